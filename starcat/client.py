@@ -23,8 +23,7 @@ from starcat.storage.atomic import move_into_place, whole_folder
 Content = dict[str, Any]
 
 CHUNK_BYTES = 1 << 18
-AGAIN_S = 0.2
-"""Seconds until a job is watched again, whose events ended before it did."""
+AGAIN_S = 0.2  # seconds until a job is watched again, whose events ended before it did
 
 
 class Client:
@@ -75,12 +74,12 @@ class Client:
         max_rows: int | None = None,
         time_limit_s: float | None = None,
     ) -> Content:
-        """Ask a question about databases (ids or titles) and catalogs.
+        """Run a query on databases (ids or titles) and catalogs.
 
         The answer has ``columns`` (name, type, unit, description), ``rows`` and ``is_cut``.
         """
-        given = _given(query=query, values=values, named=named, max_rows=max_rows)
-        asked = {"targets": list(targets), **given, **_given(time_limit_s=time_limit_s)}
+        asked: Content = {"targets": list(targets), "query": query, "named": named}
+        asked |= {"values": dict(values or {}), "max_rows": max_rows, "time_limit_s": time_limit_s}
         return self._json("POST", "sql", json=asked)
 
     def sql_file(
@@ -95,8 +94,8 @@ class Client:
         time_limit_s: float | None = None,
     ) -> int:
         """Write the answer to a question to a file, and return how many rows it has."""
-        given = _given(query=query, values=values, named=named, time_limit_s=time_limit_s)
-        asked = {"targets": list(targets), "format": form, **given}
+        asked: Content = {"targets": list(targets), "query": query, "named": named}
+        asked |= {"values": dict(values or {}), "format": form, "time_limit_s": time_limit_s}
         with closing(self._answer("POST", "sql", json=asked, stream=True)) as answer:
             _receive(answer, path)
         return int(answer.headers["X-Starcat-Rows"])
@@ -221,11 +220,6 @@ class Client:
             raise _error_of(told, answer.status_code)
 
 
-def _given(**values: Any) -> Content:
-    """Return the values that are not None."""
-    return {name: value for name, value in values.items() if value is not None}
-
-
 def _receive(answer: requests.Response, path: Path) -> str:
     """Write an answer to a file, and return its digest."""
     digest = hashlib.sha256()
@@ -241,7 +235,6 @@ def _receive(answer: requests.Response, path: Path) -> str:
 
 
 def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
-    """Return the error that a service tells of, as the class that it was there."""
     words, key = str(told.get("detail", "no words")), told.get("key")
     error = error_of_kind(str(told.get("kind", "")), words, key=None if key is None else str(key))
     return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)

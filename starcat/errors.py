@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatEr
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
-    message: str
+    message: InitVar[str]  # ``args``, as every exception has it
     exit_code = 1
 
 

@@ -21,8 +21,9 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from fastapi.testclient import TestClient
+
     from starcat.catalog.ingest import Ingested
-    from starcat.geometry.camera import Camera
     from starcat.matcher.database import Database
 
 # The same examples on every machine and in every run: a test fails for everybody or for nobody.
@@ -91,14 +92,6 @@ def ingested(catalogs: Path) -> Callable[[str, str], Ingested]:
 
 
 @pytest.fixture(scope="session")
-def solve_wahba_quest() -> Callable[..., NDArray[np.float64]]:
-    """QUEST, which checks the attitudes of the singular-value decomposition by other means."""
-    from quest import solve_wahba_quest
-
-    return solve_wahba_quest
-
-
-@pytest.fixture(scope="session")
 def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
     """Directions uniform over the sphere: of a count and a seed."""
 
@@ -111,42 +104,10 @@ def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
 
 @pytest.fixture(scope="session")
 def sky_of() -> Callable[..., Database]:
-    """Databases in memory with pairs and triangles: of directions and a camera of 20 deg.
+    """Databases in memory with pairs and triangles: of directions and a camera of 20 deg."""
+    from skies import triangle_sky
 
-    Star numbers are rows plus 1000, so that a mix-up of the two shows.
-    """
-    from starcat.geometry.camera import Camera
-    from starcat.matcher.database import Database, ProductArrays
-    from starcat.products.boresights import tile_sphere
-    from starcat.products.pairs_and_triangles import find_pairs, find_triangles
-
-    def make(
-        u: NDArray[np.float64], camera: Camera | None = None, boresights: int = 1000
-    ) -> Database:
-        camera = camera or Camera(1024, 1024, fov_x_deg=20.0)
-        mag = np.random.default_rng(len(u)).uniform(1.0, 6.0, len(u))
-        found = find_pairs(u, 0.0, camera.diagonal_rad)
-        made = find_triangles(tile_sphere(boresights, u, mag, camera), u, 8)
-        columns = ("i", "j", "k", "area_rad2", "circumradius_rad")
-        triangles = {name: getattr(made, name) for name in columns}
-        pairs = {"i": found.i, "j": found.j, "separation_rad": found.separation_rad}
-        return Database(
-            name="sky-1.0.0",
-            camera=camera,
-            epoch_jyear=2026.0,
-            star_id=np.arange(len(u)) + 1000,
-            directions=u,
-            mag=mag,
-            designation=np.full(len(u), b"star"),
-            products={
-                "pairs": ProductArrays({**pairs, **found.index.datasets}, found.index.attributes),
-                "triangles": ProductArrays(
-                    {**triangles, **made.index.datasets}, made.index.attributes
-                ),
-            },
-        )
-
-    return make
+    return triangle_sky
 
 
 SMALL_SPEC = """\
@@ -174,6 +135,14 @@ def sao_lines() -> list[bytes]:
         motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
         lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
     return lines
+
+
+@pytest.fixture
+def sao_file(tmp_path: Path, sao_lines: list[bytes]) -> Path:
+    """A file ``sao.dat`` of `sao_lines`."""
+    path = tmp_path / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -220,6 +189,22 @@ def starcat(
     signal.signal(signal.SIGTERM, before)
 
 
+@pytest.fixture
+def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The texts that matplotlib is given to write from now on."""
+    import matplotlib.text
+
+    written: list[str] = []
+    write = matplotlib.text.Text.__init__
+
+    def listen(self, x=0, y=0, text="", **options):
+        written.append(text)
+        write(self, x, y, text, **options)
+
+    monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
+    return written
+
+
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The artifact of `small_spec`; to be copied by who changes it."""
@@ -232,6 +217,33 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
     return build(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
 
 
+@pytest.fixture
+def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
+    """The small artifact as a copy that may be changed; `artifact_copies.seal` puts it right."""
+    from artifact_copies import copied
+
+    return copied(small_artifact, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+    """The folder of a service that has the small database."""
+    from services import add_database
+
+    folder = tmp_path_factory.mktemp("service") / "service"
+    add_database(folder, small_artifact)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def client(root: Path, request: pytest.FixtureRequest) -> Iterator[TestClient]:
+    """A client of that service, with the settings that the module names ``SETTINGS``."""
+    from services import client_of
+
+    with client_of(root, **getattr(request.module, "SETTINGS", {})) as opened:
+        yield opened
+
+
 @pytest.fixture(scope="session")
 def artifact_version(
     tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
@@ -242,9 +254,7 @@ def artifact_version(
     when it is built; the tables are the same files.
     """
     import h5py
-
-    from starcat.artifact.manifest import manifest_digest
-    from starcat.storage.digests import file_sha256, json_bytes
+    from artifact_copies import seal
 
     folder = tmp_path_factory.mktemp("versions")
 
@@ -253,20 +263,13 @@ def artifact_version(
         if artifact.exists():
             return artifact
         shutil.copytree(small_artifact, artifact, copy_function=shutil.copyfile)
-        manifest = json.loads((artifact / "manifest.json").read_bytes())
-        manifest["version"] = manifest["spec"]["version"] = version
+        spec = json.loads((artifact / "manifest.json").read_bytes())["spec"] | {"version": version}
         with h5py.File(artifact / "database.h5", "r+") as file:
             file.attrs["version"] = version
-            file.attrs["spec"] = json.dumps(manifest["spec"], sort_keys=True)
+            file.attrs["spec"] = json.dumps(spec, sort_keys=True)
         for path in (artifact / "report").iterdir():
             path.write_bytes(path.read_bytes() + f"<!-- {version} -->".encode())
-        for name, facts in manifest["files"].items():
-            facts |= {
-                "bytes": (artifact / name).stat().st_size,
-                "sha256": file_sha256(artifact / name),
-            }
-        manifest["manifest_sha256"] = manifest_digest(manifest)
-        (artifact / "manifest.json").write_bytes(json_bytes(manifest))
+        seal(artifact, lambda manifest: manifest.update(version=version, spec=spec))
         return artifact
 
     return make

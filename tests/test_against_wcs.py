@@ -27,14 +27,9 @@ Array = NDArray[np.float64]
 FITS_FROM_CAMERA_PX = 0.5
 
 POINTINGS = [
-    (83.8, -5.4, 0.0),
-    (0.0, 0.0, 90.0),
-    (359.9999, 10.0, 181.0),
-    (266.4, -29.0, 270.0),
-    (12.3, 90.0, 33.0),
-    (200.0, -90.0, 300.0),
-    (45.0, 89.9, 123.4),
-]
+    (83.8, -5.4, 0.0), (0.0, 0.0, 90.0), (359.9999, 10.0, 181.0), (266.4, -29.0, 270.0),
+    (12.3, 90.0, 33.0), (200.0, -90.0, 300.0), (45.0, 89.9, 123.4),
+]  # fmt: skip
 """Right ascension, declination and roll, degrees; the poles and RA 0 among them."""
 
 pointings = st.tuples(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 360.0))

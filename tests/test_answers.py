@@ -36,29 +36,19 @@ needs_c = pytest.mark.skipif(
 
 ARCSEC = 3600.0 * math.degrees(1.0)
 
+ALL_TERMS = Distortion(k1=-0.2, k2=0.05, k3=0.3, p1=1e-3, p2=-2e-3)
+OFF, WIDE = {"principal_point_px": (610.0, 510.5)}, {"principal_point_px": (600.0, 500.0)}
 LENSES = {
     "barrel": Camera(1280, 960, fov_x_deg=20.0, distortion=Distortion(k1=-0.2)),
     "pincushion": Camera(1024, 768, fov_x_deg=11.42, distortion=Distortion(k1=0.6, k2=-2.0)),
-    "all terms, off the middle": Camera(
-        1280,
-        960,
-        fov_x_deg=20.0,
-        principal_point_px=(610.0, 510.5),
-        distortion=Distortion(k1=-0.2, k2=0.05, k3=0.3, p1=1e-3, p2=-2e-3),
-    ),
-    "wide": Camera(
-        1280,
-        960,
-        fov_x_deg=50.0,
-        principal_point_px=(600.0, 500.0),
-        distortion=Distortion(k1=-0.2, k2=0.05),
-    ),
+    "all terms, off the middle": Camera(1280, 960, fov_x_deg=20.0, distortion=ALL_TERMS, **OFF),
+    "wide": Camera(1280, 960, fov_x_deg=50.0, distortion=Distortion(k1=-0.2, k2=0.05), **WIDE),
 }
 
 PINHOLES = {
     "narrow": Camera(1024, 1024, fov_x_deg=1.0),
     "usual": Camera(1024, 768, fov_x_deg=11.42),
-    "wide, off the middle": Camera(1280, 960, fov_x_deg=90.0, principal_point_px=(600.0, 500.0)),
+    "wide, off the middle": Camera(1280, 960, fov_x_deg=90.0, **WIDE),
 }
 
 ATTITUDES = [(123.4, -34.5, 71.0), (0.0, 0.0, 0.0), (10.0, 89.99, 200.0), (0.0, -90.0, 33.0)]

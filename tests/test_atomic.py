@@ -17,6 +17,7 @@ from starcat.storage.atomic import (
     sync,
     whole_file,
     whole_folder,
+    write_file,
     writing,
 )
 
@@ -36,7 +37,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_file_appears_when_it_is_whole(tmp_path):
     path = tmp_path / "new" / "table.csv"
     with whole_file(path) as partial:
         partial.write_bytes(b"half")
@@ -49,7 +50,7 @@ def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
     assert mode_of(path) == usual_mode(tmp_path)
 
 
-def test_a_file_that_fails_leaves_the_one_before(tmp_path: Path) -> None:
+def test_a_file_that_fails_leaves_the_one_before(tmp_path):
     path = tmp_path / "table.csv"
     path.write_bytes(b"before")
 
@@ -64,7 +65,7 @@ def test_a_file_that_fails_leaves_the_one_before(tmp_path: Path) -> None:
     assert names_in(tmp_path) == ["table.csv"]
 
 
-def test_two_writers_of_one_process_do_not_share_a_file(tmp_path: Path) -> None:
+def test_two_writers_of_one_process_do_not_share_a_file(tmp_path):
     path = tmp_path / "table.csv"
     with whole_file(path) as one, whole_file(path) as other:
         assert one != other
@@ -74,14 +75,15 @@ def test_two_writers_of_one_process_do_not_share_a_file(tmp_path: Path) -> None:
     assert names_in(tmp_path) == ["table.csv"]
 
 
-def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    place = whole_file(tmp_path / "file" / "table.csv")
     with pytest.raises(OutputError, match="choose another --output"):
-        place.__enter__()
+        whole_file(tmp_path / "file" / "table.csv").__enter__()
+    with pytest.raises(OutputError, match=r"table.csv: cannot be written \(Not a directory\)$"):
+        write_file(tmp_path / "file" / "table.csv", b"")
 
 
-def test_replaced_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replaced_for_good(tmp_path, monkeypatch):
     done: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: done.append(os.fstat(descriptor).st_mode))
     (tmp_path / "beside").mkdir()
@@ -94,7 +96,7 @@ def test_replaced_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert [stat.S_ISDIR(mode) for mode in done] == [False, True]
 
 
-def test_a_folder_appears_when_it_is_whole_and_cannot_be_changed(tmp_path: Path) -> None:
+def test_a_folder_appears_when_it_is_whole_and_cannot_be_changed(tmp_path):
     final = tmp_path / "dist" / "small-1.0.0"
     with whole_folder(final) as partial:
         (partial / "report").mkdir()
@@ -134,7 +136,7 @@ def test_a_folder_in_place_of_another(new, replace, outcome, tmp_path):
         assert names_in(tmp_path) == ["small"]
 
 
-def test_a_different_folder_stays(tmp_path: Path) -> None:
+def test_a_different_folder_stays(tmp_path):
     final = tmp_path / "small"
     move_into_place(filled(tmp_path / "old", a="1"), final, replace=False)
     with pytest.raises(OutputError, match="already exists and differs"):
@@ -142,7 +144,7 @@ def test_a_different_folder_stays(tmp_path: Path) -> None:
     assert (final / "a").read_text() == "1"
 
 
-def test_what_the_system_refuses_becomes_an_output_error(tmp_path: Path) -> None:
+def test_what_the_system_refuses_becomes_an_output_error(tmp_path):
     with (
         pytest.raises(OutputError, match=r"space left on device\); try later"),
         writing(tmp_path, "try later"),
@@ -171,7 +173,7 @@ def test_nothing_is_synchronised_where_the_system_cannot(tmp_path, monkeypatch):
     sync(tmp_path)
 
 
-def test_the_files_of_a_built_artifact_can_only_be_read(small_artifact: Path) -> None:
+def test_the_files_of_a_built_artifact_can_only_be_read(small_artifact):
     modes = {mode_of(path) for path in small_artifact.rglob("*") if path.is_file()}
     assert modes == {0o444}
     assert mode_of(small_artifact) & 0o200

@@ -178,14 +178,16 @@ def test_wahba_finds_the_attitude_of_exact_directions(count, random_directions):
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("noise", [30 * ARCSEC, 0.3])
-def test_wahba_agrees_with_scipy(noise, weighted, random_directions):
+@pytest.mark.parametrize("radius_rad", [None, 0.1, 0.005])
+def test_wahba_agrees_with_scipy(noise, weighted, radius_rad, random_directions):
     generator = np.random.default_rng(8)
-    for seed, matrix in enumerate(random_attitudes(20, generator)):
-        icrs = random_directions(6, seed)
+    half_turns = [np.diag(2.0 * axis - 1.0) for axis in np.eye(3)]
+    for seed, matrix in enumerate([*random_attitudes(20, generator), *half_turns]):
+        icrs = random_directions(6, seed) if radius_rad is None else field(6, seed, radius_rad)
         body = icrs @ matrix.T + generator.normal(scale=noise, size=icrs.shape)
         weights = generator.uniform(0.1, 5.0, 6) if weighted else None
         expected = Rotation.align_vectors(body, icrs, weights=weights)[0].as_matrix()
-        assert np.abs(solve_wahba_svd(body, icrs, weights) - expected).max() < 1e-12
+        assert np.abs(solve_wahba_svd(body, icrs, weights) - expected).max() < 1e-9
 
 
 def test_a_weight_of_zero_leaves_a_star_out(random_directions):
@@ -221,79 +223,12 @@ def turned(icrs: np.ndarray, matrix: np.ndarray, noise: float, seed: int) -> np.
     return body / np.linalg.norm(body, axis=1)[:, None]
 
 
-def about(axis: np.ndarray, angle_deg: float) -> np.ndarray:
-    return Rotation.from_rotvec(np.radians(angle_deg) * axis).inv().as_matrix()
-
-
-HALF_TURNS = [about(axis / np.linalg.norm(axis), 180.0) for axis in [*np.eye(3), np.ones(3)]]
-
-
 def field(count: int, seed: int, radius_rad: float = 0.1) -> np.ndarray:
     """Return directions within a field of view somewhere on the sky."""
     generator = np.random.default_rng(seed)
     offset = generator.uniform(-1.0, 1.0, (count, 2)) * radius_rad
     near = np.column_stack([offset, np.ones(count)]) @ random_attitudes(1, generator)[0]
     return near / np.linalg.norm(near, axis=1)[:, None]
-
-
-def scipy_attitude(body: np.ndarray, icrs: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    return Rotation.align_vectors(body, icrs, weights=weights)[0].as_matrix()
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC, 0.01])
-@pytest.mark.parametrize("count", [4, 15])
-def test_quest_agrees_with_svd_and_scipy_in_a_field_of_view(
-    count, noise, weighted, solve_wahba_quest
-):
-    for seed, matrix in enumerate(random_attitudes(40, np.random.default_rng(11))):
-        icrs = field(count, seed)
-        body = turned(icrs, matrix, noise, seed)
-        weights = np.random.default_rng(seed).uniform(0.1, 5.0, count) if weighted else None
-        found = matrix_from_quaternion(solve_wahba_quest(body, icrs, weights))
-        assert np.abs(found - solve_wahba_svd(body, icrs, weights)).max() < 1e-9
-        assert np.abs(found - scipy_attitude(body, icrs, weights)).max() < 1e-9
-
-
-@pytest.mark.parametrize("matrix", HALF_TURNS, ids=["x", "y", "z", "oblique"])
-@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC])
-def test_quest_has_no_singular_attitude(matrix, noise, random_directions, solve_wahba_quest):
-    for seed in range(10):
-        for icrs in (random_directions(6, seed), field(6, seed)):
-            body = turned(icrs, matrix, noise, seed)
-            q = solve_wahba_quest(body, icrs)
-            assert q[3] >= 0.0
-            assert np.linalg.norm(q) == pytest.approx(1.0, abs=ROUNDING)
-            assert np.abs(matrix_from_quaternion(q) - solve_wahba_svd(body, icrs)).max() < 1e-9
-
-
-@pytest.mark.parametrize("apart_deg", [5.0, 60.0, 90.0, 175.0])
-@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC])
-def test_quest_needs_two_directions(apart_deg, noise, solve_wahba_quest):
-    for seed, matrix in enumerate(random_attitudes(20, np.random.default_rng(12))):
-        icrs = np.eye(3)[:2].copy()
-        icrs[1] = [np.cos(np.radians(apart_deg)), np.sin(np.radians(apart_deg)), 0.0]
-        body = turned(icrs, matrix, noise, seed)
-        found = matrix_from_quaternion(solve_wahba_quest(body, icrs))
-        assert np.abs(found - solve_wahba_svd(body, icrs)).max() < 1e-9
-
-
-@pytest.mark.parametrize("radius_deg", [0.3, 1.0])
-def test_quest_agrees_with_svd_for_stars_close_together(radius_deg, solve_wahba_quest):
-    for seed, matrix in enumerate(random_attitudes(100, np.random.default_rng(13))):
-        icrs = field(4, seed, np.radians(radius_deg))
-        body = turned(icrs, matrix, 10 * ARCSEC, seed)
-        found = matrix_from_quaternion(solve_wahba_quest(body, icrs))
-        assert np.abs(found - solve_wahba_svd(body, icrs)).max() < 1e-9
-
-
-def test_quest_leaves_a_star_of_weight_zero_out(solve_wahba_quest):
-    icrs = field(5, 14)
-    matrix = matrix_from_radec_roll(10.0, 20.0, 30.0)
-    body = icrs @ matrix.T
-    body[4] = -body[4]
-    q = solve_wahba_quest(body, icrs, np.array([1.0, 1.0, 1.0, 1.0, 0.0]))
-    assert np.abs(matrix_from_quaternion(q) - matrix).max() < 1e-9
 
 
 @pytest.mark.parametrize("count", [2, 3, 8])

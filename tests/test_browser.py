@@ -30,7 +30,7 @@ pytestmark = [
     pytest.mark.timeout(150),
 ]
 
-FLAGS = (
+FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
     "--disable-quic",
@@ -38,7 +38,7 @@ FLAGS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-)
+]
 
 WIDTHS_PX = (360, 768, 1280)
 
@@ -344,22 +344,19 @@ def test_a_file_is_dropped(identified, page):
 def addresses(job: str, published: str, identified: str) -> list[str]:
     """One address of every kind of page."""
     database = f"/databases/{identified}"
-    of_database = ["", "/coverage", "/compare", "/sql?query=FROM+stars+LIMIT+3", "/sql?query=FROM"]
-    return [
-        *(
-            "/",
-            "/new",
-            "/jobs",
-            job,
-            "/databases",
-            "/identify",
-            "/releases",
-            "/sign-in",
-            "/api/docs",
-        ),
+    plain = [
+        "/",
+        "/new",
+        "/jobs",
+        "/databases",
+        "/identify",
+        "/releases",
+        "/sign-in",
+        "/api/docs",
         "/nowhere",
-        *(database + one for one in of_database),
     ]
+    of_database = ["", "/coverage", "/compare", "/sql?query=FROM+stars+LIMIT+3", "/sql?query=FROM"]
+    return [*plain, job, *(database + one for one in of_database)]
 
 
 NARROW_AND_WIDE = (("light", 360), ("dark", 768))
@@ -367,10 +364,7 @@ NARROW_AND_WIDE = (("light", 360), ("dark", 768))
 
 @pytest.mark.parametrize(
     "looks",
-    [
-        NARROW_AND_WIDE,
-        pytest.param((("dark", 360), ("light", 1280)), marks=pytest.mark.slow),
-    ],
+    [NARROW_AND_WIDE, pytest.param((("dark", 360), ("light", 1280)), marks=pytest.mark.slow)],
     ids=["light and narrow, dark and middling", "dark and narrow, light and wide"],
 )
 def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, page, looks):

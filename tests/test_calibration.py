@@ -249,33 +249,25 @@ def test_an_undistorted_camera_gets_no_distortion(skies):
     assert abs(pulls(found.fit, database.camera)["focal_length_px"]) < 3.0
 
 
-def test_frames_without_magnitudes_calibrate_too(skies):
-    database = skies[50.0]
-    camera = real_camera(database)
-    frames = [
-        MeasuredFrame(frame.name, frame.centroids_px)
-        for frame in photographs(database, camera, 8, 6)
-    ]
-    found = calibrate_frames(Matcher(database), frames, *within_five_percent(camera))
-    assert found.n_identified == 8
-    assert max(map(abs, pulls(found.complete, camera).values())) < 3.5
-
-
-def test_a_method_that_has_to_know_the_focal_length_calibrates_too(skies):
-    database = skies[20.0]
-    camera = real_camera(database)
-    frames = photographs(database, camera, 4, 6)
-    found = calibrate_frames(Matcher(database, "pairs"), frames, *within_five_percent(camera))
-    assert found.n_identified == 4
+@pytest.mark.parametrize(("method", "fov", "count"), [("triangle", 50.0, 8), ("pairs", 20.0, 4)])
+def test_without_magnitudes_and_by_a_method_that_has_to_know_the_focal_length(
+    skies, method, fov, count
+):
+    camera = real_camera(skies[fov])
+    frames = photographs(skies[fov], camera, count, 6)
+    if method == "triangle":
+        frames = [replace(frame, mag=None) for frame in frames]
+    matcher = Matcher(skies[fov], method)
+    found = calibrate_frames(matcher, frames, *within_five_percent(camera))
+    assert found.n_identified == count
     assert max(map(abs, pulls(found.complete, camera).values())) < 3.5
 
 
 def test_pixels_that_are_not_square_are_said(skies):
     database = skies[50.0]
+    middle = np.array([0.0, 480.0])
     frames = [
-        MeasuredFrame(
-            frame.name, [0.0, 480.0] + (frame.centroids_px - [0.0, 480.0]) * [1.0, 1.002], frame.mag
-        )
+        replace(frame, centroids_px=middle + (frame.centroids_px - middle) * [1.0, 1.002])
         for frame in photographs(database, database.camera, 12, 8)
     ]
     found = calibrate_frames(Matcher(database), frames, *within_five_percent(database.camera))
@@ -287,9 +279,7 @@ def test_pixels_that_are_not_square_are_said(skies):
 def test_a_calibration_does_not_depend_on_the_order_of_stars(skies):
     database = skies[20.0]
     frames = photographs(database, real_camera(database), 6, 9)
-    turned = [
-        MeasuredFrame(frame.name, frame.centroids_px[::-1], frame.mag[::-1]) for frame in frames
-    ]
+    turned = [MeasuredFrame(f.name, f.centroids_px[::-1], f.mag[::-1]) for f in frames]
     about = within_five_percent(database.camera)
     one, other = (calibrate_frames(Matcher(database), given, *about) for given in (frames, turned))
     assert one.fit.free == other.fit.free

@@ -7,7 +7,6 @@ import dataclasses
 import math
 import pickle
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -132,22 +131,19 @@ def test_direction_round_trip(random_directions):
     assert separation(back, body).max() < 1e-12
 
 
-def test_the_axis_is_the_middle_of_the_frame():
-    assert WIDE.pixels_from_directions(np.array([[0.0, 0.0, 1.0]])).tolist() == [[512.0, 384.0]]
-    assert WIDE.directions_from_pixels(np.array([[512.0, 384.0]])).tolist() == [[0.0, 0.0, 1.0]]
-
-
-def test_the_axis_is_at_the_principal_point():
-    axis = np.array([[0.0, 0.0, 1.0]])
-    for camera in (LENS, Camera(1024, 768, 2000.0, principal_point_px=(-50, 400))):
-        point = [list(camera.principal_point_px)]
-        assert camera.pixels_from_directions(axis).tolist() == point
-        assert camera.directions_from_pixels(np.array(point)).tolist() == axis.tolist()
-
-
-def test_the_only_pixel_of_a_one_pixel_camera_has_its_centre_at_a_half():
-    camera = Camera(1, 1, 10.0)
-    assert camera.pixels_from_directions(np.array([[0.0, 0.0, 1.0]])).tolist() == [[0.5, 0.5]]
+@pytest.mark.parametrize(
+    ("camera", "point"),
+    [
+        (WIDE, [512.0, 384.0]),
+        (LENS, [500.0, 400.0]),
+        (Camera(1024, 768, 2000.0, principal_point_px=(-50, 400)), [-50.0, 400.0]),
+        (Camera(1, 1, 10.0), [0.5, 0.5]),
+    ],
+)
+def test_the_axis_is_at_the_principal_point(camera, point):
+    axis = [[0.0, 0.0, 1.0]]
+    assert camera.pixels_from_directions(np.array(axis)).tolist() == [point]
+    assert camera.directions_from_pixels(np.array([point])).tolist() == axis
 
 
 def test_x_grows_to_the_right_and_y_downwards():
@@ -157,47 +153,47 @@ def test_x_grows_to_the_right_and_y_downwards():
 
 
 @pytest.mark.parametrize("camera", [WIDE, LENS])
-def test_directions_are_of_unit_length(camera):
-    pixels = np.random.default_rng(2).uniform(0.0, 768.0, (200, 2))
-    length = np.linalg.norm(camera.directions_from_pixels(pixels), axis=1)
-    assert np.abs(length - 1.0).max() < 1e-15
+class TestAnyCamera:
+    def test_directions_are_of_unit_length(self, camera):
+        pixels = np.random.default_rng(2).uniform(0.0, 768.0, (200, 2))
+        length = np.linalg.norm(camera.directions_from_pixels(pixels), axis=1)
+        assert np.abs(length - 1.0).max() < 1e-15
 
+    def test_what_is_behind_or_beside_the_camera_has_no_pixel(self, camera):
+        body = np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9], [1.0, 0.0, 0.0], [np.nan] * 3])
+        pixels = camera.pixels_from_directions(body)
+        assert np.isnan(pixels).all()
+        assert not camera.contains(pixels).any()
 
-@pytest.mark.parametrize("camera", [WIDE, LENS])
-def test_what_is_behind_or_beside_the_camera_has_no_pixel(camera):
-    body = np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9], [1.0, 0.0, 0.0], [np.nan] * 3])
-    pixels = camera.pixels_from_directions(body)
-    assert np.isnan(pixels).all()
-    assert not camera.contains(pixels).any()
+    def test_no_pixels(self, camera):
+        none = np.empty((0, 2))
+        assert camera.directions_from_pixels(none).shape == (0, 3)
+        assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
+        assert camera.contains(none).shape == (0,)
 
+    def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(self, camera):
+        last = np.nextafter(1024.0, 0.0), np.nextafter(768.0, 0.0)
+        inside = [(0.0, 0.0), (0.5, 0.5), last]
+        outside = [(1024.0, 0.0), (0.0, 768.0), (-1e-9, 5.0), (5.0, -1e-9)]
+        outside += [(np.nan, 5.0), (5.0, np.nan), (np.inf, 5.0), (-np.inf, 5.0)]
+        found = camera.contains(np.array(inside + outside)).tolist()
+        assert found == [True] * 3 + [False] * 8
 
-@pytest.mark.parametrize(
-    ("pixel", "inside"),
-    [
-        ((0.0, 0.0), True),
-        ((0.5, 0.5), True),
-        ((np.nextafter(1024.0, 0.0), np.nextafter(768.0, 0.0)), True),
-        ((1024.0, 0.0), False),
-        ((0.0, 768.0), False),
-        ((-1e-9, 5.0), False),
-        ((5.0, -1e-9), False),
-        ((np.nan, 5.0), False),
-        ((5.0, np.nan), False),
-        ((np.inf, 5.0), False),
-        ((-np.inf, 5.0), False),
-    ],
-)
-@pytest.mark.parametrize("camera", [WIDE, LENS])
-def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(camera, pixel, inside):
-    assert camera.contains(np.array([pixel])).tolist() == [inside]
-
-
-@pytest.mark.parametrize("camera", [WIDE, LENS])
-def test_no_pixels(camera):
-    none = np.empty((0, 2))
-    assert camera.directions_from_pixels(none).shape == (0, 3)
-    assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
-    assert camera.contains(none).shape == (0,)
+    def test_copies_are_equal(self, camera):
+        assert eval(repr(camera)) == camera
+        changed = dataclasses.replace(camera, width_px=900)
+        assert changed.principal_point_px == camera.principal_point_px
+        assert changed.distortion == camera.distortion
+        pixels = points_of(1024, 768)
+        body = camera.directions_from_pixels(pixels)
+        assert camera.radius_rad > 0.0
+        for twin in (pickle.loads(pickle.dumps(camera)), copy.deepcopy(camera), copy.copy(camera)):
+            assert twin == camera
+            assert hash(twin) == hash(camera)
+            assert twin.radius_rad == camera.radius_rad
+            np.testing.assert_array_equal(twin.directions_from_pixels(pixels), body)
+        # What was computed from the coefficients stays behind.
+        assert len(pickle.dumps(camera)) < 1000
 
 
 # The field of view ----------------------------------------------------------------------------
@@ -212,17 +208,13 @@ def test_a_camera_of_a_field_has_that_field(width_px, height_px, fov_deg):
     assert camera.fov_y_deg == pytest.approx(fov_deg, rel=1e-13)
 
 
-@pytest.mark.parametrize("ratio", [0.99901, 1.0, 1.00099])
+@pytest.mark.parametrize("ratio", [0.99899, 0.99901, 1.0, 1.00099, 1.00101])
 def test_both_fields_may_be_given_if_they_agree(ratio):
     wide = Camera(1600, 1200, fov_x_deg=16.0)
     fov_y_deg = math.degrees(2.0 * math.atan(600.0 / (ratio * wide.focal_length_px)))
-    assert Camera(1600, 1200, fov_x_deg=16.0, fov_y_deg=fov_y_deg) == wide
-
-
-@pytest.mark.parametrize("ratio", [0.99899, 1.00101])
-def test_two_fields_that_disagree_are_refused(ratio):
-    focal_length_px = ratio * 800.0 / math.tan(math.radians(8.0))
-    fov_y_deg = math.degrees(2.0 * math.atan(600.0 / focal_length_px))
+    if abs(ratio - 1.0) < 1e-3:
+        assert Camera(1600, 1200, fov_x_deg=16.0, fov_y_deg=fov_y_deg) == wide
+        return
     with pytest.raises(ValueError, match=r"expected 12\.0342, which square pixels give"):
         Camera(1600, 1200, fov_x_deg=16.0, fov_y_deg=fov_y_deg)
 
@@ -262,11 +254,8 @@ def test_a_camera_that_looks_out_of_its_corner(point):
     assert camera.diagonal_rad == pytest.approx(math.radians(60.0), rel=1e-15)
     assert camera.radius_rad == pytest.approx(math.atan(math.sqrt(2.0)), rel=1e-15)
     assert camera.fov_x_deg == pytest.approx(math.degrees(math.acos(1.25 / math.sqrt(1.25 * 2.25))))
-
-
-def test_a_camera_that_looks_out_of_its_edge():
-    camera = Camera(100, 60, 100.0, principal_point_px=(0.0, 30.0))
-    assert camera.fov_x_deg == pytest.approx(45.0, rel=1e-15)
+    edge = Camera(100, 60, 100.0, principal_point_px=(0.0, 30.0))
+    assert edge.fov_x_deg == pytest.approx(45.0, rel=1e-15)
 
 
 def test_the_stated_field_is_that_of_the_pinhole():
@@ -533,24 +522,6 @@ def test_distortions_are_values():
     assert type(Distortion(k1=1).k1) is float
 
 
-@pytest.mark.parametrize("camera", [WIDE, LENS])
-def test_copies_are_equal(camera):
-    assert eval(repr(camera)) == camera
-    changed = dataclasses.replace(camera, width_px=900)
-    assert changed.principal_point_px == camera.principal_point_px
-    assert changed.distortion == camera.distortion
-    pixels = points_of(1024, 768)
-    body = camera.directions_from_pixels(pixels)
-    assert camera.radius_rad > 0.0
-    for twin in (pickle.loads(pickle.dumps(camera)), copy.deepcopy(camera), copy.copy(camera)):
-        assert twin == camera
-        assert hash(twin) == hash(camera)
-        assert twin.radius_rad == camera.radius_rad
-        np.testing.assert_array_equal(twin.directions_from_pixels(pixels), body)
-    # What was computed from the coefficients stays behind.
-    assert len(pickle.dumps(camera)) < 1000
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -692,7 +663,6 @@ def test_a_build_spec_is_a_camera_file(name):
     ("text", "key", "value", "message"),
     [
         ("", "width_px", None, "width_px: missing; every camera needs it"),
-        ("width_px = 9", "height_px", None, "height_px: missing; every camera needs it"),
         ("camera = {}", "camera.width_px", None, "camera.width_px: missing; every camera needs"),
         ("camera = 5", "camera", 5, "camera: found 5; expected a table"),
         (
@@ -703,12 +673,6 @@ def test_a_build_spec_is_a_camera_file(name):
             "fov_x_deg with fov_y_deg, focal_length_mm with pixel_um",
         ),
         (SIZE + "pixel_um = 5", None, None, "found pixel_um; expected one of focal_length_px, "),
-        (
-            SIZE + "fov_x_deg = 9\nfocal_length_mm = 5\npixel_um = 5",
-            None,
-            None,
-            "found fov_x_deg and focal_length_mm and pixel_um; expected one of",
-        ),
         (
             SIZE + "focal_length_px = 9\nfov_y_deg = 5",
             None,
@@ -756,18 +720,6 @@ def test_a_build_spec_is_a_camera_file(name):
             "camera.height_px is 5.0; expected a whole number from 1 to 1000000",
         ),
         (
-            SIZE + "fov_x_deg = '9'",
-            "fov_x_deg",
-            "9",
-            "fov_x_deg is '9'; expected a finite number above 0 and below 180",
-        ),
-        (
-            SIZE + "fov_x_deg = 90\nfov_y_deg = 9",
-            "fov_y_deg",
-            9,
-            "fov_y_deg is 9; expected 53.1301, which square pixels give with fov_x_deg 90",
-        ),
-        (
             SIZE + "focal_length_mm = inf\npixel_um = 5",
             "focal_length_mm",
             math.inf,
@@ -778,12 +730,6 @@ def test_a_build_spec_is_a_camera_file(name):
             "pixel_um",
             0,
             "pixel_um is 0; expected a finite number above 0",
-        ),
-        (
-            SIZE + "fov_x_deg = 9\nprincipal_point_px = 3",
-            "principal_point_px",
-            3,
-            "principal_point_px is 3; expected two finite numbers, x and y",
         ),
         (
             SIZE + "fov_x_deg = 9\ndistortion = -0.1",
@@ -812,7 +758,7 @@ def test_a_wrong_camera_file_is_refused(read, tmp_path, text, key, value, messag
     assert (refused.value.key, refused.value.value) == (key, value)
 
 
-def test_an_unreadable_camera_file_is_refused(tmp_path: Path):
+def test_an_unreadable_camera_file_is_refused(tmp_path):
     path = tmp_path / "cam.toml"
     with pytest.raises(ConfigError, match=r"cam\.toml: no such camera file"):
         read_camera(path)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 from scipy.spatial.transform import Rotation
+from skies import pair_sky
 
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes, solve_wahba_svd
 from starcat.geometry.camera import Camera
@@ -21,12 +24,11 @@ from starcat.matcher.chance import (
     log_assignments,
     log_compatible_assignments,
 )
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
-from starcat.products.pairs_and_triangles import find_pairs
 from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
@@ -42,26 +44,6 @@ def rays(centroids_px: list[list[float]]) -> np.ndarray:
 
 
 FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
-
-
-def sky_of(u: np.ndarray, camera: Camera = CAMERA, mag: np.ndarray | None = None) -> Database:
-    pairs = find_pairs(u, 0.0, camera.diagonal_rad)
-    columns = {
-        "i": pairs.i,
-        "j": pairs.j,
-        "separation_rad": pairs.separation_rad,
-        **pairs.index.datasets,
-    }
-    return Database(
-        name="sky-1.0.0",
-        camera=camera,
-        epoch_jyear=2026.0,
-        star_id=np.arange(len(u)),
-        directions=u,
-        mag=np.zeros(len(u)) if mag is None else mag,
-        designation=np.full(len(u), b"star"),
-        products={"pairs": ProductArrays(columns, pairs.index.attributes)},
-    )
 
 
 # --- The value
@@ -394,7 +376,7 @@ def test_no_more_random_frames_agree_where_noises_are_stated(
 
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     lenient = Matcher(
-        sky_of(random_directions(374, 14)),
+        pair_sky(random_directions(374, 14), CAMERA),
         "pairs",
         tolerance_px=12.0,
         max_false_match_probability=0.1,
@@ -415,7 +397,7 @@ NOISE_MAG = 0.3
 
 @pytest.fixture(scope="module")
 def narrow_sky(random_directions) -> Database:
-    return sky_of(random_directions(4500, 16), NARROW, magnitudes(4500))
+    return pair_sky(random_directions(4500, 16), NARROW, magnitudes(4500))
 
 
 def six_of_nine(sky: Database, noise_px: float, astray_px: float, seed: int) -> Iterator[Frame]:
@@ -482,3 +464,86 @@ def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     stated = Matcher(narrow_sky, "pairs", noise_px=1.0, noise_mag=NOISE_MAG)
     assert accepted(stated, frames) >= 4
     assert stated.identify(frames[0].centroids_px, magnitudes=frames[0].mag).n_matched == 6
+
+
+# --- Assignments: their numbers are those of an enumeration, and never above the bound
+
+GRAPHS = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=6))
+
+
+def matchings(compatible: np.ndarray, n: int) -> int:
+    """Count the ways to assign n rows to n columns that they are joined to, one by one."""
+    count, stars = compatible.shape
+    return sum(
+        all(compatible[row, column] for row, column in zip(rows, columns, strict=True))
+        for rows in combinations(range(count), n)
+        for columns in permutations(range(stars), n)
+    )
+
+
+def bounds_by_hand(compatible: np.ndarray, n: int) -> list[float]:
+    """Return the five bounds as sums of products over all choices."""
+    bounds = [float(math.comb(len(compatible), n) * math.perm(compatible.shape[1], n))]
+    for graph in (compatible, compatible.T):
+        others = graph.shape[1]
+        degrees = graph.sum(axis=1).tolist()
+        roots = [math.factorial(c) ** (1.0 / c) if c else 0.0 for c in degrees]
+        bounds.append(sum(math.prod(chosen) for chosen in combinations(degrees, n)))
+        filled = math.factorial(others) ** ((others - n) / others) / math.factorial(others - n)
+        bounds.append(filled * sum(math.prod(chosen) for chosen in combinations(roots, n)))
+    return bounds
+
+
+@given(GRAPHS)
+def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compatible):
+    most = min(compatible.shape)
+    found = np.exp(log_compatible_assignments(most, compatible))
+    for n in range(most + 1):
+        number, bounds = matchings(compatible, n), bounds_by_hand(compatible, n)
+        assert all(number <= bound * (1.0 + 1e-12) for bound in bounds)
+        assert found[n] == pytest.approx(min(bounds), rel=1e-12, abs=1e-300)
+        if number == math.comb(len(compatible), n) * math.perm(compatible.shape[1], n):
+            assert found[n] == pytest.approx(number, rel=1e-12)
+
+
+@given(GRAPHS)
+def test_centroids_and_stars_may_change_places(compatible):
+    most = min(compatible.shape)
+    one, other = (np.exp(log_compatible_assignments(most, g)) for g in (compatible, compatible.T))
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+@pytest.mark.parametrize("sizes", [(2, 2), (3, 2), (1, 1, 1), (4, 3, 2)])
+def test_groups_that_keep_to_themselves_are_counted_exactly(sizes):
+    count = sum(sizes)
+    group = np.repeat(np.arange(len(sizes)), sizes)
+    found = log_compatible_assignments(count, group[:, None] == group)[count]
+    assert math.exp(found) == pytest.approx(math.prod(map(math.factorial, sizes)), rel=1e-12)
+
+
+def test_one_centroid_without_a_star_leaves_no_way_for_all():
+    compatible = np.ones((4, 6), dtype=bool)
+    compatible[2] = False
+    found = log_compatible_assignments(4, compatible)
+    assert found[4] == -np.inf
+    assert math.exp(found[3]) == pytest.approx(math.perm(6, 3))
+
+
+@pytest.mark.parametrize(("count", "stars"), [(900, 1100), (64, 2000)])
+def test_large_numbers_do_not_overflow(count, stars):
+    found = log_compatible_assignments(count, np.ones((count, stars), dtype=bool))
+    assert found[-1] == pytest.approx(log_assignments(count, count, stars), rel=1e-12)
+    assert np.isfinite(found).all()
+
+
+@given(st.integers(0, 9), st.integers(0, 9), st.integers(0, 9))
+def test_the_number_without_magnitudes(n, more, others):
+    found = math.exp(log_assignments(n, n + more, n + others))
+    assert found == pytest.approx(math.comb(n + more, n) * math.perm(n + others, n), rel=1e-11)
+
+
+def test_magnitudes_are_compatible_within_a_closed_interval():
+    # All numbers are exact: 3.5 x 0.5 = 1.75.
+    mag, stars = np.array([4.0, np.nan]), np.array([2.25, 2.0, 5.75, 6.0, np.nan])
+    found = compatible_pairs(mag, stars, 0.5)
+    assert found.tolist() == [[True, False, True, False, True], [True] * 5]

@@ -6,10 +6,7 @@ import csv
 import io
 import math
 import shutil
-import socket
 import subprocess
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,19 +14,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import uvicorn
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io.votable import parse
 from astropy.table import Table
 from fastapi.testclient import TestClient
 from pyvo.dal import DALQueryError, conesearch
-from shelved import DATABASE, client_of, shelve
+from served import serve
+from services import DATABASE, client_of
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
-from starcat.service.app import make_app
-from starcat.service.settings import Settings
 from starcat.vo.cone import ConeRequest, cone_request
 
 PLACES = [
@@ -44,23 +39,14 @@ PLACES = [
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    """The folder of a service with one database and one catalog that was read."""
-    root = tmp_path_factory.mktemp("cones") / "service"
-    shelve(root, small_artifact)
-    kept = root / "catalogs" / "bright"
-    kept.mkdir(parents=True)
-    shutil.copyfile(small_artifact / "stars.parquet", kept / "stars.parquet")
-    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name("faint.parquet"))
-    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name(f"sao-{'0a' * 8}.parquet"))
-    (root / "catalogs" / "unfinished").mkdir()
+def root(root: Path, small_artifact: Path) -> Path:
+    """The folder of a service with one database and catalogs that were read."""
+    catalogs = root / "catalogs"
+    (catalogs / "unfinished").mkdir(parents=True)
+    (catalogs / "bright").mkdir()
+    for name in ("bright/stars.parquet", "faint.parquet", f"sao-{'0a' * 8}.parquet"):
+        shutil.copyfile(small_artifact / "stars.parquet", catalogs / name)
     return root
-
-
-@pytest.fixture(scope="module")
-def client(root: Path) -> Iterator[TestClient]:
-    with client_of(root) as client:
-        yield client
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +77,7 @@ def fields_of(content: bytes) -> list[Any]:
 
 
 @pytest.mark.parametrize(("ra_deg", "dec_deg", "sr"), PLACES)
-def test_a_search_finds_what_brute_force_finds(
-    client: TestClient, stars: dict[str, np.ndarray], ra_deg: float, dec_deg: float, sr: float
-) -> None:
+def test_a_search_finds_what_brute_force_finds(client, stars, ra_deg, dec_deg, sr):
     answer = ask(client, RA=ra_deg, DEC=dec_deg, SR=sr)
     assert (answer.status_code, answer.headers["content-type"]) == (
         200, "text/xml;content=x-votable"
@@ -111,14 +95,12 @@ def test_a_search_finds_what_brute_force_finds(
     "catalog",
     [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"sao-{'0a' * 8}.parquet"],
 )
-def test_a_catalog_has_several_names(
-    client: TestClient, stars: dict[str, np.ndarray], catalog: str
-) -> None:
+def test_a_catalog_has_several_names(client, stars, catalog):
     found = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
     assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
 
 
-def test_columns_have_the_ucds_of_the_standard(client: TestClient) -> None:
+def test_columns_have_the_ucds_of_the_standard(client):
     for verbosity in (1, 2, 3):
         fields = fields_of(ask(client, VERB=verbosity).content)
         for ucd, datatypes in (
@@ -132,7 +114,7 @@ def test_columns_have_the_ucds_of_the_standard(client: TestClient) -> None:
             assert ucd == "ID_MAIN" or field.ref == "starcat.icrs"
 
 
-def test_verbosity_chooses_columns(client: TestClient, small_artifact: Path) -> None:
+def test_verbosity_chooses_columns(client, small_artifact):
     names = {v: [f.name for f in fields_of(ask(client, VERB=v).content)] for v in (1, 2, 3)}
     assert names[1] == ["designation", "ra_deg", "dec_deg", "separation_deg"]
     assert [f.name for f in fields_of(ask(client).content)] == names[2]
@@ -143,7 +125,7 @@ def test_verbosity_chooses_columns(client: TestClient, small_artifact: Path) -> 
     assert set(names[1]) < set(names[2]) < set(names[3])
 
 
-def test_a_radius_of_nothing_gives_the_columns_only(client: TestClient) -> None:
+def test_a_radius_of_nothing_gives_the_columns_only(client):
     found = parse(io.BytesIO(ask(client, SR=0).content))
     assert len(found.get_first_table().array) == 0
     assert [f.name for f in found.get_first_table().fields] == [
@@ -157,9 +139,7 @@ def test_a_radius_of_nothing_gives_the_columns_only(client: TestClient) -> None:
 @pytest.mark.parametrize(
     ("maxrec", "rows", "is_over"), [(0, 0, True), (3, 3, True), (999, 0, False)]
 )
-def test_a_search_is_cut_and_says_so(
-    client: TestClient, stars: dict[str, np.ndarray], maxrec: int, rows: int, is_over: bool
-) -> None:
+def test_a_search_is_cut_and_says_so(client, stars, maxrec, rows, is_over):
     answer = ask(client, MAXREC=maxrec)
     expected = near(stars, 83.6, -5.4, 20.0)
     found = parse(io.BytesIO(answer.content)).get_first_table().array
@@ -167,7 +147,7 @@ def test_a_search_is_cut_and_says_so(
     assert (b'value="OVERFLOW"' in answer.content) == is_over
 
 
-def test_other_formats(client: TestClient, stars: dict[str, np.ndarray], root: Path) -> None:
+def test_other_formats(client, stars, root):
     expected = near(stars, 83.6, -5.4, 20.0)
     text = ask(client, RESPONSEFORMAT="csv", responseformat_=1)
     assert text.headers["content-type"].startswith("text/csv")
@@ -180,7 +160,7 @@ def test_other_formats(client: TestClient, stars: dict[str, np.ndarray], root: P
     assert not list((root / "scratch").iterdir())
 
 
-def test_the_document_is_of_the_artifact(client: TestClient) -> None:
+def test_the_document_is_of_the_artifact(client):
     found = parse(io.BytesIO(ask(client).content))
     infos = {info.name: info.value for info in found.resources[0].infos}
     assert infos == {"QUERY_STATUS": "OK", "artifact": "small", "version": "1.0.0"}
@@ -210,9 +190,7 @@ def test_the_document_is_of_the_artifact(client: TestClient) -> None:
         ({"ra": "1"}, 400, "RA is given twice"),
     ],
 )
-def test_what_is_wrong_is_told_in_a_votable(
-    client: TestClient, parameters: dict[str, str], status: int, words: str
-) -> None:
+def test_what_is_wrong_is_told_in_a_votable(client, parameters, status, words):
     answer = ask(client, **parameters)
     assert (answer.status_code, answer.headers["content-type"]) == (
         status, "text/xml;content=x-votable"
@@ -231,7 +209,7 @@ def check_error(content: bytes, words: str) -> None:
 
 
 @pytest.mark.parametrize("missing", ["RA", "DEC", "SR"])
-def test_what_is_missing_is_told(client: TestClient, missing: str) -> None:
+def test_what_is_missing_is_told(client, missing):
     given = {name: "1" for name in ("RA", "DEC", "SR") if name != missing}
     answer = client.get("/scs/small", params=given)
     assert answer.status_code == 400
@@ -240,19 +218,10 @@ def test_what_is_missing_is_told(client: TestClient, missing: str) -> None:
 
 @pytest.mark.parametrize(
     "catalog",
-    [
-        "nothing",
-        "unfinished",
-        "sa",
-        "glob('/*')",
-        "0" * 16,
-        "..%2f..%2fetc%2fpasswd",
-        "bright%00",
-        "records.sqlite",
-        "x" * 300,
-    ],
-)
-def test_a_catalog_that_is_not_there(client: TestClient, catalog: str) -> None:
+    ["nothing", "unfinished", "sa", "glob('/*')", "0" * 16, "..%2f..%2fetc%2fpasswd", "bright%00",
+     "records.sqlite", "x" * 300],
+)  # fmt: skip
+def test_a_catalog_that_is_not_there(client, catalog):
     answer = ask(client, catalog)
     assert answer.status_code in (400, 404)
     assert b"root:" not in answer.content
@@ -260,12 +229,12 @@ def test_a_catalog_that_is_not_there(client: TestClient, catalog: str) -> None:
         check_error(answer.content, "no database and no catalog is called")
 
 
-def test_who_may_not_read_gets_nothing(root: Path) -> None:
+def test_who_may_not_read_gets_nothing(root):
     with client_of(root, anonymous="none") as client:
         assert ask(client).status_code == 401
 
 
-def test_parameters_as_they_are_checked() -> None:
+def test_parameters_as_they_are_checked():
     asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
     assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)
     assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "votable/td")
@@ -281,23 +250,11 @@ def test_parameters_as_they_are_checked() -> None:
 @pytest.fixture(scope="module")
 def address(root: Path) -> Iterator[str]:
     """Where the service listens."""
-    with socket.socket() as listening:
-        listening.bind(("127.0.0.1", 0))
-        port = listening.getsockname()[1]
-        config = uvicorn.Config(make_app(Settings(root=root)), log_config=None, lifespan="on")
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
-        thread.start()
-        until = time.monotonic() + 20.0
-        while not server.started and time.monotonic() < until:
-            time.sleep(0.02)
-        yield f"http://127.0.0.1:{port}/scs/small"
-        server.should_exit = True
-        thread.join(20.0)
-        assert not thread.is_alive()
+    with serve(root, root.parent / "log") as served:
+        yield f"{served.address}/scs/small"
 
 
-def test_pyvo_searches(address: str, stars: dict[str, np.ndarray]) -> None:
+def test_pyvo_searches(address, stars):
     found = conesearch(address, pos=(83.6, -5.4), radius=20.0, verbosity=1)
     expected = near(stars, 83.6, -5.4, 20.0)
     assert [row.id for row in found] == expected
@@ -306,7 +263,7 @@ def test_pyvo_searches(address: str, stars: dict[str, np.ndarray]) -> None:
     assert found[0].pos.dec.deg == stars["dec_deg"][first]
 
 
-def test_pyvo_is_told_what_is_wrong(address: str) -> None:
+def test_pyvo_is_told_what_is_wrong(address):
     assert len(conesearch(address, pos=(0.0, 0.0), radius=90.0, maxrec=5)) == 5
     with pytest.raises(DALQueryError, match="VERB is '7'; give a whole number from 1 to 3"):
         conesearch(address, pos=(0.0, 0.0), radius=1.0, verbosity=7)
@@ -315,7 +272,7 @@ def test_pyvo_is_told_what_is_wrong(address: str) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
-def test_stilts_searches(address: str, stars: dict[str, np.ndarray], tmp_path: Path) -> None:
+def test_stilts_searches(address, stars, tmp_path):
     out, asked = tmp_path / "found.csv", tmp_path / "asked.csv"
     asked.write_text("ra,dec\n83.6,-5.4\n0,90\n", encoding="ascii")
     subprocess.run(

@@ -17,9 +17,9 @@ from scipy.spatial import SphericalVoronoi, cKDTree
 
 from starcat.artifact.reader import open_artifact
 from starcat.catalog.ingest import count_by_reason, ingest
-from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
+from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
-from starcat.errors import BuildError, ConfigError
+from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import check_fields
@@ -32,7 +32,6 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
-from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
 
 Array = NDArray[np.float64]
@@ -43,7 +42,7 @@ Draw = Callable[[int, int], Array]
 
 
 @pytest.mark.parametrize("brightest", [1, 3, 6, 100])
-def test_counts_are_those_of_counting(brightest: int, random_directions: Draw) -> None:
+def test_counts_are_those_of_counting(brightest, random_directions):
     stars = random_directions(400, 1)
     mag = np.arange(400.0)
     fields = tile_sphere(40, stars, mag, NominalField(30.0, 30.0), "circular")
@@ -55,17 +54,15 @@ def test_counts_are_those_of_counting(brightest: int, random_directions: Draw) -
         assert made.triangles[tile] == comb(min(inside, brightest), 3)
 
 
-def test_an_empty_sky_has_a_coverage() -> None:
+def test_an_empty_sky_has_a_coverage():
     fields = tile_sphere(5, np.empty((0, 3)), np.empty(0), NominalField(10.0, 10.0))
     made = field_coverage(fields, 6)
     summary = summarise_coverage(made)
-    assert not made.stars.any()
-    assert not made.pairs.any()
-    assert not made.triangles.any()
+    assert not np.any([made.stars, made.pairs, made.triangles])
     assert (summary.fields, summary.stars.maximum, summary.histogram.tolist()) == (5, 0, [5])
 
 
-def test_a_summary_by_hand() -> None:
+def test_a_summary_by_hand():
     boresights = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     summary = summarise_coverage(coverage_from_counts(boresights, np.array([7, 2, 2, 5]), 6))
     assert (summary.stars.minimum, summary.stars.median, summary.stars.maximum) == (2, 2, 7)
@@ -76,7 +73,7 @@ def test_a_summary_by_hand() -> None:
     assert (summary.pairs.maximum, summary.triangles.maximum) == (21, 20)
 
 
-def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed() -> None:
+def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed():
     counts = np.arange(1000)[::-1]
     summary = summarise_coverage(coverage_from_counts(saff_kuijlaars(1000), counts, 6))
     assert summary.stars.one_percent == 9
@@ -87,7 +84,7 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
 
 
 @pytest.mark.parametrize("count", [10, 100, 10_000])
-def test_nobody_is_farther_than_the_covering_radius(count: int, random_directions: Draw) -> None:
+def test_nobody_is_farther_than_the_covering_radius(count, random_directions):
     boresights = saff_kuijlaars(count)
     radius, direction = covering_radius(boresights)
     sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)
@@ -100,7 +97,7 @@ def test_nobody_is_farther_than_the_covering_radius(count: int, random_direction
     assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
 
 
-def test_default_tiling_leaves_no_hole(random_directions: Draw) -> None:
+def test_default_tiling_leaves_no_hole(random_directions):
     boresights = saff_kuijlaars(10_000)
     gap = tiling_gap(boresights, np.radians(6.0))
     assert not gap.has_holes
@@ -108,7 +105,7 @@ def test_default_tiling_leaves_no_hole(random_directions: Draw) -> None:
 
 
 @pytest.mark.parametrize("rotation", range(3))
-def test_covering_radius_of_solids(rotation: int, random_directions: Draw) -> None:
+def test_covering_radius_of_solids(rotation, random_directions):
     """Known angles, in any position; a cube's facets have four corners on one circle."""
     turn, _ = np.linalg.qr(random_directions(3, rotation))
     octahedron = np.concatenate([np.eye(3), -np.eye(3)]) @ turn
@@ -117,14 +114,6 @@ def test_covering_radius_of_solids(rotation: int, random_directions: Draw) -> No
     half = np.arccos(1.0 / np.sqrt(3.0))
     assert covering_radius(octahedron)[0] == pytest.approx(half, rel=1e-12)
     assert covering_radius(cube)[0] == pytest.approx(half, rel=1e-12)
-
-
-def test_directions_of_one_side_leave_the_other_uncovered(random_directions: Draw) -> None:
-    u = random_directions(500, 4)
-    cap = u[u[:, 2] > 0.9]
-    radius, direction = covering_radius(cap)
-    assert direction[2] < -0.95
-    assert radius > np.radians(150.0)
 
 
 def circle(ra_deg: list[float], dec_deg: float) -> np.ndarray:
@@ -157,7 +146,7 @@ FEW = {
 
 @pytest.mark.parametrize("name", FEW)
 @pytest.mark.parametrize("rotation", range(3))
-def test_few_directions(name: str, rotation: int, random_directions: Draw) -> None:
+def test_few_directions(name, rotation, random_directions):
     """The radius is that of brute force over the sphere, refined where it is farthest."""
     turn, _ = np.linalg.qr(random_directions(3, rotation))
     directions = FEW[name] @ (turn if rotation else np.eye(3))
@@ -174,7 +163,7 @@ def test_few_directions(name: str, rotation: int, random_directions: Draw) -> No
     assert best == pytest.approx(radius, abs=2e-4)
 
 
-def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator() -> None:
+def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator():
     assert np.degrees(covering_radius(saff_kuijlaars(2))[0]) == pytest.approx(90.0)
     assert np.degrees(covering_radius(saff_kuijlaars(3))[0]) == pytest.approx(90.0)
     assert np.degrees(covering_radius(FEW["equator"])[0]) == pytest.approx(90.0)
@@ -182,7 +171,7 @@ def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 500])
-def test_holes_are_said_and_so_is_what_closes_them(count: int) -> None:
+def test_holes_are_said_and_so_is_what_closes_them(count):
     tile = np.radians(6.0)
     gap = tiling_gap(saff_kuijlaars(count), tile)
     assert gap.has_holes
@@ -191,7 +180,7 @@ def test_holes_are_said_and_so_is_what_closes_them(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [10, 100, 10_000])
-def test_boresights_are_spread_evenly(count: int) -> None:
+def test_boresights_are_spread_evenly(count):
     """No two nearer than 2 / sqrt(N), and no cell far from its share of the sphere.
 
     The first and last step of the spiral leave cells of 0.72 of a share beside the poles.
@@ -210,23 +199,19 @@ def test_boresights_are_spread_evenly(count: int) -> None:
 
 
 @pytest.fixture
-def make(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callable[..., Built]:
+def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built]:
     """Build the small spec with some keys of its selection and boresights set."""
-    path = tmp_path / "sao.dat"
-    path.write_bytes(b"".join(sao_lines))
 
     def run(folder: str = "dist", **changes: dict[str, Any]) -> Built:
         content = tomllib.loads(small_spec)
         for section, keys in changes.items():
             content[section] = {**content[section], **keys}
-        return build(spec_from_dict(content, "small.toml"), {"sao": [path]}, tmp_path / folder)
+        return build(spec_from_dict(content, "small.toml"), {"sao": [sao_file]}, tmp_path / folder)
 
     return run
 
 
-def test_too_few_stars_in_a_field_fail_the_build(
-    make: Callable[..., Built], small_artifact: Path, tmp_path: Path
-) -> None:
+def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, tmp_path):
     table = open_artifact(small_artifact).table("boresights").to_pylist()
     counts = np.array([row["star_count"] for row in table])
     wanted = int(counts.min()) + 2
@@ -246,7 +231,7 @@ def test_too_few_stars_in_a_field_fail_the_build(
     assert made.coverage.summary.stars.minimum == counts.min()
 
 
-def test_only_some_of_many_short_fields_are_named() -> None:
+def test_only_some_of_many_short_fields_are_named():
     spec = preset("sao-12deg").model_copy(
         update={"boresights": preset("sao-12deg").boresights.model_copy(
             update={"min_stars_per_field": 3})}
@@ -256,29 +241,11 @@ def test_only_some_of_many_short_fields_are_named() -> None:
         check_fields(none, spec)
 
 
-@pytest.mark.parametrize(
-    "path", ["boresights.min_stars_per_field", "selection.max_stars_per_field"]
-)
-@pytest.mark.parametrize("value", [0, -1, 2.5, "six", True, 10_001])
-def test_keys_have_a_range(path: str, value: object, small_spec: str) -> None:
-    content = tomllib.loads(small_spec)
-    section, _, key = path.partition(".")
-    content[section] = {**content[section], key: value}
-    with pytest.raises(ConfigError, match=path):
-        spec_from_dict(content, "small.toml")
-
-
-def dense_spec(small_spec: str, most: int) -> BuildSpec:
+@pytest.mark.parametrize("most", [3, 6, 12])
+def test_thinning_keeps_the_brightest_of_every_field(most, small_artifact, small_spec):
     content = tomllib.loads(small_spec)
     content["selection"]["max_stars_per_field"] = most
-    return spec_from_dict(content, "small.toml")
-
-
-@pytest.mark.parametrize("most", [3, 6, 12])
-def test_thinning_keeps_the_brightest_of_every_field(
-    most: int, small_artifact: Path, small_spec: str
-) -> None:
-    spec = dense_spec(small_spec, most)
+    spec = spec_from_dict(content, "small.toml")
     stars = open_artifact(small_artifact).table("stars")
     before = tile_guide_stars(stars, spec)
     selected = select_guide_stars(stars, spec.selection)
@@ -292,26 +259,21 @@ def test_thinning_keeps_the_brightest_of_every_field(
         assert set(now) <= set(was)
     assert after.count.max() < before.count.max()
     assert np.std(after.count) < np.std(before.count)
-    assert_nothing_is_lost(selected, thinned)
-
-
-def assert_nothing_is_lost(before: Selected, after: Selected) -> None:
-    gone = count_by_reason(after.rejected).get("density", 0)
-    assert len(after.guide_stars) + gone == len(before.guide_stars)
-    assert len(after.rejected) == len(before.rejected) + gone
+    # Nothing is lost.
+    gone = count_by_reason(thinned.rejected).get("density", 0)
+    assert len(thinned.guide_stars) + gone == len(selected.guide_stars)
+    assert len(thinned.rejected) == len(selected.rejected) + gone
     ids = [
         np.sort(np.concatenate([s.guide_stars["star_id"], s.rejected["star_id"]]))
-        for s in (before, after)
+        for s in (selected, thinned)
     ]
     assert np.array_equal(*ids)
-    assert np.all(np.diff(after.rejected["star_id"].to_numpy()) > 0)
-    assert (after.steps[-1].name, len(after.steps[-1].directions)) == (
-        "density",
-        len(after.guide_stars),
-    )
+    assert np.all(np.diff(thinned.rejected["star_id"].to_numpy()) > 0)
+    step = thinned.steps[-1]
+    assert (step.name, len(step.directions)) == ("density", len(thinned.guide_stars))
 
 
-def test_a_thinned_build_counts_density(make: Callable[..., Built], small_artifact: Path) -> None:
+def test_a_thinned_build_counts_density(make, small_artifact):
     made = make(selection={"max_stars_per_field": 8})
     (source,) = made.manifest["sources"]
     whole = open_artifact(small_artifact).manifest["sources"][0]
@@ -325,7 +287,7 @@ def test_a_thinned_build_counts_density(make: Callable[..., Built], small_artifa
     assert count_by_reason(rejected) == source["rejected"]
 
 
-def test_thinning_makes_a_real_sky_even(catalogs: Path) -> None:
+def test_thinning_makes_a_real_sky_even(catalogs):
     base = preset("sao-12deg")
     selection = base.selection.model_copy(update={"max_stars_per_field": 10})
     spec = base.model_copy(update={"selection": selection})
@@ -341,9 +303,7 @@ def test_thinning_makes_a_real_sky_even(catalogs: Path) -> None:
     assert floats_of(thinned.guide_stars, "mag").max() <= 6.0
 
 
-def test_a_build_says_that_its_tiling_has_holes(
-    make: Callable[..., Built], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     with caplog.at_level(logging.WARNING, logger="starcat"):
         # Where the tiling has holes there are no triangles either.
         made = make(boresights={"count": 20}, self_test={"min_identified": 0.0})
@@ -357,9 +317,7 @@ def test_a_build_says_that_its_tiling_has_holes(
     assert warning.split(":")[0] in (made.folder / "report" / "index.html").read_text()
 
 
-def test_a_build_without_holes_is_silent(
-    make: Callable[..., Built], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_build_without_holes_is_silent(make, caplog):
     made = make()
     assert made.warnings == ()
     assert not caplog.records

@@ -22,9 +22,8 @@ from starcat.geometry.sphere import (
     tangent_axes,
 )
 from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
-from starcat.products.match_figures import ARCSEC, MatchModel
+from starcat.products.match_figures import ARCSEC, TILES, MagnitudeCounts, MatchModel
 from starcat.products.match_odds import pair_probabilities
-from starcat.products.star_counts import TILES, MagnitudeCounts
 
 Array = NDArray[np.float64]
 

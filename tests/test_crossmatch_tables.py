@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-import shutil
 import struct
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
+from artifact_copies import copied, seal
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.diff import diff_artifacts
-from starcat.artifact.manifest import MANIFEST_VERSION, manifest_digest
+from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.other_catalogs import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
@@ -23,6 +24,7 @@ from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
 from starcat.catalog.proper_motion import MAS, Motion, propagate
 from starcat.catalog.selection import select_guide_stars
+from starcat.catalog.stars import with_columns
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
@@ -39,7 +41,6 @@ from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict
-from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
 from starcat.storage.schema import product_schema
 
@@ -59,8 +60,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
     folder = tmp_path_factory.mktemp("crossmatch")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     stars = ingest("sao", [folder / "sao.dat"]).stars
-    names = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
-    then = propagate(Motion(*(stars[name].to_numpy() for name in names)), 16.0)
+    then = propagate(Motion(*(stars[field.name].to_numpy() for field in fields(Motion))), 16.0)
     generator = np.random.default_rng(16)
     records = []
     for row in range(500):
@@ -81,7 +81,7 @@ def artifact(files: Path, small_spec: str) -> Path:
 
 @pytest.fixture
 def copy(artifact: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(artifact, tmp_path / artifact.name, copy_function=shutil.copyfile))
+    return copied(artifact, tmp_path)
 
 
 # In an artifact ------------------------------------------------------------------------------
@@ -152,25 +152,19 @@ def test_diff_says_that_it_came(artifact, small_artifact):
     assert diff_artifacts(open_artifact(artifact), open_artifact(artifact)).is_same
 
 
-def seal(folder: Path, table: pa.Table) -> None:
-    """Replace the product, and make every digest fit."""
-    schema, path = product_schema("crossmatch"), folder / "crossmatch.parquet"
-    write_parquet(table, path)
-    manifest = json.loads((folder / "manifest.json").read_bytes())
-    facts = {"rows": len(table), "content_sha256": content_sha256(table, schema)}
-    manifest["products"]["crossmatch"] |= facts
-    held = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
-    manifest["files"]["crossmatch.parquet"] = held
-    manifest["manifest_sha256"] = manifest_digest(manifest)
-    (folder / "manifest.json").write_bytes(json_bytes(manifest))
+def findings_with(folder: Path, table: pa.Table) -> str:
+    """Replace the product, make every digest fit, and say what is wrong then."""
+    content = content_sha256(table, product_schema("crossmatch"))
+    write_parquet(table, folder / "crossmatch.parquet")
+    facts = {"rows": len(table), "content_sha256": content}
+    seal(folder, lambda manifest: manifest["products"]["crossmatch"].update(facts))
+    return " | ".join(str(finding) for finding in verify_artifact(folder).findings)
 
 
 def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
     values = table[name].to_pylist()
     values[row] = value
-    place = table.column_names.index(name)
-    field = table.schema.field(name)
-    return table.set_column(place, field, pa.array(values, field.type))
+    return with_columns(table, {name: pa.array(values, table.schema.field(name).type)})
 
 
 @pytest.mark.parametrize(
@@ -191,16 +185,13 @@ def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
 )
 def test_what_is_wrong_is_found(name, value, words, copy):
     table = read_parquet(copy / "crossmatch.parquet")
-    seal(copy, changed(table, name, 7, value))
-    found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
-    assert words in found
+    assert words in findings_with(copy, changed(table, name, 7, value))
 
 
 def test_rows_out_of_order_are_found(copy):
     table = read_parquet(copy / "crossmatch.parquet")
-    seal(copy, table.take([1, 0, *range(2, len(table))]))
-    found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
-    assert "in the order of star, catalog, rank" in found
+    swapped = table.take([1, 0, *range(2, len(table))])
+    assert "in the order of star, catalog, rank" in findings_with(copy, swapped)
 
 
 def test_an_empty_product_has_no_problems(artifact):
@@ -297,15 +288,10 @@ def tables(files: Path) -> tuple[Path, Path]:
 def test_moving_stars_are_those_of_the_table(tables):
     table = read_star_table(tables[0])
     stars = moving_stars(table)
-    moved = propagate(
-        Motion(*(table[name].to_numpy() for name in table.column_names[3:5]),
-               *(table[name].to_numpy() for name in table.column_names[6:8])), 30.0
-    )  # fmt: skip
-    expected = moving_stars(
-        table.set_column(3, "ra_deg", pa.array(moved.ra_deg)).set_column(
-            4, "dec_deg", pa.array(moved.dec_deg)
-        )
-    )
+    motion = Motion(*(table[field.name].to_numpy() for field in fields(Motion)))
+    moved = propagate(motion, 30.0)
+    there = {"ra_deg": moved.ra_deg, "dec_deg": moved.dec_deg}
+    expected = moving_stars(with_columns(table, there))
     there = stars.at(np.arange(len(table)), 2030.0)
     assert there == pytest.approx(expected.directions, abs=1e-15)
     assert stars.has_motion.all()
@@ -379,9 +365,7 @@ def test_files_that_are_no_star_tables_are_refused(tables, tmp_path):
     with pytest.raises(SchemaError, match="ra_deg: found string"):
         read_star_table(tmp_path / "typed.parquet")
     for value in (None, float("nan"), float("inf")):
-        blank = table.set_column(
-            place, "ra_deg", pa.array([value, *table["ra_deg"].to_pylist()[1:]])
-        )
-        write_parquet(blank, tmp_path / "blank.parquet")
+        values = pa.array([value, *table["ra_deg"].to_pylist()[1:]])
+        write_parquet(table.set_column(place, "ra_deg", values), tmp_path / "blank.parquet")
         with pytest.raises(SchemaError, match="ra_deg: found 1 rows without a value"):
             read_star_table(tmp_path / "blank.parquet")

@@ -38,17 +38,16 @@ def with_text(line: bytes, place: int, text: bytes) -> bytes:
     return line[:place] + text + line[place + len(text) :]
 
 
-def test_an_artifact_does_not_differ_from_itself(small_artifact: Path) -> None:
+def test_an_artifact_does_not_differ_from_itself(small_artifact):
     artifact = open_artifact(small_artifact)
     found = diff_artifacts(artifact, artifact)
     assert found.is_same
-    assert (found.spec, found.sources, found.software) == ((), (), ())
-    assert (found.came, found.went, found.moved) == ((), (), ())
+    assert not any((found.spec, found.sources, found.software, found.came, found.went, found.moved))
     assert [product.product for product in found.products] == list(artifact.products)
     assert all(product.is_same for product in found.products)
 
 
-def test_a_brighter_limit_lets_stars_go(small_artifact: Path, make: Make) -> None:
+def test_a_brighter_limit_lets_stars_go(small_artifact, make):
     a, b = open_artifact(small_artifact), make("b", selection={"faint_limit_mag": 5.5})
     found = diff_artifacts(a, b)
     assert found.spec == (Change("selection.faint_limit_mag", 6.0, 5.5),)
@@ -131,7 +130,7 @@ def test_a_repeated_record_does_not_hide_the_reason(
     assert {s.reason for s in found.went if s.star_id == star} == {"double"}
 
 
-def test_products_of_one_side(small_artifact: Path, make: Make) -> None:
+def test_products_of_one_side(small_artifact, make):
     without = make("b", products={"triangles": {"enabled": False}})
     a = open_artifact(small_artifact)
     found = diff_artifacts(a, without)
@@ -143,7 +142,7 @@ def test_products_of_one_side(small_artifact: Path, make: Make) -> None:
     assert found.spec == (Change("products.triangles.enabled", True, False),)
 
 
-def test_numbers_of_two_catalogs_are_not_the_same_star(small_artifact: Path) -> None:
+def test_numbers_of_two_catalogs_are_not_the_same_star(small_artifact):
     a, b = open_artifact(small_artifact), open_artifact(small_artifact)
     b.manifest["spec"]["catalog"]["source"] = "tycho2"
     b.manifest["software"]["numpy"] = "1.0"

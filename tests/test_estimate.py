@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
+from starcat.catalog.stars import with_columns
 from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import Inputs, build
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
@@ -47,7 +48,7 @@ def read(small, small_spec: str) -> CatalogSnapshot:
     return read_snapshot(spec_of(small_spec), small[1])
 
 
-def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
+def check(found: Estimate, folder: Path, least_bytes: int = 0, *, is_small: bool = False) -> None:
     """Compare an estimate with an artifact: stars to the last one, files within 20 %."""
     manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
     [stars, *_] = manifest["sources"]
@@ -59,6 +60,8 @@ def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
     report = sum(path.stat().st_size for path in (folder / "report").iterdir())
     for name, size in found.cost.files.items():
         real = (folder / name).stat().st_size
+        if name == "report" and is_small:
+            continue  # the report has pictures of their own size
         if name == "report":
             real = report + (folder / MANIFEST_NAME).stat().st_size
         assert size == pytest.approx(real, rel=0.2, abs=least_bytes), name
@@ -87,18 +90,7 @@ def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
 def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
     spec = spec_of(small_spec, **sections)
     built = build(spec, small[1], tmp_path)
-    # Of a few hundred rows a file is mostly its footer; the report has pictures of their own size.
-    check_small(estimate_spec(spec, small[1]), built.folder)
-
-
-def check_small(found: Estimate, folder: Path) -> None:
-    small_files = {**found.cost.files}
-    del small_files["report"]
-    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
-    assert found.cost.stars == manifest["products"]["stars"]["rows"]
-    assert found.rejected == manifest["sources"][0]["rejected"]
-    for name, size in small_files.items():
-        assert size == pytest.approx((folder / name).stat().st_size, rel=0.2), name
+    check(estimate_spec(spec, small[1]), built.folder, is_small=True)
 
 
 @pytest.mark.slow
@@ -152,19 +144,13 @@ def test_other_specs_are_as_estimated(changes, tmp_path):
 @pytest.mark.parametrize("most", [None, 5])
 def test_stars_are_chosen_as_in_a_build(read, small_spec, action, companions, most):
     """An estimate looks only at stars that are bright enough; that must not show."""
-    spec = spec_of(
-        small_spec,
-        selection={
-            "faint_limit_mag": 5.0,
-            "max_stars_per_field": most,
-            "doubles": {
-                "min_separation_deg": 3.0,
-                "max_delta_mag": 1.0,
-                "companion_limit_mag": companions,
-                "action": action,
-            },
-        },
-    )
+    doubles = {"min_separation_deg": 3.0, "max_delta_mag": 1.0, "action": action}
+    selection = {
+        "faint_limit_mag": 5.0,
+        "max_stars_per_field": most,
+        "doubles": {**doubles, "companion_limit_mag": companions},
+    }
+    spec = spec_of(small_spec, selection=selection)
     selected, fields = select_stars(read.stars, spec)
     found = choose_stars(read, spec)
     assert found.selected.guide_stars.equals(selected.guide_stars)
@@ -175,8 +161,7 @@ def test_stars_are_chosen_as_in_a_build(read, small_spec, action, companions, mo
 def test_stars_without_a_magnitude_are_counted(read, small_spec):
     mag = read.stars["mag"].to_numpy().copy()
     known = pa.array(mag, mask=np.arange(len(mag)) < 7)
-    place = read.stars.schema.get_field_index("mag")
-    stars = read.stars.set_column(place, read.stars.schema.field("mag").with_nullable(True), known)
+    stars = with_columns(read.stars, {"mag": known})
     found = choose_stars(replace(read, stars=stars), spec_of(small_spec))
     assert found.rejected["no_magnitude"] == 7
 
@@ -188,11 +173,8 @@ def test_stars_without_a_magnitude_are_counted(read, small_spec):
     count=st.integers(1, 40),
 )
 def test_the_brightest_of_fields_are_those_of_the_whole_tiling(read, mags, most, seed, count):
-    stars = read.stars.take(
-        pa.array(np.sort(np.random.default_rng(seed).permutation(len(read.stars))[: len(mags)]))
-    )
-    place = stars.schema.get_field_index("mag")
-    stars = stars.set_column(place, stars.schema.field("mag"), pa.array(mags))
+    rows = np.sort(np.random.default_rng(seed).permutation(len(read.stars))[: len(mags)])
+    stars = with_columns(read.stars.take(pa.array(rows)), {"mag": pa.array(mags)})
     spec = preset("gaia-12deg", {"camera.fov_x_deg": "60", "boresights.count": str(count)})
     whole = np.unique(tile_guide_stars(stars, spec).brightest(most)[1])
     assert np.array_equal(brightest_of_fields(stars, spec, most), whole)
@@ -251,21 +233,13 @@ def test_the_size_of_a_large_table_is_known_from_parts():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"camera.fov_x_deg": "30"}, "too dense to estimate: the 1,000,000 fields of the tiling"),
         (
-            {"boresights.count": "1000000", "camera.fov_x_deg": "30"},
-            "too dense to estimate: the 1,000,000 fields of the tiling",
-        ),
-        (
-            {
-                "boresights.count": "1000000",
-                "camera.fov_x_deg": "30",
-                "selection.max_stars_per_field": "10000",
-            },
+            {"camera.fov_x_deg": "30", "selection.max_stars_per_field": "10000"},
             "stars, limit 4,000,000; use a brighter faint_limit_mag",
         ),
         (
             {
-                "boresights.count": "1000000",
                 "camera.fov_x_deg": "0.1",
                 "products.levels.enabled": "true",
                 "products.levels.max_ratio": "1.1",
@@ -275,7 +249,8 @@ def test_the_size_of_a_large_table_is_known_from_parts():
     ],
 )
 def test_a_tiling_that_is_too_large_is_refused(read, changes, words):
-    spec = preset("sao-12deg", {**changes, "selection.variables.join": "[]"})
+    many = {"boresights.count": "1000000", "selection.variables.join": "[]"}
+    spec = preset("sao-12deg", {**many, **changes})
     with pytest.raises(BuildError, match=words):
         choose_stars(read, spec)
 

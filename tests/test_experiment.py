@@ -42,7 +42,7 @@ def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
     return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
 
 
-def test_the_matcher_is_told_the_share_of_the_trial(small_artifact: Path, tmp_path: Path):
+def test_the_matcher_is_told_the_share_of_the_trial(small_artifact, tmp_path):
     noise = Noise(drop_probability=0.5, false_stars=4, limit_mag=6.0)
     half = Experiment("half", "triangle", Attitudes("random", 30), noise, min_share=0.05)
     whole = replace(half, name="whole", min_share=1.0)
@@ -50,7 +50,7 @@ def test_the_matcher_is_told_the_share_of_the_trial(small_artifact: Path, tmp_pa
     assert statuses(whole, small_artifact, tmp_path).count("identified") == 0
 
 
-def test_the_installed_engine_answers_as_numpy_does(small_artifact: Path, tmp_path: Path):
+def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
     numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
     found = [

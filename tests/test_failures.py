@@ -8,14 +8,13 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pytest
 
 from starcat.cli.console import progress_bars
-from starcat.errors import ConfigError, ProductError, SourceMissing
+from starcat.errors import ConfigError, SourceMissing
 from starcat.failures import DEFECT, MAX_MESSAGE, failure_of, hint_in
 from starcat.pipeline import build as pipeline
 
@@ -141,17 +140,17 @@ def test_a_want_of_memory_is_no_defect(starcat, breaking):
     assert "out of memory (Unable to allocate 16.0 TiB) while 'starcat sources' ran" in run.err
 
 
-def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_lines, tmp_path):
+def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_file, tmp_path):
     """A build whose self-test breaks: nothing is left, and the last stage is said."""
-    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     (tmp_path / "spec.toml").write_text(small_spec)
 
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("division by zero")
 
     monkeypatch.setattr(pipeline, "run_self_test", broken)
-    stars = f"sao={tmp_path / 'sao.dat'}"
-    run = starcat(["build", tmp_path / "spec.toml", "--input", stars, "-o", tmp_path / "dist"])
+    run = starcat(
+        ["build", tmp_path / "spec.toml", "--input", f"sao={sao_file}", "-o", tmp_path / "dist"]
+    )
     assert run.code == 70
     assert re.search(r"'starcat build' at 'product \w+' ended with ZeroDivisionError", run.err)
     assert not list((tmp_path / "dist").glob("small*"))
@@ -238,12 +237,3 @@ def test_a_reader_that_goes_away_is_not_told(command):
     )  # fmt: skip
     os.close(write)
     assert (run.returncode, run.stderr) == (1, b"")
-
-
-def test_missing_is_not_damaged():
-    from starcat.artifact.reader import open_artifact
-    from starcat.errors import ArtifactMissing
-
-    with pytest.raises(ArtifactMissing) as caught:
-        open_artifact(Path("none-1.0.0"))
-    assert (caught.value.exit_code, ProductError.exit_code) == (3, 5)

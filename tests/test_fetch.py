@@ -25,7 +25,7 @@ import pytest
 from served import in_background
 
 import starcat
-from starcat.catalog.fetch import FetchReport, fetch_source
+from starcat.catalog.fetch import FetchedFile, FetchReport, fetch_source
 from starcat.catalog.integrity import LOCK_NAME, read_lock
 from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import cache_folder
@@ -208,6 +208,11 @@ def fetch(source: DataSource, folder: Path, **keys: Any) -> FetchReport:
     return fetch_source(source, folder, **{"retries": 2, "timeout_s": 5, "backoff_s": 0.0} | keys)
 
 
+def fetch_one(source: DataSource, folder: Path, **keys: Any) -> FetchedFile:
+    (file,) = fetch(source, folder, **keys).files
+    return file
+
+
 def break_off(archive: Archive, folder: Path, **keys: Any) -> str:
     """Serve a file whose first download ends half way, and return its address."""
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
@@ -238,10 +243,9 @@ def test_fetches_checks_and_reports(archive, tmp_path):
 
 
 def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
-    source = tiny
-    first = fetch(source, tmp_path).files[0]
+    first = fetch_one(tiny, tmp_path)
     lock = (tmp_path / LOCK_NAME).stat()
-    second = fetch(source, tmp_path).files[0]
+    second = fetch_one(tiny, tmp_path)
     assert len(archive.requests) == 1
     assert second.status == "present"
     assert (second.sha256, second.rows, second.url) == (first.sha256, first.rows, first.url)
@@ -256,7 +260,7 @@ def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path):
         fetch(source, tmp_path)
     assert names_in(tmp_path) == {"tiny.dat"}
     (tmp_path / "tiny.dat").write_bytes(BODY)
-    file = fetch(source, tmp_path).files[0]
+    file = fetch_one(source, tmp_path)
     assert (file.status, file.rows, file.url) == ("present", ROWS, "")
     assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
 
@@ -282,7 +286,7 @@ def test_lock_file_is_sorted_and_the_same_every_time(archive, tmp_path):
 @pytest.mark.parametrize("says_length", [True, False])
 def test_name_and_gzip_follow_the_address(archive, tmp_path, says_length):
     url = archive.serve("/get", PACKED, says_length=says_length) + "?file=some/tiny.dat.gz"
-    file = fetch(tiny_source(url), tmp_path).files[0]
+    file = fetch_one(tiny_source(url), tmp_path)
     assert file.name == "tiny.dat.gz"
     assert file.path.read_bytes() == PACKED
     assert (file.bytes, file.rows) == (len(PACKED), ROWS)
@@ -292,7 +296,7 @@ def test_name_and_gzip_follow_the_address(archive, tmp_path, says_length):
 def test_body_is_kept_as_sent(archive, tmp_path, name):
     url = archive.serve(f"/{name}", PACKED, encoding="gzip")
     if name.endswith(".gz"):
-        assert fetch(tiny_source(url), tmp_path).files[0].path.read_bytes() == PACKED
+        assert fetch_one(tiny_source(url), tmp_path).path.read_bytes() == PACKED
         return
     with pytest.raises(DownloadError, match="packs the body although"):
         fetch(tiny_source(url), tmp_path)
@@ -304,7 +308,7 @@ def test_default_name_of_a_part_has_the_part_in_it(archive, tmp_path):
     source = tiny_source(
         archive.url("/get-{part}"), file_names=["tiny.dat", "tiny.dat.{part}"], parts=["1"]
     )
-    assert fetch(source, tmp_path).files[0].name == "tiny.dat.1"
+    assert fetch_one(source, tmp_path).name == "tiny.dat.1"
 
 
 @pytest.mark.parametrize(
@@ -313,7 +317,7 @@ def test_default_name_of_a_part_has_the_part_in_it(archive, tmp_path):
 )
 def test_truncated_body_is_resumed_with_only_the_rest(archive, tmp_path, validators):
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], validators=validators)
-    file = fetch(tiny_source(url), tmp_path).files[0]
+    file = fetch_one(tiny_source(url), tmp_path)
     first, second = archive.requests
     assert (first.range, first.sent) == (None, HALF)
     assert (second.range, second.status) == (f"bytes={HALF}-", 206)
@@ -325,15 +329,21 @@ def test_truncated_body_is_resumed_with_only_the_rest(archive, tmp_path, validat
 
 
 @pytest.mark.parametrize(
-    "keys", [{"ranges": False}, {"validators": ()}, {"validators": ("weak ETag",)}]
+    ("keys", "statuses"),
+    [
+        ({"cut_after": [HALF], "ranges": False}, [200, 200]),
+        ({"cut_after": [HALF], "validators": ()}, [200, 200]),
+        ({"cut_after": [HALF], "validators": ("weak ETag",)}, [200, 200]),
+        ({"cut_after": [HALF], "shift_206": RECORD + 1}, [200, 206, 200]),
+        ({"statuses": [500, 503]}, [500, 503, 200]),
+    ],
 )
-def test_truncated_body_starts_over_where_it_cannot_be_resumed(archive, tmp_path, keys):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
-    file = fetch(tiny_source(url), tmp_path).files[0]
-    assert [request.status for request in archive.requests] == [200, 200]
-    assert archive.requests[1].sent == len(BODY)
-    assert file.status == "downloaded"
-    assert file.path.read_bytes() == BODY
+def test_a_download_starts_over_where_it_cannot_be_resumed(archive, tmp_path, keys, statuses):
+    url = archive.serve("/tiny.dat", BODY, **keys)
+    assert fetch_one(tiny_source(url), tmp_path).status == "downloaded"
+    assert [request.status for request in archive.requests] == statuses
+    assert archive.requests[-1].sent == len(BODY)
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
 def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(archive, tmp_path):
@@ -341,7 +351,7 @@ def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(ar
     with pytest.raises(DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"):
         fetch(tiny_source(url), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
     assert archive.requests[-1].range == "bytes=100-"
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
@@ -351,7 +361,7 @@ def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(ar
 def test_changed_remote_file_is_not_spliced(archive, tmp_path, body, heeds_if_range):
     url = break_off(archive, tmp_path, heeds_if_range=heeds_if_range)
     archive.remotes["/tiny.dat"].body = body
-    file = fetch(tiny_source(url, rows=body.count(b"\n")), tmp_path, retries=0).files[0]
+    file = fetch_one(tiny_source(url, rows=body.count(b"\n")), tmp_path, retries=0)
     assert archive.requests[1].range == f"bytes={HALF}-"
     assert file.status == "downloaded"
     assert file.path.read_bytes() == body
@@ -361,16 +371,9 @@ def test_changed_remote_file_is_not_spliced(archive, tmp_path, body, heeds_if_ra
 def test_partial_answer_without_validator_must_agree_on_the_size(archive, tmp_path, rows):
     url = break_off(archive, tmp_path, heeds_if_range=False, validates_206=False)
     archive.remotes["/tiny.dat"].body = body = records(rows, factor=7907)
-    assert fetch(tiny_source(url, rows=rows), tmp_path).files[0].status == "downloaded"
+    assert fetch_one(tiny_source(url, rows=rows), tmp_path).status == "downloaded"
     assert [request.status for request in archive.requests] == [200, 206, 200]
     assert (tmp_path / "tiny.dat").read_bytes() == body
-
-
-def test_partial_answer_that_begins_elsewhere_is_not_spliced(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], shift_206=RECORD + 1)
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
-    assert [request.status for request in archive.requests] == [200, 206, 200]
-    assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
 def test_rest_that_is_cut_short_without_a_length_is_noticed(archive, tmp_path):
@@ -380,13 +383,13 @@ def test_rest_that_is_cut_short_without_a_length_is_noticed(archive, tmp_path):
     archive.remotes["/tiny.dat"].says_length = False
     with pytest.raises(DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
         fetch(tiny_source(url), tmp_path, retries=0)
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
 
 
 def test_part_of_one_address_is_not_continued_from_another(archive, tmp_path):
     first = archive.serve("/1/tiny.dat", BODY, cut_after=[HALF])
     second = archive.serve("/2/tiny.dat", BODY)
-    file = fetch(tiny_source(first, second), tmp_path, retries=0).files[0]
+    file = fetch_one(tiny_source(first, second), tmp_path, retries=0)
     assert (file.url, file.status) == (second, "downloaded")
     assert archive.requests[1].range is None
 
@@ -399,7 +402,7 @@ def test_part_that_is_whole_is_taken_and_one_that_is_longer_is_not(
 ):
     url = break_off(archive, tmp_path)
     (tmp_path / "tiny.dat.part").write_bytes(part)
-    assert fetch(tiny_source(url), tmp_path).files[0].status == status
+    assert fetch_one(tiny_source(url), tmp_path).status == status
     assert len(archive.requests) == requests
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
@@ -426,15 +429,9 @@ def test_killed_download_is_resumed(archive, tmp_path):
         process.kill()
     stall.set()
     assert not (tmp_path / "tiny.dat").exists()
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
     assert archive.requests[-1].range == f"bytes={HALF}-"
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
-
-
-def test_server_errors_are_tried_again(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY, statuses=[500, 503])
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
-    assert [request.status for request in archive.requests] == [500, 503, 200]
 
 
 @pytest.mark.parametrize("retries", [0, -1])
@@ -454,19 +451,19 @@ def test_waits_double_between_attempts(archive, tmp_path, monkeypatch):
     assert waits == [1, 2, 4, 8, 16, 32, 60, 60]
 
 
-def test_next_address_after_not_found(archive, tmp_path):
-    gone, mirror = archive.url("/gone/tiny.dat"), archive.serve("/mirror/tiny.dat", BODY)
-    file = fetch(tiny_source(gone, mirror), tmp_path).files[0]
-    assert file.url == mirror
-    assert [request.status for request in archive.requests] == [404, 200]
-
-
-def test_next_address_after_a_wrong_file(archive, tmp_path):
-    wrong = archive.serve("/wrong/tiny.dat", b"<html>Log in to the hotel network</html>")
+@pytest.mark.parametrize(
+    ("keys", "others"),
+    [
+        ({"body": BODY, "statuses": [404]}, set()),
+        ({"body": b"<html>Log in to the hotel network</html>"}, {"tiny.dat.rejected"}),
+    ],
+)
+def test_the_next_address_is_taken_after_one_that_fails(archive, tmp_path, keys, others):
+    wrong = archive.serve("/wrong/tiny.dat", **keys)
     right = archive.serve("/right/tiny.dat", BODY)
-    file = fetch(tiny_source(wrong, right), tmp_path).files[0]
-    assert file.url == right
-    assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.rejected", LOCK_NAME}
+    assert fetch_one(tiny_source(wrong, right), tmp_path).url == right
+    assert len(archive.requests) == 2
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME} | others
 
 
 def test_all_addresses_fail(archive, tmp_path):
@@ -502,7 +499,7 @@ def test_committed_digest(archive, tmp_path, upper):
     assert str(caught.value.path) in str(caught.value)
     assert caught.value.exit_code == 3
     known = right.upper() if upper else right
-    assert fetch(tiny_source(url, sha256=known), tmp_path).files[0].sha256 == right
+    assert fetch_one(tiny_source(url, sha256=known), tmp_path).sha256 == right
 
 
 def test_second_arrival_must_match_the_first(archive, tmp_path):
@@ -516,7 +513,7 @@ def test_second_arrival_must_match_the_first(archive, tmp_path):
         assert text in str(caught.value)
     assert names_in(tmp_path) == {"tiny.dat.rejected", LOCK_NAME}
     (tmp_path / LOCK_NAME).unlink()
-    assert fetch(tiny_source(url), tmp_path).files[0].sha256 == sha256(OTHER)
+    assert fetch_one(tiny_source(url), tmp_path).sha256 == sha256(OTHER)
 
 
 def test_file_that_changed_in_the_folder_is_reported_and_left(archive, tmp_path):
@@ -592,7 +589,7 @@ def test_wrong_records_are_refused(archive, tmp_path, body, line, message, suffi
 )
 def test_harmless_line_ends_and_comments_are_accepted(archive, tmp_path, body):
     url = archive.serve("/tiny.dat", body)
-    assert fetch(tiny_source(url, comment="#"), tmp_path).files[0].rows == ROWS
+    assert fetch_one(tiny_source(url, comment="#"), tmp_path).rows == ROWS
 
 
 def test_lines_are_numbered_across_blocks(archive, tmp_path, monkeypatch):
@@ -608,14 +605,9 @@ def test_lines_are_numbered_across_blocks(archive, tmp_path, monkeypatch):
 @pytest.mark.parametrize("end", [b"", b"\n", b"\n\n", b"\n/\n"])
 def test_delimited_records_are_counted_without_comments(archive, tmp_path, end):
     body = b"//1\n/not a comment|2\na|b\n\n//\nlong|" + b"x" * 99 + end
-    source = tiny_source(
-        archive.serve("/tiny.dat", body),
-        layout="delimited",
-        comment="//",
-        rows=None,
-        record_bytes=None,
-    )
-    assert fetch(source, tmp_path).files[0].rows == 3 + end.count(b"/")
+    keys = {"layout": "delimited", "comment": "//", "rows": None, "record_bytes": None}
+    source = tiny_source(archive.serve("/tiny.dat", body), **keys)
+    assert fetch_one(source, tmp_path).rows == 3 + end.count(b"/")
 
 
 @pytest.mark.parametrize(
@@ -628,16 +620,10 @@ def test_delimited_records_are_counted_without_comments(archive, tmp_path, end):
     ],
 )
 def test_binary_records(archive, tmp_path, body, message):
-    source = tiny_source(
-        archive.serve("/tiny.dat", body),
-        layout="binary",
-        record_bytes=10,
-        header_bytes=4,
-        magic="HEAD",
-        rows=3,
-    )
+    keys = {"layout": "binary", "record_bytes": 10, "header_bytes": 4, "magic": "HEAD", "rows": 3}
+    source = tiny_source(archive.serve("/tiny.dat", body), **keys)
     if message is None:
-        assert fetch(source, tmp_path).files[0].rows == 3
+        assert fetch_one(source, tmp_path).rows == 3
         return
     with pytest.raises(ParseError, match=message):
         fetch(source, tmp_path)
@@ -714,7 +700,7 @@ def test_part_that_is_gone_does_not_count(archive, tmp_path):
     source = parted(archive, rows=61)
     fetch(source, tmp_path, parts=["00", "02"])
     (tmp_path / "tiny.dat.00.gz").unlink()
-    assert fetch(source, tmp_path, parts=["01"]).files[0].rows == 20
+    assert fetch_one(source, tmp_path, parts=["01"]).rows == 20
 
 
 def test_gaia_comes_in_a_package(tmp_path):
@@ -727,15 +713,15 @@ def test_gaia_comes_in_a_package(tmp_path):
 
 
 def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
-    source = tiny
-    extra = source.files[0].model_copy(
-        update={"name": "extra", "file_names": ("extra.dat",), "urls": (), "optional": True}
+    changes = {"name": "extra", "file_names": ("extra.dat",), "urls": ()}
+    optional, required = (
+        tiny.files[0].model_copy(update={**changes, "optional": is_optional})
+        for is_optional in (True, False)
     )
-    report = fetch(source.model_copy(update={"files": (source.files[0], extra)}), tmp_path)
-    assert [file.name for file in report.files] == ["tiny.dat"]
-    required = extra.model_copy(update={"optional": False})
+    source = tiny.model_copy(update={"files": (tiny.files[0], optional)})
+    assert fetch_one(source, tmp_path).name == "tiny.dat"
     with pytest.raises(SourceMissing):
-        fetch(source.model_copy(update={"files": (source.files[0], required)}), tmp_path)
+        fetch(tiny.model_copy(update={"files": (tiny.files[0], required)}), tmp_path)
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hostname", "sftp://127.0.0.1/tiny.dat", "tiny.dat"])
@@ -778,7 +764,7 @@ def test_full_disk_is_not_tried_again(archive, tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len(archive.requests) == 1
-    assert fetch(source, tmp_path).files[0].status == "resumed"
+    assert fetch_one(source, tmp_path).status == "resumed"
     assert archive.requests[1].range == f"bytes={HALF}-"
 
 
@@ -870,8 +856,7 @@ def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
 
 
 def test_parallel_fetches_of_one_file_download_it_once(archive, tiny, tmp_path):
-    source = tiny
-    reports = in_parallel(*[partial(fetch, source, tmp_path)] * 4)
+    reports = in_parallel(*[partial(fetch, tiny, tmp_path)] * 4)
     statuses = sorted(report.files[0].status for report in reports)
     assert statuses == ["downloaded", "present", "present", "present"]
     assert len(archive.requests) == 1
@@ -891,7 +876,7 @@ def test_where_there_are_no_locks_every_fetch_has_its_own_part(archive, tmp_path
     monkeypatch.setattr("starcat.storage.locks.fcntl", None)
     (tmp_path / "tiny.dat.part").write_bytes(OTHER[:HALF])  # of another process, at work
     source = tiny_source(archive.serve("/tiny.dat", BODY))
-    assert fetch(source, tmp_path).files[0].status == "downloaded"
+    assert fetch_one(source, tmp_path).status == "downloaded"
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
     assert (tmp_path / "tiny.dat.part").read_bytes() == OTHER[:HALF]
     assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.part", LOCK_NAME}

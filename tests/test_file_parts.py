@@ -21,8 +21,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
 
-SOURCE = data_source("2mass")
-PSC = SOURCE.files[0]
+PSC = data_source("2mass").files[0]
 ROWS = 400
 
 
@@ -45,6 +44,12 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of some 30 records."""
     monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 10_000)
+
+
+def read_alone(path: Path, number: int) -> tuple[FileReading, list[Part]]:
+    parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
+    file = InputFile(path, PSC, "2mass", number)
+    return next((reading, list(parts)) for reading, parts in read_files([file], parse))
 
 
 def same(one: Ingested, other: Ingested) -> None:
@@ -75,9 +80,7 @@ def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
     whole = ingest("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
     stars, rejected, counted, facts = [], [], 0, []
     for number, path in enumerate(parts[:3]):
-        reading = FileReading(InputFile(path, PSC), number, SOURCE)
-        parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
-        blocks = [part for _, parsed in read_files([reading], parse) for part in parsed]
+        reading, blocks = read_alone(path, number)
         assert len(blocks) > 5
         stars += [part.stars for part in blocks]
         rejected += [part.rejected for part in blocks]
@@ -93,7 +96,7 @@ def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
 
 
 def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
-    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
+    reading = FileReading(InputFile(parts[0], PSC, "2mass"))
     next(reading.blocks())
     with pytest.raises(SourceError, match="not read to its end"):
         _ = reading.facts
@@ -138,9 +141,7 @@ def test_an_interrupted_reading_stops(parts):
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("rows", [1, 50, 10_000])
 def test_merged_blocks_hold_the_same_in_the_same_order(parts, rows):
-    parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
-    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
-    blocks = [part for _, parsed in read_files([reading], parse) for part in parsed]
+    _, blocks = read_alone(parts[0], 0)
     joined = list(merged(blocks, rows))
 
     def tables(some: list[Part]) -> list[pa.Table]:

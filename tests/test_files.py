@@ -8,17 +8,18 @@ import random
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 from starcat.catalog.readers import blocks as blocks_module
-from starcat.catalog.readers.blocks import Block, DigestReader, map_in_order, read_blocks
+from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.fixed_width import parse_binary
 from starcat.catalog.source import Column, DataSource, RecordFile
 from starcat.catalog.source_files import InputFile, SourceFiles, lacking
 from starcat.errors import ParseError, SourceError, SourceMissing
+from starcat.threads import map_in_order
 
 LINES = b"".join(b"%05d\n" % number for number in range(1, 2001))
 
@@ -69,7 +70,7 @@ def pack(count: int) -> bytes:
 
 def read(path: Path, layout: RecordFile) -> tuple[list[Block], list[DigestReader]]:
     ends: list[DigestReader] = []
-    blocks = list(read_blocks(InputFile(path, layout), "tiny", ends.append))
+    blocks = list(read_blocks(InputFile(path, layout, "tiny"), ends.append))
     return blocks, ends
 
 
@@ -96,15 +97,7 @@ def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
     assert b"".join(block.data for block in blocks) == content
     assert all(block.data.endswith(b"\n") for block in blocks[:-1])
     assert [int(block.data[:5]) for block in blocks] == [block.first_line for block in blocks]
-    assert len(ends) == 1
-
-
-@pytest.mark.parametrize("is_gzip", [False, True])
-@pytest.mark.usefixtures("small_blocks")
-def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path, is_gzip):
-    path = tmp_path / "tiny.dat"
-    path.write_bytes(gzip.compress(LINES) if is_gzip else LINES)
-    _, (digest,) = read(path, text_file())
+    (digest,) = ends
     assert digest.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert digest.bytes_read == path.stat().st_size
 
@@ -134,7 +127,7 @@ def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path):
     path.write_bytes(compressed[: len(compressed) // 2])
     seen, ends = [], []
     with pytest.raises(ParseError, match=r"cut off after line \d+ .*fetch") as caught:
-        seen.extend(read_blocks(InputFile(path, text_file()), "tiny", ends.append))
+        seen.extend(read_blocks(InputFile(path, text_file(), "tiny"), ends.append))
     assert caught.value.path == path
     assert str(path) in str(caught.value)
     assert caught.value.line == sum(block.data.count(b"\n") for block in seen)
@@ -161,28 +154,26 @@ def test_no_cut_and_no_changed_byte_gives_other_lines(tmp_path):
     assert unseen < 3  # a code length of a letter that does not occur
 
 
-def test_gzip_with_a_wrong_checksum(tmp_path):
-    path = tmp_path / "tiny.dat.gz"
-    whole = bytearray(gzip.compress(LINES))
-    whole[-8] ^= 1
-    path.write_bytes(bytes(whole))
-    with pytest.raises(ParseError, match="damaged"):
-        read(path, text_file())
+WRONG_SUM = bytearray(gzip.compress(LINES, mtime=0))
+WRONG_SUM[-8] ^= 1
 
 
-def test_rubbish_behind_a_gzip_member(tmp_path):
-    path = tmp_path / "tiny.dat.gz"
-    path.write_bytes(gzip.compress(LINES) + b"rubbish" * 2)
-    with pytest.raises(ParseError, match="damaged"):
-        read(path, text_file())
-
-
-@pytest.mark.parametrize("content", [b"", gzip.compress(b"", mtime=0)])
-def test_an_empty_file_is_refused(tmp_path, content):
+@pytest.mark.parametrize(
+    ("layout", "content", "message"),
+    [
+        (text_file(), WRONG_SUM, "damaged"),
+        (text_file(), gzip.compress(LINES, mtime=0) + b"rubbish" * 2, "damaged"),
+        (text_file(), b"", r"tiny\.dat: the file is empty; expected records of tiny"),
+        (text_file(), gzip.compress(b"", mtime=0), r"tiny\.dat: the file is empty"),
+        (BINARY, pack(0), "empty"),
+        (BINARY, gzip.compress(pack(5), mtime=0)[:12], "cut off"),
+    ],
+)
+def test_damaged_and_empty_files_are_refused(tmp_path, layout, content, message):
     path = tmp_path / "tiny.dat"
     path.write_bytes(content)
-    with pytest.raises(ParseError, match=r"tiny\.dat: the file is empty; expected records of tiny"):
-        read(path, text_file())
+    with pytest.raises(ParseError, match=message):
+        read(path, layout)
 
 
 def test_a_file_that_cannot_be_opened(tmp_path):
@@ -227,30 +218,17 @@ def test_a_binary_file_of_another_kind(tmp_path, content, found):
     assert caught.value.byte_range == (1, 8)
 
 
-def test_a_binary_file_with_only_its_header_is_empty(tmp_path):
-    path = tmp_path / "packed.bin"
-    path.write_bytes(pack(0))
-    with pytest.raises(ParseError, match="empty"):
-        read(path, BINARY)
-
-
-def test_a_gzipped_binary_file_cut_off_in_its_header(tmp_path):
-    path = tmp_path / "packed.bin.gz"
-    path.write_bytes(gzip.compress(pack(5))[:12])
-    with pytest.raises(ParseError, match="cut off"):
-        read(path, BINARY)
-
-
-def test_parts_are_read_in_the_order_of_the_archive(tmp_path):
-    for name in ("many.02", "many.00.gz", "many.01"):
-        (tmp_path / name).write_bytes(b"")
-    expected = [("many.00.gz", "many"), ("many.01", "many"), ("many.02", "many")]
-    assert names_found([tmp_path]) == expected
+def put(folder: Path, names: Iterable[str]) -> Path:
+    """Put empty files into a folder."""
+    for name in names:
+        (folder / name).write_bytes(b"")
+    return folder
 
 
 @pytest.mark.parametrize(
     ("present", "expected"),
     [
+        (["many.02", "many.00.gz", "many.01"], ["many.00.gz", "many.01", "many.02"]),
         (["many.dat"], ["many.dat"]),
         (["many.dat.gz"], ["many.dat.gz"]),
         (["many.dat", "many.dat.gz"], ["many.dat"]),
@@ -260,31 +238,26 @@ def test_parts_are_read_in_the_order_of_the_archive(tmp_path):
     ],
 )
 def test_what_a_folder_gives(tmp_path, present, expected):
-    for name in present:
-        (tmp_path / name).write_bytes(b"")
-    assert [name for name, _ in names_found([tmp_path])] == expected
+    found = names_found([put(tmp_path, present)])
+    assert found == [(name, name.split(".")[0]) for name in expected]
 
 
-def test_a_missing_part_is_named(tmp_path):
-    (tmp_path / "many.00").write_bytes(b"")
-    (tmp_path / "many.02").write_bytes(b"")
-    with pytest.raises(SourceMissing, match=r"has 2 of 3 parts of many.\{part\}; missing: 01\."):
-        SourceFiles.find(SOURCE, [tmp_path])
+TEN_TO_40 = source_of(text_file(file_names=("t.{part}",), parts=tuple(map(str, range(10, 40)))))
 
 
-def test_many_missing_parts_are_not_all_named(tmp_path):
-    source = source_of(text_file(file_names=("t.{part}",), parts=tuple(map(str, range(10, 40)))))
-    (tmp_path / "t.10").write_bytes(b"")
-    with pytest.raises(SourceMissing, match="missing: 11, 12, 13, 14, 15, 16, 17, 18 …"):
-        SourceFiles.find(source, [tmp_path])
-
-
-@pytest.mark.parametrize("present", [[], ["extra.dat"], ["other.dat"]])
-def test_a_folder_without_the_file_that_is_needed(tmp_path, present):
-    for name in present:
-        (tmp_path / name).write_bytes(b"")
-    with pytest.raises(SourceMissing, match="starcat fetch tiny") as caught:
-        SourceFiles.find(SOURCE, [tmp_path])
+@pytest.mark.parametrize(
+    ("source", "present", "message"),
+    [
+        (SOURCE, ["many.00", "many.02"], r"has 2 of 3 parts of many.\{part\}; missing: 01\."),
+        (TEN_TO_40, ["t.10"], "missing: 11, 12, 13, 14, 15, 16, 17, 18 …"),
+        (SOURCE, [], "starcat fetch tiny"),
+        (SOURCE, ["extra.dat"], "starcat fetch tiny"),
+        (SOURCE, ["other.dat"], "starcat fetch tiny"),
+    ],
+)
+def test_a_folder_without_a_file_that_is_needed(tmp_path, source, present, message):
+    with pytest.raises(SourceMissing, match=message) as caught:
+        SourceFiles.find(source, [put(tmp_path, present)])
     assert caught.value.path == tmp_path
 
 
@@ -296,22 +269,16 @@ def test_a_path_that_does_not_exist(tmp_path):
 @pytest.mark.parametrize(
     ("name", "layout"),
     [
-        ("many.01", "many"),
-        ("many.07.gz", "many"),
-        ("extra.dat", "extra"),
-        ("extra.dat.gz", "extra"),
-        ("renamed.txt", "many"),
-        ("extraxdat", "many"),
+        ("many.01", "many"), ("many.07.gz", "many"), ("extra.dat", "extra"),
+        ("extra.dat.gz", "extra"), ("renamed.txt", "many"), ("extraxdat", "many"),
     ],
-)
+)  # fmt: skip
 def test_layout_of_a_file_by_its_name_or_the_first(tmp_path, name, layout):
-    (tmp_path / name).write_bytes(b"")
-    assert names_found([tmp_path / name]) == [(name, layout)]
+    assert names_found([put(tmp_path, [name]) / name]) == [(name, layout)]
 
 
 def test_files_named_one_by_one_keep_their_order(tmp_path):
-    for name in ("many.02", "many.00"):
-        (tmp_path / name).write_bytes(b"")
+    put(tmp_path, ["many.02", "many.00"])
     found = names_found([tmp_path / "many.02", tmp_path / "many.00"])
     assert [name for name, _ in found] == ["many.02", "many.00"]
 
@@ -330,9 +297,7 @@ def test_files_named_one_by_one_keep_their_order(tmp_path):
     ],
 )
 def test_what_a_folder_lacks_of_a_source(tmp_path, names, expected):
-    for name in names:
-        (tmp_path / name).write_bytes(b"")
-    assert lacking(SOURCE, tmp_path) == expected
+    assert lacking(SOURCE, put(tmp_path, names)) == expected
 
 
 def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path):
@@ -340,7 +305,7 @@ def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path):
     assert lacking(SOURCE, tmp_path) is None
 
 
-@pytest.mark.parametrize("workers", [1, 2, 5])
+@pytest.mark.parametrize("workers", [0, 1, 2, 5])
 def test_results_come_in_the_order_of_the_items(workers):
     delays = random.Random(7)
     waits = [delays.uniform(0.0, 0.004) for _ in range(60)]
@@ -366,8 +331,23 @@ def test_no_more_than_a_few_items_are_read_ahead():
     results.close()
 
 
-def test_no_items():
-    assert list(map_in_order(str, iter(()))) == []
+def test_a_dropped_generator_may_be_closed_by_its_own_thread():
+    box = []
+    dropped, closed = threading.Event(), threading.Event()
+
+    def work(item: int) -> int:
+        if item == 3:  # as the garbage collector does, in whatever thread it runs
+            dropped.wait(5.0)
+            box.pop().close()
+            closed.set()
+        return item
+
+    results = map_in_order(work, iter(range(100)), workers=1)
+    box.append(results)
+    assert [next(results), next(results)] == [0, 1]
+    del results
+    dropped.set()
+    assert closed.wait(5.0)
 
 
 @pytest.mark.parametrize("bad", [0, 3, 9])

@@ -94,27 +94,14 @@ def test_a_number_in_another_format_than_its_column_is_the_float_of_its_text(
 @pytest.mark.parametrize(
     ("format_", "text", "expected"),
     [
-        ("F5.2", " 5.25", 5.25),
-        ("F5.2", "+5.25", 5.25),
-        ("F5.2", "-5.25", -5.25),
-        ("F5.2", " -.25", -0.25),
-        ("F5.2", "  .25", 0.25),
-        ("F5.2", " 5.2 ", 5.2),
-        ("F5.2", " 5.  ", 5.0),
-        ("F5.2", "5.250", 5.25),
-        ("F5.2", "5.25 ", 5.25),
-        ("F5.2", "  525", 525.0),
-        ("F5.2", "1.5E2", 150.0),
-        ("D6.1", "1.5D02", 150.0),
-        ("I3", "007", 7.0),
-        ("I3", " -7", -7.0),
-        ("I3", "+7 ", 7.0),
-        ("I3", "7. ", 7.0),
-        ("F3.2", ".25", 0.25),
-        ("I1", "7", 7.0),
-        ("F20.17", " 0.10000000000000001", 0.1),
+        ("F5.2", " 5.25", 5.25), ("F5.2", "+5.25", 5.25), ("F5.2", "-5.25", -5.25),
+        ("F5.2", " -.25", -0.25), ("F5.2", "  .25", 0.25), ("F5.2", " 5.2 ", 5.2),
+        ("F5.2", " 5.  ", 5.0), ("F5.2", "5.250", 5.25), ("F5.2", "5.25 ", 5.25),
+        ("F5.2", "  525", 525.0), ("F5.2", "1.5E2", 150.0), ("D6.1", "1.5D02", 150.0),
+        ("I3", "007", 7.0), ("I3", " -7", -7.0), ("I3", "+7 ", 7.0), ("I3", "7. ", 7.0),
+        ("F3.2", ".25", 0.25), ("I1", "7", 7.0), ("F20.17", " 0.10000000000000001", 0.1),
     ],
-)
+)  # fmt: skip
 def test_ways_to_write_a_number(format_, text, expected):
     parsed = parse_texts([text], format_)
     assert parsed.problems == []
@@ -153,37 +140,27 @@ def test_texts_that_mean_no_value(format_, null, texts, is_null):
 @pytest.mark.parametrize(
     ("format_", "text"),
     [
-        ("F5.2", " 5.x5"),
-        ("F5.2", "abcde"),
-        ("F5.2", "--5.0"),
-        ("F5.2", "-+5.0"),
-        ("F5.2", "1 2.5"),
-        ("F5.2", "- 2.5"),
-        ("F5.2", "  -  "),
-        ("F5.2", "    ."),
-        ("F5.2", "  -. "),
-        ("F5.2", "1.2.3"),
-        ("F5.2", "2.5 5"),
-        ("F5.2", "1.-25"),
-        ("F5.2", " 1. 5"),
-        ("F5.2", "  nan"),
-        ("F5.2", "  inf"),
-        ("F5.2", "1E999"),
-        ("F5.2", " 0x10"),
-        ("F5.2", "1_2.5"),
-        ("I5", "    -"),
-        ("I5", "1 2 3"),
-        ("I5", "--123"),
+        ("F5.2", " 5.x5"), ("F5.2", "abcde"), ("F5.2", "--5.0"), ("F5.2", "-+5.0"),
+        ("F5.2", "1 2.5"), ("F5.2", "- 2.5"), ("F5.2", "  -  "), ("F5.2", "    ."),
+        ("F5.2", "  -. "), ("F5.2", "1.2.3"), ("F5.2", "2.5 5"), ("F5.2", "1.-25"),
+        ("F5.2", " 1. 5"), ("F5.2", "  nan"), ("F5.2", "  inf"), ("F5.2", "1E999"),
+        ("F5.2", " 0x10"), ("F5.2", "1_2.5"), ("I5", "    -"), ("I5", "1 2 3"), ("I5", "--123"),
         ("I5", "12-34"),
-        ("I5", "  1.5"),
-        ("I5", "1E-99"),
     ],
-)
+)  # fmt: skip
 def test_a_field_that_is_no_number_of_its_kind(format_, text):
     parsed = parse_texts(["    1", text, "    2"], format_)
     assert parsed["x"].tolist() == [1.0, 2.0]
     assert parsed.line.tolist() == [1, 3]
     assert parsed.problems == [Problem(2, "x", (1, 5), repr(text), f"a number like {format_}")]
+
+
+@pytest.mark.parametrize(("text", "found"), [("  1.5", "1.5"), ("1E-99", "1e-99")])
+def test_a_fraction_where_a_whole_number_belongs(text, found):
+    parsed = parse_texts(["    1", text, "    2"], "I5")
+    assert parsed.line.tolist() == [1, 3]
+    expected = "a whole number, -99999 to 99999"
+    assert parsed.problems == [Problem(2, "x", (1, 5), found, expected)]
 
 
 def test_bytes_beyond_ascii_are_reported_as_they_are():
@@ -255,24 +232,12 @@ def test_problems_come_in_the_order_of_the_lines():
     assert [problem.line for problem in problems] == [1, 2, 3, 4, 6]
 
 
-@given(
-    st.lists(
-        st.sampled_from(
-            [
-                GOOD,
-                b"xyz  7|-1.5 ",
-                b"short",
-                b"",
-                b"abc x2| 5.25",
-                b"abc   |     ",
-                b"q  999|     ",
-            ]
-        ),
-        min_size=1,
-        max_size=12,
-    ),
-    st.data(),
+SOME_LINES = st.sampled_from(
+    [GOOD, b"xyz  7|-1.5 ", b"short", b"", b"abc x2| 5.25", b"abc   |     ", b"q  999|     "]
 )
+
+
+@given(st.lists(SOME_LINES, min_size=1, max_size=12), st.data())
 def test_blocks_do_not_matter(lines, data):
     cut = data.draw(st.integers(0, len(lines)))
     whole = parse_named(b"".join(line + b"\n" for line in lines))

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+from artifact_copies import copied, seal
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from starcat.artifact.manifest import manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError, StarcatError
@@ -23,19 +22,18 @@ from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.product_table import PRODUCTS
 
 FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
-"""Two targets of so many cases each."""
+LONG = pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])
+few_or_many = pytest.mark.parametrize("some", [FEW, LONG], ids=["few", "many"])
 
 
 @pytest.fixture(scope="module")
 def copy(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy that every case spoils and puts back."""
-    folder = tmp_path_factory.mktemp("fuzz") / small_artifact.name
-    return Path(shutil.copytree(small_artifact, folder, copy_function=shutil.copyfile))
+    return copied(small_artifact, tmp_path_factory.mktemp("fuzz"))
 
 
 @pytest.fixture(scope="module")
@@ -98,27 +96,16 @@ def check_bytes(artifact: Path, name: str, data: bytes, method: str, frame: Any)
         found = verify_artifact(artifact).findings
         assert data == before or name in {finding.file for finding in found}
         identify(artifact, method, frame)
-        try:
+        with suppress(StarcatError):
             opened = open_artifact(artifact)
             for product in opened.products:
                 assert opened.table(product).num_columns
-        except StarcatError:
-            pass
     finally:
         path.write_bytes(before)
 
 
-def test_changed_bytes_are_found_and_hurt_nobody(copy: Path, frame: Any) -> None:
-    run_bytes(FEW, copy, frame)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_thousand_changes_of_bytes_hurt_nobody(copy: Path, frame: Any) -> None:
-    run_bytes(MANY, copy, frame)
-
-
-def run_bytes(some: settings, copy: Path, frame: Any) -> None:
+@few_or_many
+def test_changed_bytes_are_found_and_hurt_nobody(some, copy, frame):
     @some
     @given(
         name=st.sampled_from(FILES),
@@ -140,19 +127,9 @@ Structure = Callable[[h5py.Group, str, Path], object]
 """Put something else at a name of a group; the path is of a whole database beside the file."""
 
 
-def external_link(group: h5py.Group, name: str, other: Path) -> None:
-    group[name] = h5py.ExternalLink(str(other), f"{group.name}/{name}")
-
-
-def soft_link(group: h5py.Group, name: str, other: Path) -> None:
-    product = group.name.strip("/")
-    group[name] = h5py.SoftLink(f"/{product or 'pairs'}")
-
-
 def virtual(group: h5py.Group, name: str, other: Path) -> None:
-    source = h5py.VirtualSource(str(other), "stars/mag", (10,))
     layout = h5py.VirtualLayout((10,), "f8")
-    layout[:] = source
+    layout[:] = h5py.VirtualSource(str(other), "stars/mag", (10,))
     group.create_virtual_dataset(name, layout)
 
 
@@ -161,37 +138,31 @@ def in_a_raw_file(group: h5py.Group, name: str, other: Path) -> None:
 
 
 def without_storage(shape: Any, dtype: Any = "f8", **options: Any) -> Structure:
-    def make(group: h5py.Group, name: str, other: Path) -> None:
-        group.create_dataset(name, shape, dtype, **options)
-
-    return make
+    return lambda group, name, other: group.create_dataset(name, shape, dtype, **options)
 
 
-def holding(values: Any) -> Structure:
-    def make(group: h5py.Group, name: str, other: Path) -> None:
-        group[name] = values
-
-    return make
+def holding(value: Any) -> Structure:
+    return lambda group, name, other: group.__setitem__(name, value)
 
 
-def in_a_circle(group: h5py.Group, name: str, other: Path) -> None:
-    group[name] = group["/"]
+def linking(make: Callable[[h5py.Group, str, Path], Any]) -> Structure:
+    return lambda group, name, other: group.__setitem__(name, make(group, name, other))
 
 
 STRUCTURES: dict[str, Structure] = {
-    "external link": external_link,
-    "soft link": soft_link,
-    "dangling link": lambda group, name, other: group.__setitem__(name, h5py.SoftLink("/nowhere")),
+    "external link": linking(lambda g, name, o: h5py.ExternalLink(str(o), f"{g.name}/{name}")),
+    "soft link": linking(lambda g, name, o: h5py.SoftLink(f"/{g.name.strip('/') or 'pairs'}")),
+    "dangling link": holding(h5py.SoftLink("/nowhere")),
     "virtual": virtual,
     "raw file": in_a_raw_file,
     "group": lambda group, name, other: group.create_group(name),
-    "circle": in_a_circle,
+    "circle": linking(lambda g, name, o: g["/"]),
     "4e9 rows": without_storage((4_000_000_000,)),
     "2e18 rows": without_storage((2_000_000_000_000_000_000,)),
     "endless": without_storage((100,), chunks=(10,), maxshape=(None,)),
     "4e9 rows in chunks": without_storage((4_000_000_000,), chunks=(1000,)),
     "nothing": without_storage((0,)),
-    "no shape": lambda group, name, other: group.__setitem__(name, h5py.Empty("f8")),
+    "no shape": holding(h5py.Empty("f8")),
     "one number": holding(3.0),
     "a table": holding(np.zeros((10, 2))),
     "texts": holding(["a", "b"]),
@@ -199,7 +170,7 @@ STRUCTURES: dict[str, Structure] = {
     "truth values": holding(np.zeros(10, bool)),
     "complex": holding(np.zeros(10, complex)),
     "other end first": holding(np.zeros(10, ">i4")),
-    "a type": lambda group, name, other: group.__setitem__(name, np.dtype("i4")),
+    "a type": holding(np.dtype("i4")),
     "references": without_storage((10,), h5py.ref_dtype),
     "opaque": holding(np.zeros(10, "V7")),
     "other rows": holding(np.arange(10)),
@@ -210,38 +181,28 @@ DATASETS = [(product, name) for product, layout in PRODUCTS.items() for name in 
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 
-def spoil_database(artifact: Path, change: Callable[[h5py.File], object]) -> bytes:
-    """Change the database, make all digests right again, and return how it was."""
+@contextmanager
+def spoilt_database(artifact: Path, change: Callable[[h5py.File], object]) -> Iterator[None]:
+    """Change the database and make all digests right again; put it back in the end."""
     path = artifact / "database.h5"
     before = path.read_bytes()
     with h5py.File(path, "r+") as file:
         change(file)
     seal(artifact)
-    return before
-
-
-def seal(artifact: Path) -> None:
-    manifest = json.loads((artifact / "manifest.json").read_bytes())
-    path = artifact / "database.h5"
-    held = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
-    manifest["files"]["database.h5"] = held
-    manifest["manifest_sha256"] = manifest_digest(manifest)
-    (artifact / "manifest.json").write_bytes(json_bytes(manifest))
-
-
-def restore(artifact: Path, before: bytes) -> None:
-    (artifact / "database.h5").write_bytes(before)
-    seal(artifact)
-
-
-def test_a_name_that_is_no_text_is_told(copy: Path) -> None:
-    text = h5py.string_dtype("utf-8")
-    before = spoil_database(copy, lambda file: file.attrs.create("name", b"sm\xff", dtype=text))
     try:
-        with pytest.raises(ProductError, match="not a readable starcat database"):
-            open_database(copy)
+        yield
     finally:
-        restore(copy, before)
+        path.write_bytes(before)
+        seal(artifact)
+
+
+def test_a_name_that_is_no_text_is_told(copy):
+    text = h5py.string_dtype("utf-8")
+    with (
+        spoilt_database(copy, lambda file: file.attrs.create("name", b"sm\xff", dtype=text)),
+        pytest.raises(ProductError, match="not a readable starcat database"),
+    ):
+        open_database(copy)
 
 
 def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.File], object]:
@@ -261,14 +222,10 @@ def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.
 def test_a_structure_that_no_build_writes_is_refused(
     structure, product, name, copy, small_artifact
 ):
-    other = small_artifact / "database.h5"
-    before = spoil_database(copy, put(product, name, structure, other))
-    try:
+    with spoilt_database(copy, put(product, name, structure, small_artifact / "database.h5")):
         with pytest.raises(ProductError) as caught:
             Matcher.open(copy, "pairs")
         assert verify_artifact(copy).findings
-    finally:
-        restore(copy, before)
     text = str(caught.value)
     assert text.count(str(copy / "database.h5")) == 1
     assert f"{product}/{name}" in text if name else product in text
@@ -276,28 +233,15 @@ def test_a_structure_that_no_build_writes_is_refused(
 
 
 @pytest.mark.parametrize("link", ["external link", "virtual", "raw file"])
-def test_no_other_file_is_read(link: str, copy: Path, small_artifact: Path) -> None:
+def test_no_other_file_is_read(link, copy, small_artifact):
     """The answer is the same whether the other file has the right values or is not there."""
     texts = set()
     for other in (small_artifact / "database.h5", copy / "nowhere.h5"):
-        before = spoil_database(copy, put("stars", "mag", link, other))
-        try:
+        with spoilt_database(copy, put("stars", "mag", link, other)):
             with pytest.raises(ProductError) as caught:
                 open_database(copy)
             texts.add(str(caught.value))
-        finally:
-            restore(copy, before)
     assert len(texts) == 1
-
-
-def test_made_up_databases_hurt_nobody(copy: Path, frame: Any, small_artifact: Path) -> None:
-    run_structures(FEW, copy, frame, small_artifact / "database.h5")
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_a_thousand_made_up_databases_hurt_nobody(copy, frame, small_artifact):
-    run_structures(MANY, copy, frame, small_artifact / "database.h5")
 
 
 VALUES: dict[str, list[Any]] = {
@@ -312,7 +256,10 @@ NUMBERS: list[Any] = [
 ]  # fmt: skip
 
 
-def run_structures(some: settings, copy: Path, frame: Any, other: Path) -> None:
+@few_or_many
+def test_made_up_databases_hurt_nobody(some, copy, frame, small_artifact):
+    other = small_artifact / "database.h5"
+
     @some
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
@@ -323,29 +270,18 @@ def run_structures(some: settings, copy: Path, frame: Any, other: Path) -> None:
             name = data.draw(st.sampled_from(names))
             change = put(product, name, data.draw(st.sampled_from(sorted(STRUCTURES))), other)
         elif kind == "values":
-            places = data.draw(
-                st.lists(
-                    st.tuples(
-                        st.sampled_from(names), st.floats(0.0, 1.0, exclude_max=True),
-                        st.integers(0, 99), st.integers(1, 40),
-                    ),
-                    min_size=1, max_size=3,
-                )
-            )  # fmt: skip
-            change = with_values(product, places)
+            share = st.floats(0.0, 1.0, exclude_max=True)
+            place = st.tuples(st.sampled_from(names), share, st.integers(0, 99), st.integers(1, 40))
+            change = with_values(product, data.draw(st.lists(place, min_size=1, max_size=3)))
         else:
             where = data.draw(st.sampled_from(["/", product]))
-            change = with_attribute(where, data.draw(st.integers(0, 9)), data.draw(
-                st.sampled_from(range(len(NUMBERS)))
-            ))  # fmt: skip
-        before = spoil_database(copy, change)
-        try:
-            able = [name for name, m in METHODS.items() if product in ("stars", *m.products)]
+            number = data.draw(st.sampled_from(range(len(NUMBERS))))
+            change = with_attribute(where, data.draw(st.integers(0, 9)), number)
+        able = [name for name, m in METHODS.items() if product in ("stars", *m.products)]
+        with spoilt_database(copy, change):
             identify(copy, data.draw(st.sampled_from(able)), frame)
             if kind == "structure":
                 verify_artifact(copy)
-        finally:
-            restore(copy, before)
 
     run()
 

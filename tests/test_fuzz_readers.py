@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,25 +20,17 @@ from hypothesis import strategies as st
 
 from starcat.catalog.ingest import ingest
 from starcat.catalog.parts import CATALOGS
-from starcat.catalog.source import Column, RecordFile, data_source
+from starcat.catalog.source import Column, RecordFile, data_source, source_names
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import GCVS_COLUMNS, read_gcvs
 from starcat.errors import StarcatError
 from starcat.storage.schema import product_schema
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
-from archives import archive_records, file_header, synthetic_sky
+from archives import archive_records, file_header
+from catalog_folder import bright_sky
 
-TARGETS = [
-    ("sao", "sao"),
-    ("hipparcos", "hip_main"),
-    ("tycho1", "tyc_main"),
-    ("tycho2", "tyc2"),
-    ("tycho2", "suppl_1"),
-    ("2mass", "psc"),
-    ("gaia", "gaia_merged"),
-    ("gcvs", "gcvs"),
-]
+TARGETS = [(name, layout.name) for name in source_names() for layout in data_source(name).files]
 """Every source and layout that has a reader."""
 
 TEXTS = [
@@ -51,20 +43,9 @@ TEXTS = [
 ]
 """What is put into fields: null texts, limits, huge numbers, digits of other scripts, marks."""
 
-NUMBERS = [
-    np.nan,
-    np.inf,
-    -np.inf,
-    1e308,
-    -1e308,
-    0.0,
-    -0.0,
-    360.0,
-    -90.0,
-    1e5,
-    -(2.0**63),
-    2.0**62,
-]
+NUMBERS = (
+    np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -0.0, 360.0, -90.0, 1e5, -(2.0**63), 2.0**62,
+)  # fmt: skip
 """What is put into the fields of packed records."""
 
 KINDS = ("flip", "text", "text", "text", "swap", "blank", "cut", "lengthen", "join", "repeat")
@@ -99,8 +80,9 @@ DAMAGE = st.builds(
 def good_records(source_name: str, layout_name: str) -> tuple[bytes, ...]:
     """60 records of stars that do not exist."""
     # The supplement has only the brightest stars, and the catalogue of variables only those.
-    count = {"suppl_1": 250, "gcvs": 1500}.get(layout_name, 70)
-    sky = synthetic_sky(count, faint_limit_mag=3.0 if layout_name == "suppl_1" else 7.0)
+    sky = bright_sky().where(np.arange(1500 if layout_name == "gcvs" else 70))
+    if layout_name == "suppl_1":
+        sky = replace(sky, v_mag=sky.v_mag - 5.0)
     return tuple(archive_records(source_name, sky)[layout_name][:60])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import hard_pictures
 import numpy as np
 import pytest
@@ -37,6 +35,13 @@ def stars(count: int, seed: int, faintest: float = 6.0) -> tuple[np.ndarray, np.
     )
 
 
+def grid(first: int, pitch: int, shift: float) -> np.ndarray:
+    """Places all over a picture, off the pixels' middles by up to a shift."""
+    axes = (np.arange(first, side - 10, pitch) for side in SIZE)
+    places = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
+    return places + np.random.default_rng(1).uniform(-shift, shift, places.shape)
+
+
 def picture(seed: int = 1, scene: Scene | None = None, **optics: float) -> np.ndarray:
     scene, eye = scene or Scene(), Optics(**optics)
     light = scene_light(scene, SIZE, eye.full_well_e, seed)
@@ -48,7 +53,7 @@ def picture(seed: int = 1, scene: Scene | None = None, **optics: float) -> np.nd
 
 @pytest.mark.timeout(1800)
 @pytest.mark.slow
-def test_hard_pictures_are_identified(matcher: Matcher, tmp_path: Path) -> None:
+def test_hard_pictures_are_identified(matcher, tmp_path):
     said = list(verdicts(matcher, tmp_path, 20, list(KINDS)))
     for kind in KINDS:
         of_kind = [word for taken, word in said if taken.kind == kind]
@@ -58,22 +63,15 @@ def test_hard_pictures_are_identified(matcher: Matcher, tmp_path: Path) -> None:
 
 @pytest.mark.timeout(1800)
 @pytest.mark.slow
-def test_clouds_are_seen_through(matcher: Matcher, tmp_path: Path) -> None:
+def test_clouds_are_seen_through(matcher, tmp_path):
     for kind in MORE_KINDS:
         words = [word for _, word in verdicts(matcher, tmp_path, 20, [kind])]
         assert "wrong" not in words
         assert words.count("right") >= 16, (kind, words)
 
 
-@pytest.mark.timeout(120)
-@pytest.mark.slow
-def test_no_kind_of_hard_picture_is_lost(matcher: Matcher, tmp_path: Path) -> None:
-    said = [word for _, word in verdicts(matcher, tmp_path, 3, list(KINDS))]
-    assert said == ["right"] * len(said)
-
-
 @pytest.mark.parametrize("kind", ["8 bits", "JPEG 60", "clipped", "hot pixels"])
-def test_stars_of_a_hard_picture_are_found(kind: str, tmp_path: Path) -> None:
+def test_stars_of_a_hard_picture_are_found(kind, tmp_path):
     rng = np.random.default_rng(3)
     taken = hard_pictures.KINDS[kind](rng)
     places, mag = stars(30, 4, 5.0)
@@ -93,11 +91,8 @@ def test_stars_of_a_hard_picture_are_found(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.6, 1.0, 2.0, 4.0])
-def test_the_width_of_each_spot_is_that_of_its_gaussian(sigma: float) -> None:
-    places = np.stack(np.meshgrid(np.arange(40, 400, 60), np.arange(40, 300, 60)), -1).reshape(
-        -1, 2
-    )
-    places = places + np.random.default_rng(1).uniform(-0.5, 0.5, places.shape)
+def test_the_width_of_each_spot_is_that_of_its_gaussian(sigma):
+    places = grid(40, 60, 0.5)
     optics = Optics(psf_sigma_px=sigma, full_well_e=1e9)
     image = render_image(places, np.full(len(places), 4.0), SIZE, optics, 2)
     widths, snr = best_widths(subtract_background(image), places - 0.5)
@@ -117,7 +112,7 @@ def test_the_width_of_each_spot_is_that_of_its_gaussian(sigma: float) -> None:
     ],
     ids=["coarse", "clipped", "nebula", "Moon", "town"],
 )
-def test_the_width_is_measured_in_any_picture(scene: Scene) -> None:
+def test_the_width_is_measured_in_any_picture(scene):
     spots = find_spots(picture(7, scene, psf_sigma_px=1.3))
     assert spots.psf_sigma_px == pytest.approx(1.3, rel=0.25)
     places, mag = stars(40, 7)
@@ -125,13 +120,13 @@ def test_the_width_is_measured_in_any_picture(scene: Scene) -> None:
     assert (distance < 0.5).mean() > 0.8
 
 
-def test_a_clipped_background_has_few_false_spots() -> None:
+def test_a_clipped_background_has_few_false_spots():
     scene = Scene(bits=8, black_adu=133.0, adu_per_step=4.0)
     light = render_image(np.empty((0, 2)), np.empty(0), (1024, 1024), Optics(), 3)
     assert len(find_spots(in_file_steps(light, scene))) <= 40
 
 
-def test_the_brightest_spots_are_kept() -> None:
+def test_the_brightest_spots_are_kept():
     image = picture(2)
     every, some = find_spots(image), find_spots(image, most_spots=10)
     assert len(every) > 30
@@ -139,29 +134,32 @@ def test_the_brightest_spots_are_kept() -> None:
     np.testing.assert_array_equal(some.flux, every.flux[:10])
 
 
-def test_trails_are_told_and_refused() -> None:
-    places, mag = stars(25, 3, 4.0)
-    parts = np.linspace(-0.5, 0.5, 25)[:, None, None] * np.array([12.0, 9.0]) + places
-    trails = parts.reshape(-1, 2), np.repeat(mag[None] + 2.5 * np.log10(25), 25, axis=0).ravel()
-    image = render_image(*trails, SIZE, Optics(), 4)
+def elongated(sky: tuple[np.ndarray, np.ndarray], by_px: np.ndarray) -> np.ndarray:
+    """An image of stars whose light is spread along lines."""
+    places, mag = sky
+    parts = np.linspace(-0.5, 0.5, 25)[:, None, None] * by_px + places
+    faint = np.repeat(mag[None] + 2.5 * np.log10(25), 25, axis=0).ravel()
+    return render_image(parts.reshape(-1, 2), faint, SIZE, Optics(), 4)
+
+
+def test_trails_are_told_and_refused():
+    image = elongated(stars(25, 3, 4.0), np.array([12.0, 9.0]))
     with pytest.raises(ConfigError, match=r"trails of 1[4-7] px.*expose shorter"):
         find_spots(image)
     assert len(find_spots(image, psf_sigma_px=1.5)) > 10
 
 
-def test_long_spots_of_a_lens_are_no_trails() -> None:
+def test_long_spots_of_a_lens_are_no_trails():
     places, mag = stars(25, 3, 4.0)
     outwards = places - 0.5 * np.array(SIZE)
     outwards *= 12.0 / np.linalg.norm(outwards, axis=1)[:, None]
-    parts = np.linspace(-0.5, 0.5, 25)[:, None, None] * outwards + places
-    coma = parts.reshape(-1, 2), np.repeat(mag[None] + 2.5 * np.log10(25), 25, axis=0).ravel()
-    assert len(find_spots(render_image(*coma, SIZE, Optics(), 4))) > 10
+    assert len(find_spots(elongated((places, mag), outwards))) > 10
 
 
 # Dark frame, mask, mosaic
 
 
-def test_a_dark_frame_takes_hot_pixels_out(tmp_path: Path) -> None:
+def test_a_dark_frame_takes_hot_pixels_out(tmp_path):
     rng = np.random.default_rng(8)
     current = np.where(rng.uniform(size=SIZE[::-1]) < 0.01, rng.uniform(500, 3e4, SIZE[::-1]), 0.0)
     lid = render_image(np.empty((0, 2)), np.empty(0), SIZE, Optics(background_e=0.0), 1, current)
@@ -176,7 +174,7 @@ def test_a_dark_frame_takes_hot_pixels_out(tmp_path: Path) -> None:
     assert (distance < 0.5).sum() >= 36
 
 
-def test_no_spot_is_found_in_a_dead_zone(tmp_path: Path) -> None:
+def test_no_spot_is_found_in_a_dead_zone(tmp_path):
     mask = np.zeros(SIZE[::-1], dtype=np.uint8)
     mask[:, 200:] = 255
     write_image(tmp_path / "image.png", picture(5))
@@ -188,24 +186,18 @@ def test_no_spot_is_found_in_a_dead_zone(tmp_path: Path) -> None:
     assert (distance < 0.5).mean() > 0.9
 
 
-@pytest.mark.parametrize("repair", [without_dark, without_dead_zones])
-def test_what_repairs_has_the_size_of_the_image(repair) -> None:
-    with pytest.raises(ConfigError, match="40 x 30 px, the image 50 x 30; expected the same"):
-        repair(np.zeros((30, 50)), np.zeros((30, 40)))
-
-
-def test_a_mask_leaves_something() -> None:
+def test_what_repairs_has_the_size_of_the_image_and_leaves_something():
+    for repair in (without_dark, without_dead_zones):
+        with pytest.raises(ConfigError, match="40 x 30 px, the image 50 x 30; expected the same"):
+            repair(np.zeros((30, 50)), np.zeros((30, 40)))
     with pytest.raises(ConfigError, match="leaves no pixel"):
         without_dead_zones(np.zeros((30, 50)), np.ones((30, 50)))
 
 
 @pytest.mark.parametrize("order", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("star", [(1.0, 0.6, 0.3), (0.2, 0.5, 1.0)], ids=["red", "blue"])
-def test_centroids_behind_a_mosaic_do_not_depend_on_colour(order: str, star: tuple) -> None:
-    places = np.stack(np.meshgrid(np.arange(30, 390, 30), np.arange(30, 290, 30)), -1).reshape(
-        -1, 2
-    )
-    places = places + np.random.default_rng(1).uniform(-1.0, 1.0, places.shape)
+def test_centroids_behind_a_mosaic_do_not_depend_on_colour(order, star):
+    places = grid(30, 30, 1.0)
     light = star_electrons(places, np.full(len(places), 2.0), SIZE, Optics(psf_sigma_px=1.2))
     mosaic = np.empty(SIZE[::-1])
     for number, colour in enumerate(order):

@@ -27,9 +27,7 @@ Run = Callable[[list[Any]], Any]
 
 COMMANDS = every_command()
 NETWORK = {"fetch": "downloads an archive from its servers; test_fetch has servers of its own"}
-LASTING = {
-    "serve": "runs until it is ended; test_howto_serve runs and ends it",
-}
+LASTING = {"serve": "runs until it is ended; test_howto_serve runs and ends it"}
 NEEDS = {
     "token list": ("token create",),
     "token revoke": ("token create",),

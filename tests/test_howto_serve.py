@@ -6,17 +6,12 @@ import json
 import os
 import re
 import shlex
-import socket
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from urllib.error import URLError
 
 import pytest
+from served import serve
 
 from starcat.service.security.metrics import Metrics
 from starcat.service.service import Service
@@ -34,12 +29,6 @@ def steps(port: int) -> list[tuple[str, str]]:
     return [(kind, text.replace("127.0.0.1:8000", f"127.0.0.1:{port}")) for kind, text in found]
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
-
-
 def script_of(blocks: list[tuple[str, str]]) -> str:
     """The blocks as one script of bash that ends at the first error."""
     lines = ["set -euo pipefail", 'starcat() { "$PYTHON" -m starcat "$@"; }']
@@ -53,34 +42,11 @@ def script_of(blocks: list[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-@contextmanager
-def running(folder: Path, port: int) -> Iterator[None]:
-    """The server of the first block."""
-    command = [sys.executable, "-m", *shlex.split(START), "--port", str(port)]
-    with (folder / "log").open("w") as log:
-        server = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
-    try:
-        for _ in range(240):
-            try:
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5).close()
-                break
-            except URLError:
-                assert server.poll() is None, (folder / "log").read_text()
-                time.sleep(0.25)
-        yield
-    finally:
-        server.terminate()
-        server.wait(60)
-    assert server.returncode == 0
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(540)
 def test_the_way_of_a_newcomer_runs_as_printed(tmp_path: Path) -> None:
-    port = free_port()
-    (tmp_path / "service").mkdir()
-    with running(tmp_path, port):
-        script = script_of(steps(port)[1:])
+    with serve(tmp_path / "service", tmp_path / "log") as served:
+        script = script_of(steps(served.port)[1:])
         done = subprocess.run(
             ["bash", "-c", script],
             cwd=tmp_path,

@@ -26,12 +26,8 @@ def frame(starcat: Run, small_artifact: Path, tmp_path: Path) -> Path:
 
 
 def test_answers_come_line_by_line_from_a_stream(
-    starcat: Run,
-    frame: Path,
-    small_artifact: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    starcat, frame, small_artifact, monkeypatch, capsys
+):
     rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
     pixels = [[float(x), float(y)] for x, y, _ in rows]
     asked = [{"name": "a", "centroids_px": pixels}, {"centroids_px": pixels[:2]}]
@@ -53,8 +49,8 @@ def test_answers_come_line_by_line_from_a_stream(
 
 
 def test_a_broken_line_of_a_stream_ends_it_after_the_answers_before_it(
-    starcat: Run, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    starcat, small_artifact, monkeypatch
+):
     text = '{"centroids_px": [[1, 2]]}\n\n{"centroids_px": [[1'
     monkeypatch.setattr("sys.stdin", StringIO(text))
     run = starcat(["identify", small_artifact, "-", "--ndjson"])
@@ -64,16 +60,11 @@ def test_a_broken_line_of_a_stream_ends_it_after_the_answers_before_it(
 
 
 @pytest.mark.parametrize("form", ["csv", "json", "one line of json"])
-def test_centroids_come_from_stdin(
-    starcat: Run, frame: Path, small_artifact: Path, monkeypatch: pytest.MonkeyPatch, form: str
-) -> None:
+def test_centroids_come_from_stdin(starcat, frame, small_artifact, monkeypatch, form):
     text = frame.read_text()
     if form != "csv":
         rows = [[float(value) for value in line.split(",")] for line in text.splitlines()[1:]]
-        content = {
-            "centroids_px": [[x, y] for x, y, _ in rows],
-            "mag": [mag for *_, mag in rows],
-        }
+        content = {"centroids_px": [[x, y] for x, y, _ in rows], "mag": [mag for *_, mag in rows]}
         text = json.dumps({"frames": [content]}, indent=None if "line" in form else 1)
     monkeypatch.setattr("sys.stdin", StringIO(text))
     [found] = json.loads(starcat(["identify", small_artifact, "-", "--json"]).out)
@@ -82,9 +73,7 @@ def test_centroids_come_from_stdin(
     assert found["frame"].startswith("stdin")
 
 
-def test_a_script_sees_that_a_frame_was_not_identified(
-    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_a_script_sees_that_a_frame_was_not_identified(starcat, frame, small_artifact, tmp_path):
     few = tmp_path / "few.csv"
     few.write_text("x_px,y_px\n1,2\n")
     assert starcat(["identify", small_artifact, few]).code == 0
@@ -97,9 +86,7 @@ def test_a_script_sees_that_a_frame_was_not_identified(
         assert error["message"].startswith("1 of 1 frames not identified (few: too_few_stars)")
 
 
-def test_the_reason_and_what_to_try_are_printed(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_the_reason_and_what_to_try_are_printed(starcat, small_artifact, tmp_path):
     few = tmp_path / "few.csv"
     few.write_text("x_px,y_px\n1,2\n")
     run = starcat(["identify", small_artifact, few])
@@ -124,9 +111,7 @@ def worst_arcsec(
 
 
 @pytest.mark.parametrize("said_by", [None, "the file", "--flip"], ids=str)
-def test_the_wcs_goes_into_a_copy_of_a_fits_file(
-    starcat: Run, small_artifact: Path, tmp_path: Path, said_by: str | None
-) -> None:
+def test_the_wcs_goes_into_a_copy_of_a_fits_file(starcat, small_artifact, tmp_path, said_by):
     image, copy = tmp_path / "frame.fits", tmp_path / "copy.fits"
     assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
     with fits_file.open(image, mode="update") as parts:
@@ -152,9 +137,7 @@ def test_the_wcs_goes_into_a_copy_of_a_fits_file(
         assert worst_arcsec(header, answer, bottom_up=bool(said_by)) < 1e-3
 
 
-def test_all_parts_of_a_compressed_fits_file_are_in_the_copy(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_all_parts_of_a_compressed_fits_file_are_in_the_copy(starcat, small_artifact, tmp_path):
     image, packed, copy = (tmp_path / name for name in ("frame.fits", "frame.fits.fz", "copy.fits"))
     assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
     values = fits_file.getdata(image)
@@ -169,9 +152,7 @@ def test_all_parts_of_a_compressed_fits_file_are_in_the_copy(
         assert worst_arcsec(copied[1].header, answer) < 1e-3
 
 
-def test_the_wcs_of_a_png_goes_into_a_new_fits_file(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_the_wcs_of_a_png_goes_into_a_new_fits_file(starcat, small_artifact, tmp_path):
     image, copy = tmp_path / "frame.png", tmp_path / "copy.fits"
     camera = tmp_path / "camera.toml"
     camera.write_text(

@@ -36,7 +36,7 @@ def prior(frame: Frame) -> str:
     return ",".join(map(str, quaternion_from_matrix(frame.matrix).tolist()))
 
 
-def test_a_sequence_is_followed(starcat: Run, small_artifact: Path, sequence: Path) -> None:
+def test_a_sequence_is_followed(starcat, small_artifact, sequence):
     answers = json.loads(starcat(["identify", small_artifact, sequence, "--track", "--json"]).out)
     assert [answer["status"] for answer in answers] == ["identified"] * 12
     found = [answer["origin"] for answer in answers]
@@ -49,18 +49,14 @@ def test_a_sequence_is_followed(starcat: Run, small_artifact: Path, sequence: Pa
         assert names[0] == names[1]
 
 
-def test_a_table_of_a_sequence_says_where_frames_were_found(
-    starcat: Run, small_artifact: Path, sequence: Path
-) -> None:
+def test_a_table_of_a_sequence_says_where_frames_were_found(starcat, small_artifact, sequence):
     lines = starcat(["identify", small_artifact, sequence, "--track"]).out.splitlines()
     assert sum("tracking" in line for line in lines) == 10
     assert sum("lost in space" in line for line in lines) == 2
     assert "origin" not in starcat(["identify", small_artifact, sequence]).out
 
 
-def test_a_stream_is_followed(
-    starcat: Run, small_artifact: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_is_followed(starcat, small_artifact, frames, monkeypatch):
     text = "".join(
         json.dumps({"centroids_px": frame.centroids_px.tolist()}) + "\n" for frame in frames[:4]
     )
@@ -70,9 +66,7 @@ def test_a_stream_is_followed(
     assert origins == ["lost_in_space", "tracking", "tracking", "tracking"]
 
 
-def test_a_prior_attitude_is_used(
-    starcat: Run, small_artifact: Path, frames: list[Frame], tmp_path: Path
-) -> None:
+def test_a_prior_attitude_is_used(starcat, small_artifact, frames, tmp_path):
     path = tmp_path / "frame.json"
     path.write_text(json.dumps({"centroids_px": frames[1].centroids_px.tolist()}))
     asked = ["identify", small_artifact, path, "--json", "--prior-error-deg", "3"]
@@ -97,9 +91,7 @@ def test_a_prior_attitude_is_used(
         (["--track", "--time", "2026-01-01T00:00:00"], "leave out --time, or --track"),
     ],
 )
-def test_options_that_say_no_prior_are_refused(
-    starcat: Run, small_artifact: Path, sequence: Path, options: list[str], words: str
-) -> None:
+def test_options_that_say_no_prior_are_refused(starcat, small_artifact, sequence, options, words):
     run = starcat(["identify", small_artifact, sequence, *options])
     assert run.code == 2
     assert words in run.err

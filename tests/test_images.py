@@ -25,8 +25,7 @@ from scipy.spatial import cKDTree
 from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.images.background import SMALLEST_PX, Levels, repair_hot_pixels, subtract_background
-from starcat.images.centroiding import Spots, brightest_first, find_spots
-from starcat.images.detection import detect
+from starcat.images.centroiding import Spots, brightest_first, detect, find_spots
 from starcat.images.frame_axes import FrameAxes, draw_compass, mark_radii, place_labels, stretch
 from starcat.images.image_file import read_image, write_image
 from starcat.images.picture import compass_from_matrix, draw_identified
@@ -283,21 +282,14 @@ def test_pixels_without_a_value_are_left_out():
     np.testing.assert_allclose(spots.centroids_px[0], places[0], atol=0.05)
 
 
-def test_saturated_stars_are_well_placed():
-    places = star_grid(6, 40.0, 9)
-    mag = np.where(np.arange(36) < 6, -1.0, 3.5)
-    spots = find_spots(render_image(places, mag, (240, 240), OPTICS, 13))
-    index = found_at(spots, places)
-    error = spots.centroids_px[index] - places
+@pytest.mark.parametrize(("side", "pitch", "saturated"), [(6, 40.0, 6), (12, 30.0, 60)])
+def test_saturated_stars_are_well_placed(side, pitch, saturated):
+    places, size = star_grid(side, pitch, 9), int(side * pitch)
+    mag = np.where(np.arange(side**2) < saturated, -1.0, 3.5)
+    spots = find_spots(render_image(places, mag, (size, size), OPTICS, 13))
+    error = spots.centroids_px[found_at(spots, places)] - places
     assert np.abs(error[mag < 0]).max() < 0.12
     assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)  # not that of the flat tops
-
-
-def test_sigma_is_not_measured_on_saturated_stars():
-    places = star_grid(12, 30.0, 9)
-    mag = np.where(np.arange(144) < 60, -1.0, 4.0)
-    spots = find_spots(render_image(places, mag, (360, 360), OPTICS, 13))
-    assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)
 
 
 @pytest.mark.parametrize("sigma", [None, 1.0])
@@ -316,15 +308,12 @@ def test_faint_hot_pixels_are_not_stars_either():
     assert len(find_spots(image)) <= 5
 
 
-def test_a_hot_pixel_becomes_like_its_neighbours():
+def test_what_replaces_a_hot_pixel_is_the_mean_beside_it():
     image = np.full((40, 40), 100.0)
     image[::2, ::2] = 103.0
     image[20, 10] = image[0, 0] = image[39, 39] = 9_000.0
     repaired = repair_hot_pixels(subtract_background(image), 1.0).above
     assert np.abs(repaired).max() < 5.0
-
-
-def test_what_replaces_a_hot_pixel_is_the_mean_beside_it():
     image = np.full((40, 40), 100.0)
     image[19:22, 9:12] = 140.0
     image[20, 10] = 9_000.0
@@ -470,13 +459,6 @@ def test_fits_keeps_all_digits(kind, expected, tmp_path):
     np.testing.assert_array_equal(back, image)
 
 
-@pytest.mark.parametrize("kind", ["f4", "i4"])
-def test_tiff_may_hold_more_than_16_bits(kind, tmp_path):
-    image = GREY16.astype(kind) * 3
-    Image.fromarray(image).save(tmp_path / "a.tif")
-    np.testing.assert_array_equal(read_image(tmp_path / "a.tif"), image)
-
-
 def test_fits_may_be_compressed(tmp_path):
     write_image(tmp_path / "a.fits", GREY16)
     (tmp_path / "a.fits.gz").write_bytes(gzip.compress((tmp_path / "a.fits").read_bytes()))
@@ -565,10 +547,15 @@ def test_files_of_other_programs_are_read_right(tmp_path):
         "little.tif": tiff(GREY16, "<", 1),
         "big.tif": tiff(GREY16, ">", 1),
         "white_is_zero.tif": tiff(65_535 - GREY16, "<", 0),
+        "transparent.png": png(np.dstack([GREY16, GREY16[::-1]]), 4),
     }
     for name, data in cases.items():
         (tmp_path / name).write_bytes(data)
         np.testing.assert_array_equal(read_image(tmp_path / name), GREY16, err_msg=name)
+    for kind in ("f4", "i4"):  # a TIFF may hold more than 16 bits
+        image = GREY16.astype(kind) * 3
+        Image.fromarray(image).save(tmp_path / "wide.tif")
+        np.testing.assert_array_equal(read_image(tmp_path / "wide.tif"), image)
 
 
 COLOUR16 = np.random.default_rng(2).integers(0, 65_536, (20, 31, 3), dtype=np.uint16)
@@ -587,11 +574,6 @@ LUMINANCE = [0.299, 0.587, 0.114]
 def test_colour_of_16_bits_keeps_them(name, data, tmp_path):
     (tmp_path / name).write_bytes(data)
     np.testing.assert_allclose(read_image(tmp_path / name), COLOUR16 @ LUMINANCE, rtol=1e-12)
-
-
-def test_transparency_is_left_out(tmp_path):
-    (tmp_path / "a.png").write_bytes(png(np.dstack([GREY16, GREY16[::-1]]), 4))
-    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), GREY16)
 
 
 def test_colour_of_16_bits_without_the_extra_says_how_to_get_it(tmp_path, monkeypatch):
@@ -649,17 +631,15 @@ def test_damaged_and_unknown_files_are_refused(name, data, word, tmp_path):
 
 @pytest.mark.parametrize("length", [80, 2880, 3000, 2880 + GREY16.nbytes - 1])
 def test_cut_fits_files_are_refused(length, tmp_path):
-    write_image(tmp_path / "a.fits", GREY16)
-    (tmp_path / "a.fits").write_bytes((tmp_path / "a.fits").read_bytes()[:length])
+    path = tmp_path / "a.fits"
+    write_image(path, GREY16)
+    data = path.read_bytes()
+    path.write_bytes(data[:length])
     with pytest.raises(ConfigError, match="cannot be read as FITS"):
-        read_image(tmp_path / "a.fits")
-
-
-def test_fits_without_its_last_filling_is_whole_enough(tmp_path):
-    write_image(tmp_path / "a.fits", GREY16)
-    data = (tmp_path / "a.fits").read_bytes()
-    (tmp_path / "a.fits").write_bytes(data[: 2880 + GREY16.nbytes])
-    np.testing.assert_array_equal(read_image(tmp_path / "a.fits"), GREY16)
+        read_image(path)
+    # Without its last filling a file is whole enough.
+    path.write_bytes(data[: 2880 + GREY16.nbytes])
+    np.testing.assert_array_equal(read_image(path), GREY16)
 
 
 def test_what_is_not_one_plane_is_refused(tmp_path):
@@ -725,15 +705,8 @@ def test_a_picture_is_the_same_whatever_the_user_has_set(suffix, tmp_path):
     assert matplotlib.__version__.encode() not in first
 
 
-def test_a_picture_names_stars_and_counts_the_rest(tmp_path, monkeypatch):
-    written = []
-    write = matplotlib.text.Text.__init__
-
-    def listen(self, x=0, y=0, text="", **options):
-        written.append(text)
-        write(self, x, y, text, **options)
-
-    monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
+def test_a_picture_names_stars_and_counts_the_rest(tmp_path, written_words):
+    written = written_words
     draw(tmp_path / "a.png")
     for name in NAMES:
         assert name is None or name in written
@@ -843,8 +816,7 @@ def test_labels_cover_nothing():
 def test_images_are_shown_from_black_to_white():
     shown = stretch(SKY_IMAGE)
     assert shown.shape == SKY_IMAGE.shape
-    assert shown.min() == 0.0
-    assert shown.max() == 1.0
+    assert (shown.min(), shown.max()) == (0.0, 1.0)
     assert np.median(shown) < 0.1
     brightest = np.unravel_index(SKY_IMAGE.argmax(), SKY_IMAGE.shape)
     assert shown[brightest] == 1.0
@@ -853,20 +825,9 @@ def test_images_are_shown_from_black_to_white():
     holed = SKY_IMAGE.astype(float)
     holed[:5] = np.nan
     assert not stretch(holed)[:5].any()
-
-
-def test_large_images_keep_their_stars_when_shown():
+    # Large images keep their stars.
     image = np.random.default_rng(3).normal(100.0, 1.0, (1801, 2703))
     image[1000, 2000] = 900.0
     shown = stretch(image)
     assert shown.shape == (601, 901)
     assert shown[1000 // 3, 2000 // 3] == shown.max()
-
-
-def test_written_and_found_again(tmp_path):
-    image = render_image(SPOTS, np.full(16, 4.0), (160, 160), OPTICS, 20)
-    expected = find_spots(image).centroids_px
-    for name in ("a.fits", "a.png", "a.tif"):
-        write_image(tmp_path / name, image)
-        found = find_spots(read_image(tmp_path / name)).centroids_px
-        np.testing.assert_array_equal(found, expected)

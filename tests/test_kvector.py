@@ -115,22 +115,15 @@ def test_ends_are_closed_and_empty_answers_are_empty(values, interval, expected)
     assert rows(index.exact(*interval)) == expected
 
 
+NAN, INF = np.nan, np.inf
+
+
 @pytest.mark.parametrize(
-    "values",
-    [
-        [2.0, 1.0],
-        [1.0, 2.0, 1.5, 3.0],
-        [np.nan],
-        [1.0, np.nan, 2.0],
-        [1.0, np.inf],
-        [-np.inf, 1.0],
-        [[1.0, 2.0]],
-    ],
-    ids=["inverted", "unsorted", "nan", "nan-inside", "inf", "minus-inf", "2-d"],
+    "values", [[2, 1], [1, 2, 1.5, 3], [NAN], [1, NAN, 2], [1, INF], [-INF, 1], [[1, 2]]], ids=str
 )
 def test_what_is_not_a_sorted_array_is_refused(values):
     with pytest.raises(ValueError, match="values"):
-        build_kvector(np.array(values))
+        build_kvector(np.array(values, dtype=float))
 
 
 def test_counts_never_fall_and_end_with_all():

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations, islice
 
 import numpy as np
 import pytest
 from frames import observe
-from pattern_skies import database as pattern_sky
-from set_skies import frame_centred_on, set_sky
+from skies import frame_centred_on, pattern_sky, set_sky
 
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import separation
 from starcat.matcher.c_engine import FEATURES, is_compiled
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -128,6 +129,20 @@ class TestMethod:
                     assert one.star_ids.tolist() == without.star_ids.tolist()
                     moved = np.abs(one.q_body_from_icrs - without.q_body_from_icrs)
                     assert moved.max() < 1e-13
+
+    def test_candidates_are_as_far_apart_as_the_centroids_and_not_mirrored(self, matcher):
+        sky = matcher.database
+        u = sky.directions
+        for frame in frames(matcher, 3, Noise(0.5, 0.1, 3)):
+            seen = observe(frame.centroids_px, sky.camera, 2.0)
+            for batch in islice(METHODS[matcher.method].propose(seen, sky), 100):
+                for p, q in combinations(range(batch.stars.shape[1]), 2):
+                    apart = seen.separation_rad[batch.centroids[:, p], batch.centroids[:, q]]
+                    miss = separation(u[batch.stars[:, p]], u[batch.stars[:, q]]) - apart
+                    assert np.abs(miss).max(initial=0.0) <= seen.side_tolerance_rad * (1.0 + 1e-6)
+                if SKIES[matcher.method] == "triangles":
+                    turned = np.linalg.det(u[batch.stars[:, :3]])
+                    assert (turned * np.linalg.det(seen.body[batch.centroids[:, :3]]) > 0.0).all()
 
     def test_without_magnitudes_nothing_depends_on_brightness(self, matcher):
         if matcher.engine == "c":

@@ -6,23 +6,24 @@ import csv
 import gzip
 import io
 import json
-import shutil
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from archives import file_header
+from artifact_copies import copied, seal
 from astropy import units
 from astropy.coordinates import Distance, SkyCoord
 from astropy.time import Time
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION, manifest_digest
+from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION
 from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
@@ -32,12 +33,12 @@ from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, with_columns
 from starcat.catalog.verdict import Quality
 from starcat.pipeline.build import Built, build
-from starcat.pipeline.motions import JoinedMotions, join_motions, motion_product
+from starcat.pipeline.motions import JoinedMotions, join_motions, motions_of
 from starcat.pipeline.rebuild import rebuild
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.digests import file_sha256
 from starcat.store.reading import read_catalog
 
 FAINT_LIMIT_MAG = 6.3
@@ -285,18 +286,20 @@ def test_a_damaged_table_is_told(artifact):
 
 @pytest.mark.parametrize("damage", ["count", "product"])
 def test_a_manifest_that_says_otherwise_is_told(damage, built, tmp_path):
-    copy = Path(shutil.copytree(built.folder, tmp_path / "a", copy_function=shutil.copyfile))
-    manifest = json.loads((copy / "manifest.json").read_bytes())
-    count = manifest["sources"][1]["joined"]
-    if damage == "count":
-        manifest["sources"][1]["joined"] += 1
-        expected = f"{count + 1} stars have their motion from it, but the product motions holds"
-    else:
-        del manifest["products"]["motions"], manifest["files"]["motions.parquet"]
+    copy = copied(built.folder, tmp_path)
+    more = built.manifest["sources"][1]["joined"] + 1
+    expected = f"{more} stars have their motion from it, but the product motions holds"
+    if damage == "product":
         (copy / "motions.parquet").unlink()
         expected = "tycho2: motions are from it, but there is no product motions"
-    manifest["manifest_sha256"] = manifest_digest(manifest)
-    (copy / "manifest.json").write_bytes(json_bytes(manifest))
+
+    def change(manifest: dict[str, Any]) -> None:
+        if damage == "count":
+            manifest["sources"][1]["joined"] = more
+        else:
+            del manifest["products"]["motions"], manifest["files"]["motions.parquet"]
+
+    seal(copy, change)
     found = [str(finding) for finding in verify_artifact(copy).findings]
     assert any(expected in text for text in found), found
 
@@ -385,16 +388,8 @@ def test_an_entry_without_motion_gives_none(tycho2, sky, artifact, tmp_path):
 
 
 def test_a_star_with_a_motion_keeps_it(sky, inputs, tmp_path):
-    own = replace(
-        sky,
-        stars=with_columns(
-            sky.stars,
-            {
-                "pm_ra_cosdec_mas_yr": np.full(len(sky.stars), 12.5),
-                "pm_dec_mas_yr": np.full(len(sky.stars), -3.0),
-            },
-        ),
-    )
+    motion = {"pm_ra_cosdec_mas_yr": 12.5, "pm_dec_mas_yr": -3.0}
+    own = replace(sky, stars=with_columns(sky.stars, motion))
     found = join_motions(own, spec_of(), inputs)
     assert found.table is not None
     assert set(found.table["outcome"].to_pylist()) == {"own_motion"}
@@ -420,7 +415,7 @@ def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
     assert preset("gaia-12deg-2026").recorded()["catalog"]["motions"] == ["tycho2"]
     found = join_motions(sky, spec, {})
     assert found.catalog is sky
-    assert (found.sources, motion_product(found, sky.stars)) == ((), ())
+    assert (found.sources, motions_of(sky.stars, found.table, sky.stars)) == ((), ())
     assert open_artifact(small_artifact).manifest["manifest_version"] == MANIFEST_VERSION
 
 

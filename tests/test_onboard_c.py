@@ -104,7 +104,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, random_directions) -> dict[st
 @pytest.mark.timeout(300)
 @pytest.mark.slow
 @pytest.mark.parametrize("cc", ["gcc", "clang"])
-def test_the_unit_test_passes_where_the_folder_stands_alone(folder: Path, cc: str) -> None:
+def test_the_unit_test_passes_where_the_folder_stands_alone(folder, cc):
     if shutil.which(cc) is None:
         pytest.skip(f"{cc} is missing")
     said = make(folder, "test", f"COMPILERS={cc}", "CFLAGS=-O1", f"BUILD=build-{cc}")
@@ -113,7 +113,7 @@ def test_the_unit_test_passes_where_the_folder_stands_alone(folder: Path, cc: st
 
 
 @pytest.mark.slow
-def test_the_example_prints_the_attitude(folder: Path) -> None:
+def test_the_example_prints_the_attitude(folder):
     said = make(folder, "all", "example")
     assert "status 0 after" in said
     assert re.search(r"^attitude( -?0\.\d{9},?){4}", said, re.MULTILINE)
@@ -135,14 +135,14 @@ def undefined(folder: Path, *flags: str) -> set[str]:
     return called - defined - COMPILERS_OWN
 
 
-def test_the_library_calls_nothing_but_five_functions_of_libm(folder: Path) -> None:
+def test_the_library_calls_nothing_but_five_functions_of_libm(folder):
     if shutil.which("nm") is None:
         pytest.skip("nm is missing")
     assert undefined(folder) == LIBM
     assert undefined(folder, "-DSTARCAT_SINGLE") == {f"{name}f" for name in LIBM}
 
 
-def test_the_functions_of_libm_can_be_replaced(folder: Path, tmp_path: Path) -> None:
+def test_the_functions_of_libm_can_be_replaced(folder, tmp_path):
     if shutil.which("nm") is None:
         pytest.skip("nm is missing")
     names = sorted(LIBM)
@@ -157,13 +157,13 @@ def test_the_functions_of_libm_can_be_replaced(folder: Path, tmp_path: Path) -> 
     assert found == {f"my_{name}" for name in names}
 
 
-def test_no_flipped_bit_goes_unseen(folder: Path, made: dict[str, Path]) -> None:
+def test_no_flipped_bit_goes_unseen(folder, made):
     program = build(folder, "flips", "flips.c", "random_sky.c")
     ran = subprocess.run([program, made["little"], "10000"], capture_output=True, text=True)
     assert ran.stdout == "10000 flips, 0 missed\n", ran.stderr
 
 
-def test_an_image_of_the_other_byte_order_is_refused(folder: Path, made: dict[str, Path]) -> None:
+def test_an_image_of_the_other_byte_order_is_refused(folder, made):
     program = build(folder, "replay", "replay.c")
     ran = subprocess.run([program, made["big"], made["frames"]], capture_output=True, text=True)
     assert (ran.returncode, ran.stderr) == (2, "cannot open: -5\n")
@@ -183,7 +183,7 @@ def rows(heading: str) -> list[list[str]]:
     ]
 
 
-def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names() -> None:
+def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
     header = (ONBOARD / "include" / "starcat.h").read_text()
     enum = header[header.index("typedef enum") : header.index("} starcat_status")]
     sources = {path.name: path.read_text() for path in ONBOARD.glob("tests/test_*.c")}
@@ -202,7 +202,7 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names() ->
     assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
 
 
-def test_every_deviation_from_misra_is_explained() -> None:
+def test_every_deviation_from_misra_is_explained():
     text = (ONBOARD / "tests" / "cppcheck.txt").read_text()
     suppressed = re.findall(r"^misra-c2012-(\S+)|^(\w+):", text, re.MULTILINE)
     explained = [row[0].strip("`") for row in rows("MISRA C:2012")]
@@ -212,7 +212,7 @@ def test_every_deviation_from_misra_is_explained() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("target", ["sanitize", "valgrind", "coverage", "cppcheck", "size"])
-def test_tools_find_nothing(folder: Path, target: str) -> None:
+def test_tools_find_nothing(folder, target):
     said = make(folder, target, f"BUILD=build-{target}")
     if target == "coverage":
         assert "(100.00 %)" in said
@@ -222,7 +222,7 @@ def test_tools_find_nothing(folder: Path, target: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_other_processors_give_the_same_answers(folder: Path, made: dict[str, Path]) -> None:
+def test_other_processors_give_the_same_answers(folder, made):
     """32-bit ARM, and big-endian PowerPC with an image that Python wrote for it."""
     of_c = make(folder, "cross", "BUILD=build-cross")
     images = f"{made['little']} {made['big']}"
@@ -236,5 +236,5 @@ def test_other_processors_give_the_same_answers(folder: Path, made: dict[str, Pa
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("target", ["fuzz-image", "fuzz-centroids"])
-def test_fuzzing_finds_nothing(folder: Path, target: str) -> None:
+def test_fuzzing_finds_nothing(folder, target):
     make(folder, target, "FUZZ_SECONDS=5", f"BUILD=build-{target}")

@@ -6,9 +6,7 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +19,19 @@ from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import DIRECTION_SCALE
 from starcat.onboard.reading import read_image
 
-Starcat = Callable[..., Any]
+
+@pytest.fixture
+def path(starcat, small_artifact, tmp_path) -> Path:
+    """The image of the small artifact."""
+    path = tmp_path / "db.img"
+    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+    return path
 
 
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
 def test_an_exported_image_is_the_artifacts_and_is_found_sound(
-    method: str, small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
+    method, small_artifact, tmp_path, starcat
+):
     path = tmp_path / "db.img"
     command = ["export", small_artifact, "--to", "onboard", "--method", method, "-o", path]
     ran = starcat([*command, "--json"])
@@ -45,11 +49,7 @@ def test_an_exported_image_is_the_artifacts_and_is_found_sound(
     assert path.read_bytes() == make_image(contents_of(open_artifact(small_artifact), method)).data
 
 
-def test_the_matcher_can_make_the_same_image_from_its_database(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
-    path = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+def test_the_matcher_can_make_the_same_image_from_its_database(small_artifact, path):
     database = open_database(small_artifact, ("triangles",))
     rows = [database.products["triangles"][name] for name in "ijk"]
     made = make_image(
@@ -70,8 +70,8 @@ def test_the_matcher_can_make_the_same_image_from_its_database(
 
 
 def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small_artifact, tmp_path, starcat, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     command = ["export", small_artifact, "--to", "onboard"]
     assert starcat(command).code == 0
@@ -89,9 +89,7 @@ def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
     assert big.code == 0, big.out
 
 
-def test_an_image_that_has_to_fit_says_what_was_left_out(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
+def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_path, starcat):
     path = tmp_path / "db.img"
     command = ["export", small_artifact, "--to", "onboard", "-o", path, "--replace"]
     whole = json.loads(starcat([*command, "--json"]).out)
@@ -106,11 +104,7 @@ def test_an_image_that_has_to_fit_says_what_was_left_out(
     assert starcat(["verify", path, "--against", small_artifact]).code == 0
 
 
-def test_inspect_says_what_an_image_holds_within_100_columns(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
-    path = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
     image, ran = read_image(path), starcat(["inspect", path])
     assert ran.code == 0
     assert max(map(len, ran.out.splitlines())) <= 100
@@ -133,11 +127,7 @@ def test_inspect_says_what_an_image_holds_within_100_columns(
     }
 
 
-def test_verify_names_the_damaged_blocks(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
-    path = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+def test_verify_names_the_damaged_blocks(starcat, path):
     data = bytearray(path.read_bytes())
     data[5 * 4096 + 7] ^= 1
     data[9 * 4096] ^= 128
@@ -154,14 +144,7 @@ def test_verify_names_the_damaged_blocks(
     assert "its header says" in ran.out
 
 
-def test_verify_holds_an_image_against_another_artifact(
-    small_artifact: Path,
-    artifact_version: Callable[[str], Path],
-    tmp_path: Path,
-    starcat: Starcat,
-) -> None:
-    path = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+def test_verify_holds_an_image_against_another_artifact(artifact_version, starcat, path):
     ran = starcat(["verify", path, "--against", artifact_version("1.0.1"), "--json"])
     assert ran.code == 5
     problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
@@ -171,19 +154,15 @@ def test_verify_holds_an_image_against_another_artifact(
     assert starcat(["verify", path]).code == 0
 
 
-def test_c_source_is_written_with_its_header(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
+def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, path):
     source = tmp_path / "flight" / "db.c"
     ran = starcat(["export", small_artifact, "--to", "c", "-o", source, "--json"])
     assert ran.code == 0, ran.err
     header = source.with_suffix(".h")
     assert json.loads(ran.out)["files"] == [str(source), str(header)]
     assert "extern const uint64_t starcat_small_1_0_0[" in header.read_text()
-    image = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", image])
     words = re.findall(r"0x([0-9A-F]{16})u", source.read_text())
-    assert b"".join(bytes.fromhex(word)[::-1] for word in words) == image.read_bytes()
+    assert b"".join(bytes.fromhex(word)[::-1] for word in words) == path.read_bytes()
     header.write_text("mine")
     refused = starcat(["export", small_artifact, "--to", "c", "-o", source])
     assert refused.code == 1
@@ -196,8 +175,8 @@ def test_c_source_is_written_with_its_header(
 
 
 def test_a_field_that_the_library_has_no_room_for_is_told_of(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small_artifact, tmp_path, starcat, monkeypatch
+):
     header = Path(__file__).parents[1] / "onboard" / "include" / "starcat.h"
     found = re.search(r"define STARCAT_MAX_STARS (\d+)", header.read_text())
     assert found is not None
@@ -209,9 +188,7 @@ def test_a_field_that_the_library_has_no_room_for_is_told_of(
     assert f"-DSTARCAT_MAX_STARS={near}" in starcat(command).err
 
 
-def test_formats_have_their_old_spelling(
-    small_artifact: Path, tmp_path: Path, starcat: Starcat
-) -> None:
+def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):
     for option in ("--to", "--format"):
         ran = starcat(["export", small_artifact, option, "json", "-o", tmp_path / option[2:]])
         assert ran.code == 0
@@ -219,7 +196,7 @@ def test_formats_have_their_old_spelling(
     assert stars[0] == stars[1]
 
 
-def test_the_quantum_that_the_page_states_is_that_of_the_directions() -> None:
+def test_the_quantum_that_the_page_states_is_that_of_the_directions():
     page = (Path(__file__).parents[1] / "docs" / "onboard-format.md").read_text(encoding="utf-8")
     assert "| directions | 2^-31 | 0.00005 arcsec on each axis |" in page
     assert round(float(np.degrees(0.5 / DIRECTION_SCALE)) * 3600.0, 5) == 0.00005

@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from hypothesis import strategies as st
 from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, SchemaVersionError
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.onboard import image as image_module
+from starcat.onboard import layout
 from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
 from starcat.onboard.grid import Grid, grid_for, most_near
@@ -146,7 +145,7 @@ def test_a_name_that_is_too_long_is_refused():
 
 
 def test_an_image_of_four_gigabytes_is_refused(monkeypatch):
-    monkeypatch.setattr(image_module, "MAX_BYTES", 8191)
+    monkeypatch.setattr(layout, "MAX_BYTES", 8191)
     with pytest.raises(
         ConfigError, match="would have 8,192 bytes; at most 8,191 can be said in it"
     ):
@@ -443,13 +442,6 @@ def test_nothing_can_be_fitted_too():
         shrink(contents, np.empty(0, np.int32), fields_of(contents), 8191)
 
 
-def test_an_image_knows_its_size_before_it_is_made(real):
-    contents = real[0]
-    n_cells = grid_for(1500, CAMERA.radius_rad).n_cells
-    sizes = Sizes("triangle", 1500, len(contents.features), n_cells)
-    assert sizes.total_bytes == len(make_image(contents).data)
-
-
 def compiler() -> str:
     found = shutil.which("gcc") or shutil.which("cc")
     if found is None:
@@ -457,7 +449,7 @@ def compiler() -> str:
     return found
 
 
-def test_the_c_source_compiles_to_the_image(tmp_path: Path):
+def test_the_c_source_compiles_to_the_image(tmp_path):
     gcc, name = compiler(), "sky-1.0.0"
     data = make_image(sky(30, 1)).data
     (tmp_path / "db.h").write_text(c_header(name, len(data)))
@@ -473,7 +465,7 @@ def test_the_c_source_compiles_to_the_image(tmp_path: Path):
     assert subprocess.run([tmp_path / "main"], stdout=-1, check=True).stdout == data
 
 
-def test_the_c_source_is_refused_by_a_machine_of_the_other_byte_order(tmp_path: Path):
+def test_the_c_source_is_refused_by_a_machine_of_the_other_byte_order(tmp_path):
     gcc, data = compiler(), make_image(sky(30, 1), "big").data
     (tmp_path / "db.h").write_text(c_header("sky-1.0.0", len(data)))
     (tmp_path / "db.c").write_text(c_source("sky-1.0.0", data, "big", "db.h"))

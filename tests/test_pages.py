@@ -10,25 +10,20 @@ from urllib.parse import urljoin
 
 import pytest
 from fastapi.testclient import TestClient
-from shelved import DATABASE, client_of, shelve
+from services import DATABASE, add_database, client_of
 
-from starcat.service.jobs.job_states import Attempt, Outcome, begin_next
+from starcat.service.jobs.job import Attempt, Outcome, begin_next
 from starcat.service.pages.draft import draft_of_form, draft_of_text
 from starcat.service.pages.rendering import DIGEST, FILES
 from starcat.specs.reading import preset, preset_names, read_spec
 
 PAGE = f"/databases/{DATABASE}"
+SETTINGS = {"anonymous": "publisher"}
 LATER = "fedcba9876543210"
 
 PAGES = [
-    "/",
-    "/databases",
-    PAGE,
-    f"{PAGE}/coverage",
-    f"{PAGE}/sql?query=FROM+stars+LIMIT+2",
-    f"{PAGE}/compare?other={LATER}",
-    "/identify",
-    "/releases",
+    *("/", "/databases", PAGE, f"{PAGE}/coverage", f"{PAGE}/sql?query=FROM+stars+LIMIT+2"),
+    *(f"{PAGE}/compare?other={LATER}", "/identify", "/releases"),
 ]
 """Pages of databases."""
 
@@ -56,17 +51,9 @@ count = 300
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, artifact_version) -> Path:
-    root = tmp_path_factory.mktemp("pages") / "service"
-    shelve(root, small_artifact)
-    shelve(root, artifact_version("1.1.0"), LATER)
+def root(root: Path, artifact_version) -> Path:
+    add_database(root, artifact_version("1.1.0"), LATER)
     return root
-
-
-@pytest.fixture(scope="module")
-def client(root: Path) -> Iterator[TestClient]:
-    with client_of(root, anonymous="publisher") as client:
-        yield client
 
 
 @pytest.fixture(scope="module")

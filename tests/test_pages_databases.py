@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from shelved import DATABASE, LOCAL, client_of, shelve, waiting_build
+from services import DATABASE, LOCAL, add_database, client_of, waiting_build
 
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
@@ -26,22 +26,15 @@ from starcat.report import coverage_map
 from starcat.report.coverage_map import project
 from starcat.service.pages.rendering import time_text
 
+SETTINGS = {"anonymous": "publisher"}
 LATER = "fedcba9876543210"
 PAGE = f"/databases/{DATABASE}"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, artifact_version) -> Path:
-    folder = tmp_path_factory.mktemp("pages") / "service"
-    shelve(folder, small_artifact)
-    shelve(folder, artifact_version("1.1.0"), LATER)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def client(root: Path) -> Iterator[TestClient]:
-    with client_of(root, anonymous="publisher") as client:
-        yield client
+def root(root: Path, artifact_version) -> Path:
+    add_database(root, artifact_version("1.1.0"), LATER)
+    return root
 
 
 @pytest.fixture
@@ -93,7 +86,7 @@ def test_one_database_tells_filters_rates_products_and_columns(client, small_art
 
 
 def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
-    folder = shelve(tmp_path / "service", small_artifact)
+    folder = add_database(tmp_path / "service", small_artifact)
     path = folder / "manifest.json"
     manifest = json.loads(path.read_bytes())
     manifest["spec"]["description"] = "<script>alert(1)</script>"
@@ -190,7 +183,7 @@ def test_the_report_of_a_build_can_do_nothing(client, small_artifact):
 def test_two_versions_are_compared(client):
     words = text_of(client.get(f"{PAGE}/compare?other={LATER}").text)
     assert "version 1.0.0 1.1.0" in words
-    assert "Stars that came (0)" in words
+    assert "Stars added (0)" in words
     assert "the same" in words
     assert client.get(f"{PAGE}/compare?other={'0' * 16}").status_code == 404
     assert 'value="fedcba9876543210" selected' in client.get(f"{PAGE}/compare").text
@@ -296,8 +289,8 @@ def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
 def test_another_content_of_a_release_is_refused_in_words(
     tmp_path, small_artifact, artifact_version
 ):
-    shelve(tmp_path / "service", small_artifact)
-    shelve(tmp_path / "service", artifact_version("1.0.0"), LATER)
+    add_database(tmp_path / "service", small_artifact)
+    add_database(tmp_path / "service", artifact_version("1.0.0"), LATER)
     with client_of(tmp_path / "service", anonymous="publisher") as client:
         assert client.post("/releases", data={"database": DATABASE}).status_code == 200
         form = {"database": LATER, "note": "kept <b>"}
@@ -337,7 +330,7 @@ def test_the_start_says_how_programs_reach_the_service(client, empty):
 
 
 def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
-    shelve(tmp_path / "service", small_artifact)
+    add_database(tmp_path / "service", small_artifact)
     ended_s = time.time() - 86_400.0
     with client_of(tmp_path / "service", anonymous="reader") as client:
         service = client.app.state.service

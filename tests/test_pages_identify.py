@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from shelved import DATABASE, client_of, shelve
+from services import DATABASE
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
@@ -24,16 +23,8 @@ from starcat.matcher.database import open_database
 from starcat.service.pages.identify import NOISE_PX, centroid_file
 from starcat.simulation.simulate import Noise, simulate_frames
 
-LOCAL = "http://127.0.0.1:8000"
 SEED = 7
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[TestClient]:
-    root = tmp_path_factory.mktemp("identify") / "service"
-    shelve(root, small_artifact)
-    with client_of(root, anonymous="reader", upload_mib=2.0) as client:
-        yield client
+SETTINGS = {"anonymous": "reader", "upload_mib": 2.0}
 
 
 @pytest.fixture(scope="module")

@@ -38,14 +38,10 @@ def table() -> pa.Table:
     )
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
-    write_parquet(table(), tmp_path / "a.parquet")
-    assert read_parquet(tmp_path / "a.parquet").equals(table())
-
-
-def test_the_same_table_has_the_same_bytes(tmp_path: Path) -> None:
+def test_what_is_written_is_read_and_has_the_same_bytes_again(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_parquet(table(), tmp_path / name)
+        assert read_parquet(tmp_path / name).equals(table())
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -53,6 +49,10 @@ def test_duckdb_reads_a_whole_artifact(files: list[Path]) -> None:
     for path in files:
         counted = duckdb.sql(f"SELECT count(*) FROM '{path}'").fetchall()
         assert counted == [(pq.read_metadata(path).num_rows,)]
+        pairs = duckdb.sql(f"SELECT key, value FROM parquet_kv_metadata('{path}')").fetchall()
+        footer = dict(pairs)
+        assert footer[b"IVOA.VOTable-Parquet.version"] == b"1.0"
+        assert footer[b"starcat.schema"].startswith(path.stem.encode())
     everything = duckdb.sql(
         f"SELECT DISTINCT filename FROM read_parquet('{files[0].parent}/*.parquet', "
         "filename = true, union_by_name = true)"
@@ -68,11 +68,8 @@ def test_pandas_reads_every_product(files: list[Path]) -> None:
         assert len(found) == expected.num_rows
         for name in found.columns:
             assert int(found[name].isna().sum()) == expected[name].null_count, (path.name, name)
-    stars = pd.read_parquet(files[0].parent / "stars.parquet")
-    assert (
-        stars["star_id"].tolist()
-        == pq.read_table(files[0].parent / "stars.parquet")["star_id"].to_pylist()
-    )
+        if path.stem == "stars":
+            assert found["star_id"].tolist() == expected["star_id"].to_pylist()
 
 
 def test_duckdb_joins_products(small_artifact: Path) -> None:
@@ -86,14 +83,6 @@ def test_duckdb_joins_products(small_artifact: Path) -> None:
               FROM '{small_artifact}/stars.parquet') b ON b.row = p.j"""
     ((off,),) = duckdb.sql(query).fetchall()
     assert off < 1e-12
-
-
-def test_duckdb_sees_the_footer(files: list[Path]) -> None:
-    for path in files:
-        rows = duckdb.sql(f"SELECT key, value FROM parquet_kv_metadata('{path}')").fetchall()
-        footer = dict(rows)
-        assert footer[b"IVOA.VOTable-Parquet.version"] == b"1.0"
-        assert footer[b"starcat.schema"].startswith(path.stem.encode())
 
 
 def test_the_votable_is_one_without_data(files: list[Path]) -> None:

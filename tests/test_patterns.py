@@ -18,13 +18,7 @@ from starcat.geometry.patterns import bin_of, cell_of, cyclic_shifts, ring_of, s
     st.integers(1, 400),
     st.integers(1, 400),
 )
-def test_bins(
-    pairs: list[tuple[float, float]],
-    angle_bin: float,
-    separation_bin: float,
-    angles: int,
-    separations: int,
-) -> None:
+def test_bins(pairs, angle_bin, separation_bin, angles, separations):
     pairs = [*pairs, (0.0, 0.0), (angle_bin, separation_bin), (7.0, 0.3)]
     angle_rad, separation_rad = np.array(pairs).T
     found = bin_of(angle_rad, separation_rad, angle_bin, separation_bin, angles, separations)
@@ -40,7 +34,7 @@ def test_bins(
     st.floats(0.01, 1.2),
     st.integers(1, 200),
 )
-def test_cells(points: list[tuple[float, float]], radius_rad: float, side: int) -> None:
+def test_cells(points, radius_rad, side):
     reach = math.tan(radius_rad)
     points = [*points, (-reach, reach), (0.0, 0.0), (reach, -reach)]
 
@@ -53,14 +47,14 @@ def test_cells(points: list[tuple[float, float]], radius_rad: float, side: int) 
 
 
 @given(st.lists(st.floats(0.0, 1.5), max_size=20), st.floats(0.01, 1.2), st.integers(1, 200))
-def test_rings(parts: list[float], radius_rad: float, rings: int) -> None:
+def test_rings(parts, radius_rad, rings):
     apart = [radius_rad * part for part in (*parts, 0.0, 0.5, 1.0)]
     expected = [min(math.floor(each / radius_rad * rings), rings - 1) for each in apart]
     assert ring_of(apart, radius_rad, rings).tolist() == expected
 
 
 @given(st.lists(st.floats(-7.0, 7.0), max_size=20), st.integers(1, 31))
-def test_sectors(turns: list[float], sectors: int) -> None:
+def test_sectors(turns, sectors):
     found = sector_of(np.array([*turns, 0.0, -1e-30]), sectors)
     assert ((found >= 0) & (found < sectors)).all()
     assert found[-2] == 0
@@ -72,7 +66,7 @@ def test_sectors(turns: list[float], sectors: int) -> None:
 
 
 @given(st.integers(1, 31), st.data())
-def test_shifts_are_turns_of_the_bits(sectors: int, data: st.DataObject) -> None:
+def test_shifts_are_turns_of_the_bits(sectors, data):
     patterns = data.draw(st.lists(st.integers(0, 2**sectors - 1), min_size=1, max_size=5))
     found = cyclic_shifts(np.array(patterns), sectors)
     for pattern, shifts in zip(patterns, found.T.tolist(), strict=True):

@@ -22,15 +22,11 @@ ROUNDING_MAG = 1e-13
 @pytest.mark.parametrize(
     ("bt_mag", "vt_mag", "v_mag", "is_out_of_range"),
     [
-        (9.0, 8.0, 7.910, False),
-        (8.0, 8.0, 8.0, False),
-        (7.8, 8.0, 8.018, False),
-        (9.8, 8.0, 7.838, False),
-        (11.0, 8.0, 7.838, True),
-        (7.0, 8.0, 8.018, True),
+        (9.0, 8.0, 7.910, False), (8.0, 8.0, 8.0, False), (7.8, 8.0, 8.018, False),
+        (9.8, 8.0, 7.838, False), (11.0, 8.0, 7.838, True), (7.0, 8.0, 8.018, True),
     ],
     ids=["yellow", "white", "blue end", "red end", "too red", "too blue"],
-)
+)  # fmt: skip
 def test_johnson_v_of_both_magnitudes(bt_mag, vt_mag, v_mag, is_out_of_range):
     found = johnson_v(np.array([bt_mag]), np.array([vt_mag]))
     assert found.mag[0] == pytest.approx(v_mag, abs=ROUNDING_MAG)
@@ -77,25 +73,10 @@ def test_weights_of_a_band(band, weights):
 @pytest.mark.parametrize(
     "band",
     [
-        "",
-        "V",
-        "K",
-        "j",
-        "J+H",
-        "J-H",
-        "0.6*J+0.3*H",
-        "0.5*J+0.5*J",
-        "J+J",
-        "(J+H)/3",
-        "(J+H)/0",
-        "(J+H)",
-        "J*0.5+H*0.5",
-        "0.5*J+",
-        "-1*J+2*H",
-        "J\n",
-        "nan*J",
+        "", "V", "K", "j", "J+H", "J-H", "0.6*J+0.3*H", "0.5*J+0.5*J", "J+J", "(J+H)/3",
+        "(J+H)/0", "(J+H)", "J*0.5+H*0.5", "0.5*J+", "-1*J+2*H", "J\n", "nan*J",
     ],
-)
+)  # fmt: skip
 def test_what_is_no_band_is_refused(band):
     with pytest.raises(ConfigError, match="unknown band") as caught:
         blend_weights(band)

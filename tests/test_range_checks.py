@@ -17,9 +17,10 @@ from starcat.catalog.source import Column, data_source
 from starcat.catalog.verdict import Verdicts
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
-from archives import FILE_NAMES, archive_records, file_header, record, synthetic_sky
+from archives import archive_records, file_header, record
+from catalog_folder import bright_sky
 
-SKY = synthetic_sky(40)
+SKY = bright_sky().where(np.arange(40))
 BRIGHT_SKY = replace(SKY, v_mag=SKY.v_mag - 6.0)
 
 Read = Callable[..., Ingested]
@@ -33,7 +34,7 @@ def read(tmp_path: Path) -> Read:
         layout = next(file for file in data_source(source).files if file.name == layout_name)
         sky = BRIGHT_SKY if layout_name == "suppl_1" else SKY
         records = archive_records(source, sky)[layout_name]
-        path = tmp_path / FILE_NAMES[layout_name]
+        path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
         path.write_bytes(file_header(layout, 41) + b"".join([*records, record(layout, fields)]))
         return ingest(source, [path])
 
@@ -41,13 +42,9 @@ def read(tmp_path: Path) -> Read:
 
 
 PSC = {
-    "ra": "10.000000",
-    "dec": "20.000000",
-    "designation": "00400000+2000000 ",
-    "k_m": "5.000",
-    "pts_key": "77",
-    "jdate": "2451545.0",
-}
+    "ra": "10.000000", "dec": "20.000000", "designation": "00400000+2000000 ", "k_m": "5.000",
+    "pts_key": "77", "jdate": "2451545.0",
+}  # fmt: skip
 
 
 def test_a_record_of_2mass_with_a_date_is_kept(read):
@@ -178,7 +175,7 @@ def test_limits_swapped_are_refused():
 
 
 def test_progress_counts_bytes_within_a_file(tmp_path):
-    line = archive_records("sao", synthetic_sky(1))["sao"][0]
+    line = archive_records("sao", SKY)["sao"][0]
     lines = [b"%6d" % number + line[6:] for number in range(1, 60_001)]
     path = tmp_path / "sao.dat"
     path.write_bytes(b"".join(lines))

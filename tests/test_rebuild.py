@@ -3,51 +3,32 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
+from artifact_copies import copied, seal
 
 from starcat.artifact import manifest as manifest_module
 from starcat.artifact.diff import Change
-from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
+from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.cli.artifacts import print_rebuilt
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
 from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
-from starcat.storage.digests import json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
 
 
 @pytest.fixture
-def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
-    path = tmp_path / "sao.dat"
-    path.write_bytes(b"".join(sao_lines))
-    return path
-
-
-@pytest.fixture
 def copy(small_artifact: Path, tmp_path: Path) -> Path:
-    return Path(
-        shutil.copytree(
-            small_artifact,
-            tmp_path / "artifacts" / small_artifact.name,
-            copy_function=shutil.copyfile,
-        )
-    )
+    return copied(small_artifact, tmp_path / "artifacts")
 
 
-def edit_manifest(folder: Path, change: Any) -> None:
-    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
-    change(manifest)
-    manifest["manifest_sha256"] = manifest_digest(manifest)
-    (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
-
-
-def test_the_same_inputs_give_the_same_bytes(small_artifact, stars, tmp_path):
+def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path):
     events: list[str] = []
     rebuilt = rebuild(
-        small_artifact, {"sao": [stars]}, tmp_path / "again", lambda stage, *_: events.append(stage)
+        small_artifact,
+        {"sao": [sao_file]},
+        tmp_path / "again",
+        lambda stage, *_: events.append(stage),
     )
     assert events[0] == "check inputs"
     assert "self-test" in events
@@ -59,57 +40,45 @@ def test_the_same_inputs_give_the_same_bytes(small_artifact, stars, tmp_path):
     assert made.read_bytes() == (small_artifact / MANIFEST_NAME).read_bytes()
 
 
-def test_nothing_is_left_without_an_output(small_artifact, stars, tmp_path, monkeypatch):
+def test_nothing_is_left_without_an_output(small_artifact, sao_file, tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
-    assert rebuild(small_artifact, {"sao": [stars]}).is_identical
+    assert rebuild(small_artifact, {"sao": [sao_file]}).is_identical
     assert list(temporary.iterdir()) == []
 
 
-def test_another_input_is_refused(small_artifact: Path, stars: Path) -> None:
-    data = bytearray(stars.read_bytes())
+def test_another_input_is_refused(small_artifact, sao_file):
+    data = bytearray(sao_file.read_bytes())
     data[83] ^= 1
-    stars.write_bytes(data)
-    with pytest.raises(
-        ChecksumMismatch, match=r"sao.dat: sha256 .* was made from sao.dat"
-    ) as error:
-        rebuild(small_artifact, {"sao": [stars]})
-    assert (error.value.source, error.value.path) == ("sao", stars)
-
-
-def test_another_number_of_inputs_is_refused(small_artifact: Path, stars: Path) -> None:
-    more = stars.with_name("more.dat")
-    more.write_bytes(stars.read_bytes()[:205])
+    other = sao_file.with_name("other.dat")
+    other.write_bytes(data)
+    with pytest.raises(ChecksumMismatch, match=r"other.dat: sha256 .* was made from sao.dat") as e:
+        rebuild(small_artifact, {"sao": [other]})
+    assert (e.value.source, e.value.path) == ("sao", other)
     with pytest.raises(ChecksumMismatch, match=r"2 input files; .* was made from 1"):
-        rebuild(small_artifact, {"sao": [stars, more]})
+        rebuild(small_artifact, {"sao": [sao_file, other]})
+    with pytest.raises(ConfigError, match="does not read gaia"):
+        rebuild(small_artifact, {"sao": [sao_file], "gaia": [sao_file]})
 
 
-def test_a_missing_input_is_an_error(small_artifact, tmp_path, monkeypatch):
+def test_a_missing_input_or_artifact_is_an_error(small_artifact, tmp_path, monkeypatch):
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
     with pytest.raises(SourceMissing):
         rebuild(small_artifact, {})
-
-
-def test_an_input_that_is_not_used_is_an_error(small_artifact: Path, stars: Path) -> None:
-    with pytest.raises(ConfigError, match="does not read gaia"):
-        rebuild(small_artifact, {"sao": [stars], "gaia": [stars]})
-
-
-def test_no_artifact_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ProductError):
         rebuild(tmp_path, {})
 
 
-def test_other_libraries_are_named(copy, stars, monkeypatch):
+def test_other_libraries_are_named(copy, sao_file, monkeypatch):
     found = manifest_module.version
 
     def version(name: str) -> str:
         return "99.0" if name == "numpy" else found(name)
 
     monkeypatch.setattr(manifest_module, "version", version)
-    rebuilt = rebuild(copy, {"sao": [stars]})
+    rebuilt = rebuild(copy, {"sao": [sao_file]})
     assert not rebuilt.is_identical
     changes = {change.file: change.what for change in rebuilt.changes}
     assert changes.pop(MANIFEST_NAME).endswith("software")
@@ -117,11 +86,11 @@ def test_other_libraries_are_named(copy, stars, monkeypatch):
     assert rebuilt.software == (Change("numpy", found("numpy"), "99.0"),)
 
 
-def test_what_was_changed_afterwards_is_named(copy: Path, stars: Path) -> None:
+def test_what_was_changed_afterwards_is_named(copy, sao_file):
     (copy / "pairs.parquet").write_bytes(b"PAR1")
     (copy / "triangles.parquet").unlink()
     (copy / "notes.txt").write_text("mine")
-    rebuilt = rebuild(copy, {"sao": [stars]})
+    rebuilt = rebuild(copy, {"sao": [sao_file]})
     assert [(change.file, change.what) for change in rebuilt.changes] == [
         ("notes.txt", "not made by the rebuild"),
         ("pairs.parquet", "changed since it was built"),
@@ -129,7 +98,7 @@ def test_what_was_changed_afterwards_is_named(copy: Path, stars: Path) -> None:
     ]
 
 
-def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) -> None:
+def test_columns_that_came_out_differently_are_named(copy, sao_file):
     """An artifact that is sound by its own manifest, and still not what the inputs give."""
     path = copy / "stars.parquet"
     table = read_parquet(path)
@@ -137,15 +106,8 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
     write_parquet(table.set_column(place, table.schema.field(place), table["z"]), path)
     short = read_parquet(copy / "pairs.parquet").slice(1)
     write_parquet(short, copy / "pairs.parquet")
-
-    def change(manifest: dict[str, Any]) -> None:
-        from starcat.storage.digests import file_sha256
-
-        for name in ("stars.parquet", "pairs.parquet"):
-            manifest["files"][name]["sha256"] = file_sha256(copy / name)
-
-    edit_manifest(copy, change)
-    changes = {change.file: change.what for change in rebuild(copy, {"sao": [stars]}).changes}
+    seal(copy)
+    changes = {change.file: change.what for change in rebuild(copy, {"sao": [sao_file]}).changes}
     assert changes == {
         MANIFEST_NAME: "differs in files",
         "pairs.parquet": f"built differently: {len(short)} rows before, {len(short) + 1} now",
@@ -154,12 +116,12 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
 
 
 @pytest.mark.slow
-def test_the_command(copy, stars, starcat, capsys):
-    ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
+def test_the_command(copy, sao_file, starcat, capsys):
+    ran = starcat(["rebuild", copy, "--input", f"sao={sao_file}"])
     assert ran.code == 0
     assert "every byte the same" in ran.out
     (copy / "pairs.parquet").write_bytes(b"PAR1")
-    ran = starcat(["rebuild", copy, "--input", f"sao={stars}", "--json"])
+    ran = starcat(["rebuild", copy, "--input", f"sao={sao_file}", "--json"])
     assert ran.code == 5
     content = json.loads(ran.out)
     assert content["is_identical"] is False
@@ -171,5 +133,5 @@ def test_the_command(copy, stars, starcat, capsys):
     assert "a-1.0.0: 1 of 9 files differ" in printed
     assert "changed since it was built" in printed
     assert "numpy" in printed
-    stars.write_bytes(b"")
-    assert starcat(["rebuild", copy, "--input", f"sao={stars}"]).code == 3
+    sao_file.write_bytes(b"")
+    assert starcat(["rebuild", copy, "--input", f"sao={sao_file}"]).code == 3

@@ -7,9 +7,7 @@ at the registry after each kill.
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import http.server
 import json
 import os
 import random
@@ -19,14 +17,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 from folder_bytes import bytes_of
-from served import in_background
+from registry_files import serving
 
 import starcat
 from starcat.artifact.verify import verify_artifact
@@ -200,116 +197,59 @@ def seen(output: Path) -> set[str]:
     return {path.name for path in output.glob("*") if not path.name.startswith(".")}
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
-    """The file server of the standard library, without its log."""
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-class Server(http.server.ThreadingHTTPServer):
-    def handle_error(self, *_: object) -> None:
-        """Say nothing: clients that are killed are the point."""
-
-
-@contextmanager
-def serving(folder: Path) -> Iterator[str]:
-    handler = functools.partial(Quiet, directory=str(folder))
-    with Server(("127.0.0.1", 0), handler) as server, in_background(server):
-        yield f"http://127.0.0.1:{server.server_port}"
-
-
 # Random kills -------------------------------------------------------------------------------
 
 
-def seconds_of(call: Callable[[], object]) -> float:
+def usual_seconds(workers: Workers, **order: str) -> float:
+    """Return how long a worker takes where nobody interrupts."""
     start = time.monotonic()
-    call()
+    workers.run(**order)
     return time.monotonic() - start
-
-
-@dataclass
-class Kills:
-    """How many workers were killed at work, of how many that were shot at."""
-
-    shots: int = 0
-    hits: int = 0
-
-    def count(self, hit: bool) -> None:
-        self.shots += 1
-        self.hits += hit
-
-
-def usual_seconds(workers: Workers, version: Version, folder: Path) -> tuple[float, float]:
-    """Return how long a publication and a pull take where nobody interrupts, at the second try."""
-    artifact = str(version("0.0.1"))
-    for k in range(2):
-        registry, output = str(folder / f"trial-{k}"), str(folder / f"trial-out-{k}")
-        publish_s = seconds_of(lambda: workers.run(publish=artifact, registry=registry))  # noqa: B023
-        pull_s = seconds_of(
-            lambda: workers.run(pull="small", registry=registry, output=output)  # noqa: B023
-        )
-    return publish_s, pull_s
-
-
-def publish_and_pull(
-    rounds: int, seed: int, workers: Workers, version: Version, folder: Path
-) -> Kills:
-    """Publish and pull a version a round, each killed once or twice before it may finish.
-
-    Pulls are from the folder and over HTTP by turns.
-    """
-    with serving(folder / "registry") as address:
-        return _rounds(rounds, seed, workers, version, folder, address)
-
-
-def _rounds(
-    rounds: int, seed: int, workers: Workers, version: Version, folder: Path, address: str
-) -> Kills:
-    dice, kills = random.Random(seed), Kills()
-    registry, reader = str(folder / "registry"), Reader(folder / "registry")
-    publish_s, pull_s = usual_seconds(workers, version, folder)
-    for k in range(rounds):
-        artifact, wanted = version(f"1.{k}.0"), f"small@1.{k}.0"
-        publish = {"publish": str(artifact), "registry": registry}
-        for _ in range(dice.randint(1, 2)):
-            kills.count(workers.kill_after(dice.random() * publish_s, **publish))
-            reader.look()
-        assert workers.run(**publish) in DONE
-        assert wanted in reader.look()
-        output = folder / f"out-{k}"
-        where = address if k % 2 else registry
-        order = {"pull": wanted, "registry": where, "output": str(output)}
-        for _ in range(dice.randint(1, 2)):
-            kills.count(workers.kill_after(dice.random() * pull_s, **order))
-            assert seen(output) == ({artifact.name} if check_output(output, artifact) else set())
-        assert workers.run(**order) in DONE
-        assert check_output(output, artifact)
-        if k % 4 == 3:
-            # A version of earlier, which may share files with one whose publisher was killed.
-            older = dice.randint(0, k)
-            order |= {"pull": f"small@1.{older}.0", "output": str(folder / "older")}
-            assert workers.run(**order) in DONE
-            assert check_output(folder / "older", version(f"1.{older}.0"))
-            shutil.rmtree(folder / "older")
-        assert verify_artifact(output / artifact.name).findings == ()
-        shutil.rmtree(output)
-    assert len(reader.look()) == rounds
-    assert [*(folder / "registry" / ".incoming").glob("*.part")] == []
-    return kills
-
-
-@pytest.mark.slow
-def test_8_rounds_with_random_kills(workers, artifact_version, tmp_path):
-    kills = publish_and_pull(8, 8, workers, artifact_version, tmp_path)
-    assert kills.hits >= 2, kills
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
-    kills = publish_and_pull(50, 50, workers, artifact_version, tmp_path)
-    assert kills.hits >= 12, kills
+    """Publish and pull a version a round, each killed once or twice before it may finish.
+
+    Pulls are from the folder and over HTTP by turns.
+    """
+    rounds, dice, kills = 50, random.Random(50), []
+    registry, reader = str(tmp_path / "registry"), Reader(tmp_path / "registry")
+    for name in ("first", "trial"):  # the second try is the usual one
+        trial, output = str(tmp_path / name), str(tmp_path / f"{name}-out")
+        publish_s = usual_seconds(workers, publish=str(artifact_version("0.0.1")), registry=trial)
+        pull_s = usual_seconds(workers, pull="small", registry=trial, output=output)
+    with serving(tmp_path / "registry") as server:
+        for k in range(rounds):
+            artifact, wanted = artifact_version(f"1.{k}.0"), f"small@1.{k}.0"
+            publish = {"publish": str(artifact), "registry": registry}
+            for _ in range(dice.randint(1, 2)):
+                kills.append(workers.kill_after(dice.random() * publish_s, **publish))
+                reader.look()
+            assert workers.run(**publish) in DONE
+            assert wanted in reader.look()
+            output = tmp_path / f"out-{k}"
+            where = server.url if k % 2 else registry
+            order = {"pull": wanted, "registry": where, "output": str(output)}
+            for _ in range(dice.randint(1, 2)):
+                kills.append(workers.kill_after(dice.random() * pull_s, **order))
+                whole = check_output(output, artifact)
+                assert seen(output) == ({artifact.name} if whole else set())
+            assert workers.run(**order) in DONE
+            assert check_output(output, artifact)
+            if k % 4 == 3:
+                # A version of earlier, which may share files with one whose publisher was killed.
+                older = dice.randint(0, k)
+                order |= {"pull": f"small@1.{older}.0", "output": str(tmp_path / "older")}
+                assert workers.run(**order) in DONE
+                assert check_output(tmp_path / "older", artifact_version(f"1.{older}.0"))
+                shutil.rmtree(tmp_path / "older")
+            assert verify_artifact(output / artifact.name).findings == ()
+            shutil.rmtree(output)
+    assert len(reader.look()) == rounds
+    assert [*(tmp_path / "registry" / ".incoming").glob("*.part")] == []
+    assert sum(kills) >= 12, kills
 
 
 # A kill at every step -----------------------------------------------------------------------

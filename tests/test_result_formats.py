@@ -29,27 +29,18 @@ ROWS = [
 def table() -> pa.Table:
     """Three stars."""
     units = {"mag": {"unit": "mag", "ucd": "phot.mag"}}
-    schema = pa.schema(
-        [
-            pa.field(name, kind, metadata=units.get(name))
-            for name, kind in (
-                ("star_id", pa.int64()), ("mag", pa.float64()), ("name", pa.string())
-            )
-        ]
-    )  # fmt: skip
+    kinds = {"star_id": pa.int64(), "mag": pa.float64(), "name": pa.string()}
+    schema = pa.schema([pa.field(name, kinds[name], metadata=units.get(name)) for name in kinds])
     return pa.Table.from_pylist(ROWS, schema)
 
 
 @EVERY
 @pytest.mark.parametrize("maxrec", [None, 3, 2, 0])
-def test_every_format_has_the_rows(
-    table: pa.Table, tmp_path: Path, asked: Format, maxrec: int | None
-) -> None:
+def test_every_format_has_the_rows(table, tmp_path, asked, maxrec):
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    content = b"".join(
-        result_chunks(table.to_reader(), asked, scratch, label=Label("stars"), maxrec=maxrec)
-    )
+    given = result_chunks(table.to_reader(), asked, scratch, label=Label("stars"), maxrec=maxrec)
+    content = b"".join(given)
     form = "votable/b2" if asked.name == "votable" else asked.name.removesuffix("/td")
     path = tmp_path / f"read{asked.suffix}"
     path.write_bytes(content)
@@ -66,23 +57,15 @@ def test_every_format_has_the_rows(
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        (None, "votable"),
-        ("", "votable"),
-        ("votable", "votable"),
-        ("text/xml", "votable"),
+        (None, "votable"), ("", "votable"), ("votable", "votable"), ("text/xml", "votable"),
         ("application/x-votable xml", "votable"),
         ("application/x-votable+xml;serialization=BINARY2", "votable"),
         ('Application/X-VOTable+XML; serialization = "TableData"', "votable/td"),
-        ("votable/td", "votable/td"),
-        ("FITS", "fits"),
-        ("csv", "csv"),
-        ("text/csv; header=present", "csv"),
-        ("tsv", "tsv"),
-        ("text/tab-separated-values", "tsv"),
-        ("parquet", "parquet"),
-        ("application/json", "json"),
+        ("votable/td", "votable/td"), ("FITS", "fits"), ("csv", "csv"),
+        ("text/csv; header=present", "csv"), ("tsv", "tsv"), ("text/tab-separated-values", "tsv"),
+        ("parquet", "parquet"), ("application/json", "json"),
     ],
-)
+)  # fmt: skip
 def test_a_format_is_asked_for_by_name_or_media_type(text: str | None, name: str) -> None:
     assert response_format(text).name == name
 
@@ -111,9 +94,7 @@ def failing(batches: int) -> pa.RecordBatchReader:
 
 
 @EVERY
-def test_what_fails_at_once_is_raised_before_anything_is_sent(
-    tmp_path: Path, asked: Format
-) -> None:
+def test_what_fails_at_once_is_raised_before_anything_is_sent(tmp_path, asked):
     with pytest.raises(QueryLimitError):
         result_chunks(failing(0), asked, tmp_path)
     assert not list(tmp_path.iterdir())
@@ -151,13 +132,9 @@ def test_a_file_is_gone_when_nobody_reads_on(tmp_path: Path, name: str) -> None:
 
 
 def test_tsv_has_one_line_a_row_and_no_quotation_marks(tmp_path: Path) -> None:
-    table = pa.table(
-        {
-            "a\tb": ['say "no"', "x\r\ny", None, ""],
-            "c": [[1, 2], None, [], [3]],
-            "d": [True, None, False, True],
-        }
-    )
+    columns = {"a\tb": ['say "no"', "x\r\ny", None, ""], "c": [[1, 2], None, [], [3]],
+               "d": [True, None, False, True]}  # fmt: skip
+    table = pa.table(columns)
     content = b"".join(result_chunks(table.to_reader(), response_format("tsv"), tmp_path))
     assert content.decode() == (
         'a b\tc\td\nsay "no"\t[1,2]\ttrue\nx  y\t\t\n\t[]\tfalse\n\t[3]\ttrue\n'

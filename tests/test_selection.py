@@ -25,16 +25,9 @@ ALONE = 10.0  # degrees between stars that have nothing to do with each other
 
 def sky_of(directions: NDArray[np.float64], mag: Sequence[float], **columns: Any) -> pa.Table:
     ra, dec = radec_from_directions(directions)
-    given_columns: dict[str, Any] = {
-        "star_id": np.arange(1, len(mag) + 1),
-        "ra_deg": ra,
-        "dec_deg": dec,
-        "x": directions[:, 0],
-        "y": directions[:, 1],
-        "z": directions[:, 2],
-        "mag": np.array(mag, dtype=float),
-        "quality_flags": 0,
-    }
+    numbers, mags = np.arange(1, len(mag) + 1), np.array(mag, dtype=float)
+    given_columns = {"star_id": numbers, "ra_deg": ra, "dec_deg": dec, "mag": mags}
+    given_columns |= {"quality_flags": 0, **dict(zip("xyz", directions.T, strict=True))}
     given_columns |= {name: np.array(values) for name, values in columns.items()}
     return table_from_columns("stars", given_columns, len(mag))
 
@@ -101,6 +94,9 @@ def test_no_stars():
 
 # Doubles
 
+MERGE = {"action": "merge"}
+SAME = [5.0, 5.0, 5.0001]  # right ascensions
+
 
 def limits_around(angle_rad: float) -> tuple[float, float]:
     """Two neighbouring floats, in degrees, below and at (or above) an angle."""
@@ -127,52 +123,38 @@ def test_separation_is_on_the_sphere_and_across_zero_hours(dec):
 
 
 @pytest.mark.parametrize(
-    ("max_delta_mag", "expected"),
+    ("ra_deg", "mag", "options", "expected"),
     [
-        (None, ["double", "double"]),
-        (2.0, ["double", "double"]),
-        (1.9, ["kept", "double"]),
-        (0.0, ["kept", "double"]),
+        # A faint companion does not count, but a bright one does.
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": None}, ["double", "double"]),
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 2.0}, ["double", "double"]),
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 1.9}, ["kept", "double"]),
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 0.0}, ["kept", "double"]),
+        # Companions count up to their own limit, be it fainter or brighter than that of stars.
+        ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": None}, ["kept", "too_faint"]),
+        ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 6.4}, ["kept", "too_faint"]),
+        ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 6.5}, ["double", "too_faint"]),
+        ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 9.0}, ["double", "too_faint"]),
+        ([0.0, 0.01], [5.0, 5.5], {"companion_limit_mag": 5.2}, ["kept", "kept"]),
+        # A bright star that is rejected is still a companion; one without magnitude is nobody's.
+        ([0.0, 0.01], [1.0, 4.0], {"bright": 2.0}, ["too_bright", "double"]),
+        ([0.0, 0.01], [4.0, np.nan], {}, ["kept", "no_magnitude"]),
+        # A separation of zero takes only stars at the same place.
+        (SAME, [3.0, 4.0, 4.5], {"min_separation_deg": 0.0}, ["double", "double", "kept"]),
+        (SAME, [3.0, 4.0, 4.5], {"min_separation_deg": 0.0, **MERGE}, ["kept", "merged", "kept"]),
+        # Two groups do not mix, and stars too different or without magnitude are not merged.
+        ([0, 5, 0.01, 5.01], [5, 4, 4.5, 4.5], MERGE, ["merged", "kept", "kept", "merged"]),
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 1.9, **MERGE}, ["kept", "kept"]),
+        ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 2.0, **MERGE}, ["kept", "merged"]),
+        ([0.0, 0.01], [3.0, np.nan], MERGE, ["kept", "no_magnitude"]),
+        # A merged star is compared with the limits as one: 4.25 here, 5.75 there.
+        ([0.0, 0.01], [5.0, 5.0], {"bright": 4.5, **MERGE}, ["too_bright", "merged"]),
+        ([0.0, 0.01], [6.5, 6.5], {"companion_limit_mag": 7.0, **MERGE}, ["kept", "merged"]),
+        ([0.0, 0.01], [6.5, 6.5], MERGE, ["too_faint", "too_faint"]),
     ],
 )
-def test_a_faint_companion_does_not_count_but_a_bright_one_does(max_delta_mag, expected):
-    stars = sky([0.0, 0.01], [3.0, 5.0])
-    assert judge(stars, rules(max_delta_mag=max_delta_mag)) == expected
-
-
-@pytest.mark.parametrize(
-    ("companion_limit_mag", "expected"),
-    [
-        (None, ["kept", "too_faint"]),
-        (6.4, ["kept", "too_faint"]),
-        (6.5, ["double", "too_faint"]),
-        (9.0, ["double", "too_faint"]),
-    ],
-)
-def test_companions_up_to_their_own_limit(companion_limit_mag, expected):
-    stars = sky([0.0, 0.01], [5.0, 6.5])
-    assert judge(stars, rules(companion_limit_mag=companion_limit_mag)) == expected
-
-
-def test_a_companion_limit_above_the_faint_limit_takes_companions_away():
-    stars = sky([0.0, 0.01], [5.0, 5.5])
-    assert judge(stars, rules(companion_limit_mag=5.2)) == ["kept", "kept"]
-
-
-def test_a_bright_star_that_is_rejected_is_still_a_companion():
-    stars = sky([0.0, 0.01], [1.0, 4.0])
-    assert judge(stars, rules(bright=2.0)) == ["too_bright", "double"]
-
-
-def test_a_star_without_magnitude_is_nobodys_companion():
-    assert judge(sky([0.0, 0.01], [4.0, np.nan]), rules()) == ["kept", "no_magnitude"]
-
-
-@pytest.mark.parametrize("action", ["remove", "merge"])
-def test_separation_zero_takes_only_stars_at_the_same_place(action):
-    stars = sky([5.0, 5.0, 5.0001], [3.0, 4.0, 4.5])
-    expected = ["double", "double", "kept"] if action == "remove" else ["kept", "merged", "kept"]
-    assert judge(stars, rules(min_separation_deg=0.0, action=action)) == expected
+def test_close_stars(ra_deg, mag, options, expected):
+    assert judge(sky(ra_deg, mag), rules(**options)) == expected
 
 
 def test_doubles_can_be_kept():
@@ -216,37 +198,6 @@ def test_a_chain_of_three_is_one_star():
     assert selected.guide_stars["mag"][0].as_py() == pytest.approx(5.0 - 2.5 * np.log10(3.0))
     assert selected.guide_stars["ra_deg"].to_pylist() == pytest.approx([0.04, 1.0], abs=1e-9)
     assert selected.guide_stars["quality_flags"].to_pylist()[1] == 0
-
-
-def test_two_groups_do_not_mix():
-    selected = merged([0.0, 5.0, 0.01, 5.01], [5.0, 4.0, 4.5, 4.5])
-    assert verdicts(selected) == {1: "merged", 2: "kept", 3: "kept", 4: "merged"}
-
-
-def test_a_merged_star_is_compared_with_the_limits_as_one():
-    both = [5.0, 5.0]  # together 4.25
-    assert list(verdicts(merged([0.0, 0.01], both, bright=4.5)).values()) == [
-        "too_bright",
-        "merged",
-    ]
-    faint = merged([0.0, 0.01], [6.5, 6.5], companion_limit_mag=7.0)  # together 5.75
-    assert list(verdicts(faint).values()) == ["kept", "merged"]
-    apart = merged([0.0, 0.01], [6.5, 6.5])
-    assert list(verdicts(apart).values()) == ["too_faint", "too_faint"]
-
-
-@pytest.mark.parametrize(
-    ("max_delta_mag", "expected"), [(1.9, ["kept", "kept"]), (2.0, ["kept", "merged"])]
-)
-def test_stars_too_different_are_not_merged(max_delta_mag, expected):
-    selected = merged([0.0, 0.01], [3.0, 5.0], max_delta_mag=max_delta_mag)
-    assert list(verdicts(selected).values()) == expected
-
-
-def test_a_star_without_magnitude_is_not_merged():
-    selected = merged([0.0, 0.01], [3.0, np.nan])
-    assert verdicts(selected) == {1: "kept", 2: "no_magnitude"}
-    assert selected.guide_stars["quality_flags"].to_pylist() == [0]
 
 
 # Flags of the archive
@@ -333,15 +284,17 @@ def test_flagged_variables(flags, flagged, amplitude, verdict):
 # Count
 
 
-def test_of_equal_stars_the_lowest_numbers_stay():
-    stars = alone([5.0, 3.0, 5.0, 5.0, 2.0])
-    expected = ["kept", "kept", "beyond_count", "beyond_count", "kept"]
-    assert judge(stars, rules(max_stars=3)) == expected
-
-
-@pytest.mark.parametrize("max_stars", [5, 6])
-def test_fewer_stars_than_allowed(max_stars):
-    assert judge(alone([5.0] * 5), rules(max_stars=max_stars)) == ["kept"] * 5
+@pytest.mark.parametrize(
+    ("mag", "max_stars", "expected"),
+    [
+        # Of equal stars the lowest numbers stay.
+        ([5, 3, 5, 5, 2], 3, ["kept", "kept", "beyond_count", "beyond_count", "kept"]),
+        ([5] * 5, 5, ["kept"] * 5),
+        ([5] * 5, 6, ["kept"] * 5),
+    ],
+)
+def test_the_brightest_stay(mag, max_stars, expected):
+    assert judge(alone(mag), rules(max_stars=max_stars)) == expected
 
 
 def test_the_count_is_of_the_stars_that_are_left():
@@ -373,18 +326,9 @@ def test_the_first_reason_that_applies_is_the_verdict():
         companion_limit_mag=7.0,
     )
     assert judge(stars, selection) == [
-        "no_magnitude",
-        "no_magnitude",
-        "too_bright",
-        "too_bright",
-        "too_faint",
-        "double",
-        "flagged_double",
-        "variable",
-        "flagged_variable",
-        "beyond_count",
-        "kept",
-    ]
+        *["no_magnitude"] * 2, *["too_bright"] * 2, "too_faint", "double", "flagged_double",
+        "variable", "flagged_variable", "beyond_count", "kept",
+    ]  # fmt: skip
 
 
 def test_steps_count_down_to_the_guide_stars():

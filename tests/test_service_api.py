@@ -5,42 +5,34 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import shutil
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from artifact_copies import copied, seal
 from fastapi.testclient import TestClient
-from shelved import DATABASE, client_of, shelve, waiting_build
+from services import DATABASE, add_database, client_of, waiting_build
 
 from starcat.artifact.verify import verify_artifact
 from starcat.releases.pulling import pull_release
 from starcat.releases.registry import FolderRegistry
 
+SETTINGS = {"anonymous": "publisher"}
 OTHER = "fedcba9876543210"
 API = f"/api/v1/databases/{DATABASE}"
 
 
-@pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[TestClient]:
-    """A client of a service that no test changes."""
-    root = tmp_path_factory.mktemp("api") / "service"
-    shelve(root, small_artifact)
-    with client_of(root, anonymous="publisher") as client:
-        yield client
-
-
 @pytest.fixture
-def root(tmp_path: Path, small_artifact: Path) -> Path:
-    shelve(tmp_path / "service", small_artifact)
+def own_root(tmp_path: Path, small_artifact: Path) -> Path:
+    add_database(tmp_path / "service", small_artifact)
     return tmp_path / "service"
 
 
 @pytest.fixture
-def own(root: Path) -> Iterator[TestClient]:
+def own(own_root: Path) -> Iterator[TestClient]:
     """A client of a service of the test's own."""
-    with client_of(root, anonymous="publisher") as client:
+    with client_of(own_root, **SETTINGS) as client:
         yield client
 
 
@@ -140,8 +132,8 @@ def test_a_range_of_another_content_is_the_whole_file(client):
     assert client.get(path, headers={**asked, "If-Range": '"another"'}).status_code == 200
 
 
-def test_only_files_of_the_manifest_are_there(own, root):
-    (root / "databases" / DATABASE / "small-1.0.0" / "secret.txt").write_text("secret")
+def test_only_files_of_the_manifest_are_there(own, own_root):
+    (own_root / "databases" / DATABASE / "small-1.0.0" / "secret.txt").write_text("secret")
     for path in (
         "../small-1.0.0.build.json",
         "..%2f..%2f..%2frecords.sqlite",
@@ -156,8 +148,8 @@ def test_only_files_of_the_manifest_are_there(own, root):
         assert own.get(f"{API}/files/{path}").status_code in (400, 404), path
 
 
-def test_a_link_is_no_file(own, root, tmp_path):
-    path = root / "databases" / DATABASE / "small-1.0.0" / "stars.parquet"
+def test_a_link_is_no_file(own, own_root, tmp_path):
+    path = own_root / "databases" / DATABASE / "small-1.0.0" / "stars.parquet"
     (tmp_path / "elsewhere").write_bytes(path.read_bytes())
     path.unlink()
     path.symlink_to(tmp_path / "elsewhere")
@@ -175,8 +167,8 @@ def test_the_archive_is_the_artifact(client, tmp_path):
     assert client.get(f"{API}/archive").content == answer.content
 
 
-def test_two_databases_are_compared(own, root, artifact_version):
-    shelve(root, artifact_version("1.1.0"), OTHER)
+def test_two_databases_are_compared(own, own_root, artifact_version):
+    add_database(own_root, artifact_version("1.1.0"), OTHER)
     found = own.get(f"{API}/diff/{OTHER}").json()
     assert [change["name"] for change in found["spec"]] == ["version"]
     assert found["counts"] == {"came": 0, "went": 0, "moved": 0}
@@ -184,12 +176,12 @@ def test_two_databases_are_compared(own, root, artifact_version):
     assert own.get(f"{API}/diff/{'0' * 16}").status_code == 404
 
 
-def test_a_removed_database_is_gone_and_its_release_stays(own, root):
+def test_a_removed_database_is_gone_and_its_release_stays(own, own_root):
     own.post("/api/v1/releases", json={"database": DATABASE})
     assert own.delete(API).status_code == 204
     assert own.get(API).status_code == 404
-    assert not (root / "databases" / DATABASE).exists()
-    assert not list((root / "scratch").iterdir())
+    assert not (own_root / "databases" / DATABASE).exists()
+    assert not list((own_root / "scratch").iterdir())
     assert own.get("/api/v1/releases/small/1.0.0").status_code == 200
 
 
@@ -201,17 +193,17 @@ def test_a_database_that_a_job_makes_is_not_removed(own):
     assert own.get(API).status_code == 200
 
 
-def test_who_may_only_read_neither_removes_nor_publishes(root):
-    with client_of(root) as client:
+def test_who_may_only_read_neither_removes_nor_publishes(own_root):
+    with client_of(own_root) as client:
         assert client.delete(API).status_code == 401
         assert client.post("/api/v1/releases", json={"database": DATABASE}).status_code == 401
         assert client.get(API).status_code == 200
-    with client_of(root, anonymous="none") as client:
+    with client_of(own_root, anonymous="none") as client:
         for path in (API, f"{API}/files/stars.parquet", "/registry/index.json", "/api/v1/releases"):
             assert client.get(path).status_code == 401
 
 
-def test_publishing_makes_a_release_that_can_be_pulled(own, root, tmp_path):
+def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
     first = own.post("/api/v1/releases", json={"database": DATABASE, "note": "<b>first</b>"})
     assert (first.status_code, first.json()["outcome"]) == (201, "published")
     again = own.post("/api/v1/releases", json={"database": DATABASE, "note": "again"})
@@ -219,20 +211,21 @@ def test_publishing_makes_a_release_that_can_be_pulled(own, root, tmp_path):
     [listed] = own.get("/api/v1/releases").json()["releases"]
     assert (listed["note"], listed["owner"]) == ("<b>first</b>", "anonymous")
     assert listed == own.get("/api/v1/releases/small/1.0.0").json()
-    [release] = FolderRegistry(root / "registry").releases()
+    [release] = FolderRegistry(own_root / "registry").releases()
     assert release.title == "small-1.0.0"
-    pull_release(FolderRegistry(root / "registry"), release, tmp_path / "out")
+    pull_release(FolderRegistry(own_root / "registry"), release, tmp_path / "out")
     assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
 
 
 def test_another_content_under_a_published_version_is_refused(
-    own, root, tmp_path, artifact_version
+    own, own_root, tmp_path, artifact_version
 ):
     own.post("/api/v1/releases", json={"database": DATABASE})
-    other = tmp_path / "small-1.0.0"
-    shutil.copytree(artifact_version("1.0.0"), other)
-    changed_content(other)
-    shelve(root, other, OTHER)
+    other = copied(artifact_version("1.0.0"), tmp_path)
+    page = other / "report" / "index.html"
+    page.write_bytes(page.read_bytes() + b"<!-- other -->")
+    seal(other)
+    add_database(own_root, other, OTHER)
     answer = own.post("/api/v1/releases", json={"database": OTHER})
     assert answer.status_code == 409
     assert "raise the version" in answer.json()["detail"]
@@ -240,25 +233,12 @@ def test_another_content_under_a_published_version_is_refused(
     assert listed["database"] == DATABASE
 
 
-def changed_content(artifact: Path) -> None:
-    from starcat.artifact.manifest import manifest_digest
-    from starcat.storage.digests import file_sha256, json_bytes
-
-    page = artifact / "report" / "index.html"
-    page.write_bytes(page.read_bytes() + b"<!-- other -->")
-    manifest = manifest_of(artifact)
-    facts = {"bytes": page.stat().st_size, "sha256": file_sha256(page)}
-    manifest["files"]["report/index.html"] |= facts
-    manifest["manifest_sha256"] = manifest_digest(manifest)
-    (artifact / "manifest.json").write_bytes(json_bytes(manifest))
-
-
-def test_the_registry_is_its_own_files_only(own, root):
+def test_the_registry_is_its_own_files_only(own, own_root):
     assert own.get("/registry/index.json").status_code == 404
     own.post("/api/v1/releases", json={"database": DATABASE})
-    (root / "registry" / ".lock").touch()
+    (own_root / "registry" / ".lock").touch()
     index = own.get("/registry/index.json")
-    assert index.content == (root / "registry" / "index.json").read_bytes()
+    assert index.content == (own_root / "registry" / "index.json").read_bytes()
     assert "no-cache" in index.headers["cache-control"]
     tag = {"If-None-Match": index.headers["etag"]}
     assert own.get("/registry/index.json", headers=tag).status_code == 304

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from served import Served, serve
-from shelved import DATABASE, shelve
+from services import DATABASE, add_database
 
 from starcat.artifact.verify import verify_artifact
 from starcat.client import Client
@@ -26,7 +26,7 @@ def served(
     folder = tmp_path_factory.mktemp("client")
     (folder / "catalogs").mkdir()
     (folder / "catalogs" / "sao.dat").write_bytes(b"".join(sao_lines))
-    shelve(folder / "root", small_artifact)
+    add_database(folder / "root", small_artifact)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("STARCAT_CATALOGS", str(folder / "catalogs"))
         patch.setenv("STARCAT_CACHE", str(folder / "no-cache"))
@@ -38,6 +38,12 @@ def served(
 @pytest.fixture(scope="module")
 def client(served: Served) -> Client:
     return Client(served.address)
+
+
+@pytest.fixture
+def remote(served: Served, starcat):
+    """Run a command of that server."""
+    return lambda *arguments: starcat(["--server", served.address, *arguments])
 
 
 def spec_of(small_spec: str, name: str) -> str:
@@ -63,17 +69,12 @@ def test_a_database_is_built_there_and_brought_here(client, small_spec, tmp_path
 
 
 @pytest.mark.slow
-def test_the_command_builds_as_it_does_here(served, starcat, small_spec, sao_lines, tmp_path):
+def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lines, tmp_path):
     (tmp_path / "spec.toml").write_text(spec_of(small_spec, "both"))
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
-    there = starcat(
-        [*("--server", served.address, "build", tmp_path / "spec.toml", "--json"),
-         *("-o", tmp_path / "there")]
-    )  # fmt: skip
-    here = starcat(
-        [*("build", tmp_path / "spec.toml", "--input", f"sao={tmp_path / 'sao.dat'}", "--json"),
-         *("-o", tmp_path / "here")]
-    )  # fmt: skip
+    there = remote("build", tmp_path / "spec.toml", "--json", "-o", tmp_path / "there")
+    given = ["--input", f"sao={tmp_path / 'sao.dat'}", "--json", "-o", tmp_path / "here"]
+    here = starcat(["build", tmp_path / "spec.toml", *given])
     assert (there.code, here.code) == (0, 0), there.err
     mine, theirs = json.loads(here.out), json.loads(there.out)
     assert theirs["products"] == mine["products"]
@@ -81,45 +82,41 @@ def test_the_command_builds_as_it_does_here(served, starcat, small_spec, sao_lin
     assert theirs["self_test"] == json.loads(json.dumps(mine["self_test"]))
     assert set(mine) - {"times_s"} <= set(theirs)
     assert not verify_artifact(tmp_path / "there" / "both-1.0.0").findings
-    table = starcat(
-        ["--server", served.address, "build", tmp_path / "spec.toml", "-o", tmp_path / "there"]
-    )
+    table = remote("build", tmp_path / "spec.toml", "-o", tmp_path / "there")
     assert (table.code, "unchanged: " in table.err) == (0, True)
 
 
 @pytest.mark.parametrize("more", [[], ["--json"], ["--format", "csv"], ["--rows", "3"]])
-def test_the_command_asks_as_it_does_here(served, starcat, small_artifact, more):
-    there = starcat(["--server", served.address, "sql", "small-1.0.0", STARS, *more])
+def test_the_command_asks_as_it_does_here(remote, starcat, small_artifact, more):
+    there = remote("sql", "small-1.0.0", STARS, *more)
     here = starcat(["sql", small_artifact, STARS, *more])
     assert (there.code, there.out) == (0, here.out), there.err
 
 
-def test_the_command_keeps_answers_in_files(served, starcat, small_artifact, tmp_path):
+def test_the_command_keeps_answers_in_files(remote, starcat, small_artifact, tmp_path):
     for form in ("parquet", "vot"):
         there, here = tmp_path / f"there.{form}", tmp_path / f"here.{form}"
         named = ["--named", "densest-fields", "--set", "count=3"]
-        ran = starcat(["--server", served.address, "sql", DATABASE, *named, "-o", there])
+        ran = remote("sql", DATABASE, *named, "-o", there)
         assert (ran.code, ran.err) == (0, f"{there}: 3 rows\n")
         starcat(["sql", small_artifact, *named, "-o", here])
         assert there.read_bytes() == here.read_bytes()
 
 
-def test_the_command_identifies_as_it_does_here(served, starcat, small_artifact, tmp_path):
+def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact, tmp_path):
     frame, picture = tmp_path / "frame.csv", tmp_path / "frame.svg"
     starcat(["simulate", small_artifact, "-o", frame, "--seed", 3, "--noise-px", 0.2])
     asked = [frame, "--json", "--picture", picture, "--tolerance-px", 1]
-    there = starcat(["--server", served.address, "identify", "small-1.0.0", *asked])
+    there = remote("identify", "small-1.0.0", *asked)
     here = starcat(["identify", small_artifact, *asked])
     assert there.code == 0, there.err
     [mine], [theirs] = json.loads(here.out), json.loads(there.out)
     assert {**theirs, "time_s": 0} == {**mine, "time_s": 0}
     assert "<svg" in picture.read_text()
-    lines = starcat(["--server", served.address, "identify", "small-1.0.0", frame])
+    lines = remote("identify", "small-1.0.0", frame)
     assert mine["stars"][0]["star"] in lines.out
     frame.write_text("x_px,y_px\n1,1\n2,2\n3,3\n")
-    ran = starcat(
-        ["--server", served.address, "identify", DATABASE, frame, "--fail-on-no-match", "--json"]
-    )
+    ran = remote("identify", DATABASE, frame, "--fail-on-no-match", "--json")
     assert ran.code == 6
     assert json.loads(ran.out)[0]["refusal"]["words"]
 
@@ -137,8 +134,8 @@ def test_the_command_identifies_as_it_does_here(served, starcat, small_artifact,
         (["releases", "registry"], 2, "which runs here"),
     ],
 )
-def test_what_is_refused_has_the_same_code(served, starcat, arguments, code, words):
-    ran = starcat(["--server", served.address, *arguments])
+def test_what_is_refused_has_the_same_code(remote, arguments, code, words):
+    ran = remote(*arguments)
     assert (ran.code, words in ran.err, ran.out) == (code, True, ""), ran.err
 
 

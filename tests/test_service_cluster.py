@@ -21,12 +21,11 @@ pytest.importorskip("fastapi")
 pytest.importorskip("distributed")
 
 from distributed import Client
-from fastapi.testclient import TestClient
+from services import client_of, states
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError
-from starcat.service.access import Principal, Role
-from starcat.service.app import make_app
+from starcat.service.access import Principal
 from starcat.service.jobs import slots as slots_module
 from starcat.service.jobs.cluster import pack, place
 from starcat.service.jobs.job import Job
@@ -39,7 +38,7 @@ from starcat.service.jobs.submission import (
 )
 from starcat.service.paths import ServicePaths
 from starcat.service.service import Service
-from starcat.service.settings import Settings
+from starcat.service.settings import Role, Settings
 from starcat.specs.reading import spec_from_dict
 
 CHIEF = Principal("chief", Role.PUBLISHER)
@@ -198,17 +197,9 @@ def cluster(tmp_path: Path, catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture
 def far(tmp_path: Path, cluster: Cluster) -> Iterator[Service]:
     """A service whose jobs are the cluster's."""
-    settings = Settings(
-        root=tmp_path / "service",
-        scheduler=cluster.address,
-        anonymous="publisher",
-        worker_silence_s=5.0,
-        shutdown_s=0.5,
-        workers=2,
-    )
-    app = make_app(settings)
-    with TestClient(app, base_url="http://127.0.0.1:8000"):
-        yield app.state.service
+    settings = {"scheduler": cluster.address, "worker_silence_s": 5.0, "shutdown_s": 0.5}
+    with client_of(tmp_path / "service", workers=2, **settings) as client:
+        yield client.app.state.service
 
 
 def submit(service: Service, spec: str, frames: int = 5) -> Job:
@@ -219,11 +210,6 @@ def submit(service: Service, spec: str, frames: int = 5) -> Job:
 def ended(service: Service, job: Job) -> Job:
     until(lambda: service.jobs.get(job.id).has_ended)
     return service.jobs.get(job.id)
-
-
-def states(service: Service, job: Job) -> list[str]:
-    events = service.jobs.events(job.id)
-    return [event.data["state"] for event in events if event.kind == "state"]
 
 
 def logged(service: Service, job: Job) -> str:

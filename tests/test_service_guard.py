@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shelved import waiting_build
+from services import waiting_build
 
 pytest.importorskip("fastapi")
 
@@ -21,15 +22,15 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from starcat.errors import ConfigError, TargetMissing
-from starcat.service import removal
-from starcat.service.access import Reader, Role, principal_of
+from starcat.service import access, removal
+from starcat.service.access import Reader, principal_of
 from starcat.service.app import make_app
-from starcat.service.security import auth, request_limits
-from starcat.service.security.logs import JsonFormatter
+from starcat.service.security import request_limits
+from starcat.service.security.middleware import JsonFormatter
 from starcat.service.security.request_limits import Buckets
 from starcat.service.security.tokens import TokenStore
-from starcat.service.server import run_server
-from starcat.service.settings import Settings, read_settings
+from starcat.service.server import listen, run_server
+from starcat.service.settings import Role, Settings, read_settings
 
 Make = Callable[..., TestClient]
 
@@ -77,11 +78,18 @@ def tokens_of(client: TestClient) -> TokenStore:
     return TokenStore(app.state.service.records)
 
 
+@pytest.fixture
+def anna(client):
+    """A client of a service, and the token of one of its readers."""
+    at = client()
+    return at, tokens_of(at).create("anna", Role.READER)[1]
+
+
 def bearer(text: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {text}"}
 
 
-def test_a_token_is_kept_as_a_digest_only(client: Make) -> None:
+def test_a_token_is_kept_as_a_digest_only(client):
     at = client()
     token, text = tokens_of(at).create("anna", Role.BUILDER)
     app: Any = at.app
@@ -95,7 +103,7 @@ def test_a_token_is_kept_as_a_digest_only(client: Make) -> None:
     assert len(text) == 8 + 43  # 256 bits in base 64
 
 
-def test_a_token_gives_its_role_by_each_way_to_send_it(client: Make) -> None:
+def test_a_token_gives_its_role_by_each_way_to_send_it(client):
     at = client()
     _, text = tokens_of(at).create("anna", Role.BUILDER)
     builder = {"name": "anna", "role": "BUILDER"}
@@ -108,7 +116,7 @@ def test_a_token_gives_its_role_by_each_way_to_send_it(client: Make) -> None:
 @pytest.mark.parametrize(
     "wrong", ["starcat_", "starcat_x", "", "x" * 10_000, "starcat_\xe9", "'--"]
 )
-def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client: Make, wrong: str) -> None:
+def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client, wrong):
     found = client().get(
         "/probe/who", headers={"Authorization": f"Bearer {wrong}".encode("latin-1")}
     )
@@ -117,10 +125,8 @@ def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client: Make, wron
     assert "not valid" in found.json()["detail"]
 
 
-def test_expired_and_revoked_tokens_are_worth_nothing(
-    client: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(auth, "KNOWN_S", 0.0)
+def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
+    monkeypatch.setattr(access, "KNOWN_S", 0.0)
     at = client()
     store = tokens_of(at)
     _, short = store.create("short", Role.READER, expires_days=1.0)
@@ -136,11 +142,8 @@ def test_expired_and_revoked_tokens_are_worth_nothing(
         store.revoke("anna")
 
 
-def test_a_known_token_is_believed_without_being_looked_up(
-    client: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at = client()
-    _, text = tokens_of(at).create("anna", Role.READER)
+def test_a_known_token_is_believed_without_being_looked_up(anna, monkeypatch):
+    at, text = anna
     found: list[int] = []
     asked = TokenStore.find
     monkeypatch.setattr(
@@ -152,12 +155,12 @@ def test_a_known_token_is_believed_without_being_looked_up(
 
 
 @pytest.mark.parametrize("name", ["", "-x", "a b", "anonymous", "x" * 65, "a\n", "<b>"])
-def test_a_token_is_called_by_a_plain_name(client: Make, name: str) -> None:
+def test_a_token_is_called_by_a_plain_name(client, name):
     with pytest.raises(ConfigError, match="cannot be the name of a token"):
         tokens_of(client()).create(name, Role.READER)
 
 
-def test_one_valid_token_has_a_name(client: Make) -> None:
+def test_one_valid_token_has_a_name(client):
     store = tokens_of(client())
     store.create("anna", Role.READER)
     with pytest.raises(ConfigError, match="revoke that one first: starcat token revoke anna"):
@@ -167,9 +170,8 @@ def test_one_valid_token_has_a_name(client: Make) -> None:
     assert [token.state(time.time()) for token in store.all()] == ["revoked", "valid"]
 
 
-def test_guessing_is_slowed_down_and_the_right_token_still_goes_through(client: Make) -> None:
-    at = client()
-    _, text = tokens_of(at).create("anna", Role.READER)
+def test_guessing_is_slowed_down_and_the_right_token_still_goes_through(anna):
+    at, text = anna
     wrong = [at.get("/probe/who", headers=bearer(f"starcat_{k}")) for k in range(15)]
     assert [one.status_code for one in wrong] == [401] * 10 + [429] * 5
     assert 1 <= int(wrong[-1].headers["retry-after"]) <= 6
@@ -178,7 +180,7 @@ def test_guessing_is_slowed_down_and_the_right_token_still_goes_through(client: 
     assert at.get("/probe/who", headers=bearer(text)).status_code == 200
 
 
-def test_a_sign_in_is_a_cookie_that_is_not_the_token(client: Make) -> None:
+def test_a_sign_in_is_a_cookie_that_is_not_the_token(client):
     at = client()
     _, text = tokens_of(at).create("anna", Role.PUBLISHER)
     answer = at.post("/sign-in", data={"token": text, "next": "/jobs"}, follow_redirects=False)
@@ -196,10 +198,8 @@ def test_a_sign_in_is_a_cookie_that_is_not_the_token(client: Make) -> None:
     assert at.get("/probe/who").json()["name"] == "anonymous"
 
 
-def test_a_sign_in_ends_with_its_time_and_with_its_token(
-    client: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(auth, "KNOWN_S", 0.0)
+def test_a_sign_in_ends_with_its_time_and_with_its_token(client, monkeypatch):
+    monkeypatch.setattr(access, "KNOWN_S", 0.0)
     at = client(session_hours=1.0)
     store = tokens_of(at)
     _, text = store.create("anna", Role.READER)
@@ -215,7 +215,7 @@ def test_a_sign_in_ends_with_its_time_and_with_its_token(
     assert at.get("/probe/who", headers=kept).json()["name"] == "anonymous"
 
 
-def test_the_cookie_is_for_https_alone_where_people_come_by_https(client: Make) -> None:
+def test_the_cookie_is_for_https_alone_where_people_come_by_https(client):
     at = client(public_url="https://stars.example")
     at.base_url = "https://stars.example"  # type: ignore[assignment]
     _, text = tokens_of(at).create("anna", Role.READER)
@@ -225,7 +225,7 @@ def test_the_cookie_is_for_https_alone_where_people_come_by_https(client: Make) 
     assert answer.headers["strict-transport-security"] == "max-age=31536000"
 
 
-def test_a_wrong_token_of_a_sign_in_shows_the_form_again(client: Make) -> None:
+def test_a_wrong_token_of_a_sign_in_shows_the_form_again(client):
     found = client().post("/sign-in", data={"token": "starcat_x", "next": "//evil.example"})
     assert found.status_code == 401
     assert "not valid" in found.text
@@ -234,9 +234,7 @@ def test_a_wrong_token_of_a_sign_in_shows_the_form_again(client: Make) -> None:
 
 
 @pytest.mark.parametrize("options", [{"host": "0.0.0.0"}, {"public_url": "https://stars.example"}])
-def test_others_than_this_machine_need_a_token_for_all_but_signing_in(
-    client: Make, options: dict[str, str]
-) -> None:
+def test_others_than_this_machine_need_a_token_for_all_but_signing_in(client, options):
     at = client(**options)
     _, text = tokens_of(at).create("anna", Role.READER)
     for path in ("/probe/who", "/metrics", "/readyz", "/api/openapi.json", "/nothing"):
@@ -253,15 +251,13 @@ def test_others_than_this_machine_need_a_token_for_all_but_signing_in(
 
 
 @pytest.mark.parametrize("options", [{"host": "0.0.0.0"}, {"public_url": "https://stars.example"}])
-def test_the_server_does_not_begin_where_others_could_not_get_in(
-    tmp_path: Path, options: dict[str, str]
-) -> None:
+def test_the_server_does_not_begin_where_others_could_not_get_in(tmp_path, options):
     settings = read_settings(tmp_path / "root", **options)
     with pytest.raises(ConfigError, match="make one first: starcat token create NAME"):
         run_server(settings, print)
 
 
-def test_requests_of_one_address_or_token_are_limited(client: Make) -> None:
+def test_requests_of_one_address_or_token_are_limited(client):
     at = client(requests_per_minute=1)
     _, text = tokens_of(at).create("anna", Role.READER)
     found = [at.get("/probe/who") for _ in range(3)]
@@ -271,106 +267,75 @@ def test_requests_of_one_address_or_token_are_limited(client: Make) -> None:
     assert at.get("/probe/who", headers=bearer(text)).status_code == 200
 
 
-def test_a_bucket_fills_again_and_the_quietest_is_forgotten(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
     now = [0.0]
-    buckets = Buckets(60.0, 2.0, lambda: now[0])
-    assert [buckets.take("a") for _ in range(3)] == [0.0, 0.0, 1.0]
-    now[0] = 0.5
-    assert buckets.take("a") == 0.5
-    now[0] = 1.0
+    buckets = Buckets(2.0, lambda: now[0])
+    assert [buckets.take("a") for _ in range(3)] == [0.0, 0.0, 30.0]
+    now[0] = 15.0
+    assert buckets.take("a") == 15.0
+    now[0] = 30.0
     assert buckets.take("a") == 0.0
-    assert buckets.take("a") == 1.0
+    assert buckets.take("a") == 30.0
     monkeypatch.setattr("starcat.service.security.request_limits.MOST_BUCKETS", 2)
     buckets.take("b")
     buckets.take("c")
     assert buckets.take("a") == 0.0  # full again, for it was forgotten
 
 
-def test_addresses_of_one_network_are_counted_together() -> None:
-    assert auth.network_of("2001:db8:0:1::1") == auth.network_of("2001:db8:0:1:ffff::2")
-    assert auth.network_of("2001:db8:0:2::1") != auth.network_of("2001:db8:0:1::1")
+def test_addresses_of_one_network_are_counted_together():
+    assert access.network_of("2001:db8:0:1::1") == access.network_of("2001:db8:0:1:ffff::2")
+    assert access.network_of("2001:db8:0:2::1") != access.network_of("2001:db8:0:1::1")
+
+
+FORGED = [
+    {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
+    {"Origin": "http://127.0.0.1.evil.example"}, {"Sec-Fetch-Site": "cross-site"},
+    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat=anything"},
+]  # fmt: skip
+HONEST = [
+    {}, {"Origin": "http://127.0.0.1"}, {"Cookie": "other=1"},
+    {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1"},
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    "headers",
-    [
-        {"Origin": "https://evil.example"},
-        {"Origin": "null"},
-        {"Origin": "http://127.0.0.1:9999"},
-        {"Origin": "http://127.0.0.1.evil.example"},
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "same-site"},
-        {"Cookie": "starcat=anything"},
-    ],
+    ("headers", "status"), [*((one, 403) for one in FORGED), *((one, 200) for one in HONEST)]
 )
-def test_what_another_site_makes_a_browser_send_is_refused(
-    client: Make, headers: dict[str, str]
-) -> None:
+def test_what_another_site_makes_a_browser_send_is_refused(client, headers, status):
     at = client(anonymous="publisher")
-    assert at.post("/probe/body", headers=headers).status_code == 403
+    assert at.post("/probe/body", headers=headers).status_code == status
     assert at.get("/probe/who", headers=headers).status_code == 200
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {},
-        {"Origin": "http://127.0.0.1"},
-        {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1"},
-        {"Cookie": "other=1"},
-    ],
-)
-def test_what_the_page_and_programs_send_is_taken(client: Make, headers: dict[str, str]) -> None:
-    assert client().post("/probe/body", headers=headers).status_code == 200
+PUBLIC = {"public_url": "https://stars.example"}
+HOSTS = [
+    ({}, "localhost:8000", 200), ({}, "127.0.0.1:1", 200), ({}, "[::1]:8000", 200),
+    ({}, "LOCALHOST", 200), ({}, "evil.example", 421), ({}, "localhost.evil.example", 421),
+    ({}, "127.0.0.1.evil.example:8000", 421), ({}, "a b", 400), ({}, "localhost/../x", 400),
+    ({}, "", 400), (PUBLIC, "stars.example", 200), (PUBLIC, "evil.example", 421),
+    ({"host": "0.0.0.0"}, "anything.example", 200),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("options", "host", "status"),
-    [
-        ({}, "localhost:8000", 200),
-        ({}, "127.0.0.1:1", 200),
-        ({}, "[::1]:8000", 200),
-        ({}, "LOCALHOST", 200),
-        ({}, "evil.example", 421),
-        ({}, "localhost.evil.example", 421),
-        ({}, "127.0.0.1.evil.example:8000", 421),
-        ({}, "a b", 400),
-        ({}, "localhost/../x", 400),
-        ({}, "", 400),
-        ({"public_url": "https://stars.example"}, "stars.example", 200),
-        ({"public_url": "https://stars.example"}, "evil.example", 421),
-        ({"host": "0.0.0.0"}, "anything.example", 200),
-    ],
-)
-def test_a_name_that_is_not_ours_is_refused(
-    client: Make, options: dict[str, str], host: str, status: int
-) -> None:
+@pytest.mark.parametrize(("options", "host", "status"), HOSTS)
+def test_a_name_that_is_not_ours_is_refused(client, options, host, status):
     assert client(**options).get("/healthz", headers={"Host": host}).status_code == status
 
 
-@pytest.mark.parametrize(
-    ("path", "status"),
-    [
-        ("/probe/%00/read", 400),
-        ("/probe/%0d%0aX:y/read", 400),
-        ("/probe/..%2f..%2fetc/read", 400),
-        ("/probe/%2e%2e/read", 400),
-        ("/probe/..%5c..%5cx/read", 400),
-        ("/probe/a/read?x=%00", 400),
-        ("/probe/a/read?x=" + "y" * 20_000, 414),
-        ("/probe/a..b/read", 200),
-        ("/probe/a/read?x=%0a..", 200),
-    ],
-)
-def test_addresses_that_no_honest_client_sends_are_refused(
-    client: Make, path: str, status: int
-) -> None:
+TARGETS = [
+    ("/probe/%00/read", 400), ("/probe/%0d%0aX:y/read", 400), ("/probe/..%2f..%2fetc/read", 400),
+    ("/probe/%2e%2e/read", 400), ("/probe/..%5c..%5cx/read", 400), ("/probe/a/read?x=%00", 400),
+    ("/probe/a/read?x=" + "y" * 20_000, 414), ("/probe/a..b/read", 200),
+    ("/probe/a/read?x=%0a..", 200),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "status"), TARGETS)
+def test_addresses_that_no_honest_client_sends_are_refused(client, path, status):
     assert client().get(path).status_code == status
 
 
-def test_too_many_headers_and_odd_methods_are_refused(client: Make) -> None:
+def test_too_many_headers_and_odd_methods_are_refused(client):
     at = client()
     many = {f"X-{k}": "v" for k in range(120)}
     assert at.get("/healthz", headers=many).status_code == 431
@@ -379,7 +344,7 @@ def test_too_many_headers_and_odd_methods_are_refused(client: Make) -> None:
     assert at.request("PURGE\u0130", "/healthz").status_code == 405
 
 
-def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client: Make) -> None:
+def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client):
     at = client(upload_mib=0.5)
     large = b"x" * (2**19 + 1)
     assert at.post("/probe/body", content=large[:-1]).json() == 2**19
@@ -392,19 +357,17 @@ def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client: Make) -> 
     assert at.post("/probe/body", headers={"Content-Length": "-1"}).status_code == 400
 
 
-def test_nothing_is_added_to_a_full_disk(client: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_added_to_a_full_disk(client, monkeypatch):
     at = client()
     monkeypatch.setattr(request_limits, "free_gib", lambda folder: 0.99)
     found = at.post("/probe/body", files={"file": b"x"})
     assert found.status_code == 507
-    assert "less than 1 GiB left" in found.json()["detail"]
+    assert "0.99 GiB free, and 1 have to be left" in found.json()["detail"]
     assert at.post("/probe/body", content=b"x").status_code == 200
     assert at.get("/probe/who").status_code == 200
 
 
-def test_a_defect_tells_the_log_and_not_the_client(
-    client: Make, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_defect_tells_the_log_and_not_the_client(client, caplog):
     found = client().get("/probe/broken", headers={"X-Request-ID": "mine-1"})
     assert found.status_code == 500
     assert "secret words" not in found.text
@@ -416,12 +379,9 @@ def test_a_defect_tells_the_log_and_not_the_client(
     assert "secret words" in line["exception"]
 
 
-def test_the_log_is_a_line_of_json_for_each_request(
-    client: Make, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_log_is_a_line_of_json_for_each_request(anna, caplog):
     caplog.set_level(logging.INFO, "starcat.service")
-    at = client()
-    _, text = tokens_of(at).create("anna", Role.READER)
+    at, text = anna
     caplog.clear()
     path = "/probe/%C2%85%7B%22level%22%3A%22forged%22/read?secret=hidden"
     at.get(path, headers={"User-Agent": "x\t{}", "X-Request-ID": "bad id\t", **bearer(text)})
@@ -437,13 +397,13 @@ def test_the_log_is_a_line_of_json_for_each_request(
     assert text not in text_line
 
 
-def test_a_request_has_an_id_of_its_own_where_the_given_one_is_odd(client: Make) -> None:
+def test_a_request_has_an_id_of_its_own_where_the_given_one_is_odd(client):
     found = client().get("/healthz", headers={"X-Request-ID": "a b"}).headers["x-request-id"]
     assert len(found) == 16
     assert set(found) <= set("0123456789abcdef")
 
 
-def test_metrics_count_by_template_and_say_what_there_is(client: Make) -> None:
+def test_metrics_count_by_template_and_say_what_there_is(client):
     at = client()
     at.get("/probe/a/read")
     at.get("/probe/b/read")
@@ -463,7 +423,7 @@ def test_metrics_count_by_template_and_say_what_there_is(client: Make) -> None:
     assert families["starcat_build_info"].samples[0].labels["version"]
 
 
-def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ready_says_what_is_wrong(client, monkeypatch):
     at = client()
     app: Any = at.app
     monkeypatch.setattr(type(app.state.slots), "is_alive", False)
@@ -471,10 +431,10 @@ def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(type(app.state.slots), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
-    monkeypatch.setattr("starcat.service.security.metrics.free_gib", lambda folder: 0.2)
+    monkeypatch.setattr("starcat.service.security.request_limits.free_gib", lambda folder: 0.2)
     found = at.get("/readyz")
     assert found.status_code == 503
-    assert "0.2 GiB of disk are left, less than 1" in found.json()["reasons"]
+    assert "0.20 GiB free, and 1 have to be left" in found.json()["reasons"][0]
     monkeypatch.setattr("starcat.service.records.WAIT_S", 0.05)
     other = sqlite3.connect(app.state.service.paths.records)
     other.execute("BEGIN IMMEDIATE")
@@ -483,7 +443,7 @@ def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch)
     other.close()
 
 
-def test_what_is_old_is_removed_and_databases_and_releases_stay(client: Make) -> None:
+def test_what_is_old_is_removed_and_databases_and_releases_stay(client):
     at = client(keep_jobs_days=2.0, keep_results_days=1.0)
     app: Any = at.app
     service = app.state.service
@@ -507,24 +467,40 @@ def test_what_is_old_is_removed_and_databases_and_releases_stay(client: Make) ->
         folder.mkdir(exist_ok=True)
         (folder / "file").write_text("x")
     removed = removal.remove_old(service, now_s + 1.5 * 86_400.0)
-    assert (removed.jobs, removed.results, removed.scratch) == (2, 1, 1)
+    assert removed == {"jobs": 2, "results": 1, "scratch": 1, "sessions": 0}
     assert [path.name for path in places.jobs.iterdir()] == [jobs[2].id]
     assert [job.id for job in service.jobs.all()] == [jobs[2].id]
     assert (places.databases / ("0" * 16) / "file").exists()
     assert (places.registry / "file").exists()
 
 
-def test_an_address_for_others_is_an_origin(tmp_path: Path) -> None:
+def test_an_address_for_others_is_an_origin(tmp_path):
     for wrong in ("stars.example", "https://stars.example/path", "https://a@b", "ftp://x"):
         with pytest.raises(ConfigError, match="public_url"):
             read_settings(tmp_path, public_url=wrong)
     assert Settings(root=tmp_path, public_url="https://x:8443").is_secure
 
 
-def test_the_page_of_the_interface_names_every_address(client: Make) -> None:
+def test_the_page_of_the_interface_names_every_address(client):
     at = client()
     page = at.get("/api/docs")
     assert page.status_code == 200
     for path, operations in at.get("/api/openapi.json").json()["paths"].items():
         for method in operations:
             assert re.search(rf">{method.upper()}</span> <code>{re.escape(path)}</code>", page.text)
+
+
+def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
+    with (
+        listen(Settings(root=tmp_path, port=0)) as listening,
+        socket.create_connection(listening.getsockname()),
+        listening.accept()[0] as accepted,
+    ):
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_port_that_is_taken_is_told(tmp_path):
+    with listen(Settings(root=tmp_path, port=0)) as listening:
+        port = listening.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1, port {port}: .*--port"):
+            listen(Settings(root=tmp_path, port=port))

@@ -22,7 +22,7 @@ import pytest
 pytest.importorskip("fastapi")
 
 import requests
-from shelved import DATABASE, shelve
+from services import DATABASE, add_database
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import SourceMissing
@@ -167,7 +167,7 @@ def assert_all_whole(root: Path) -> list[Path]:
 def test_a_server_that_is_killed_while_it_publishes_shows_no_half_release(
     service, small_artifact, tmp_path
 ):
-    shelve(service.root, small_artifact)
+    add_database(service.root, small_artifact)
     generator = random.Random(16)
     address = service.address.replace("/jobs", "/releases")
 

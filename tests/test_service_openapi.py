@@ -14,11 +14,7 @@ from pathlib import Path
 
 import pytest
 from served import Served, serve
-from shelved import shelve
-
-from starcat.service.access import Role
-from starcat.service.records import Records
-from starcat.service.security.tokens import TokenStore
+from services import add_database, token_of
 
 CHECKS = (
     "status_code_conformance,content_type_conformance,response_headers_conformance,"
@@ -42,10 +38,8 @@ def attacked(
     tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
 ) -> Iterator[tuple[Served, str]]:
     root = tmp_path_factory.mktemp("openapi") / "root"
-    shelve(root, small_artifact)
-    records = Records(root / "records.sqlite")
-    _, token = TokenStore(records).create("fuzzer", Role.PUBLISHER)
-    records.close()
+    add_database(root, small_artifact)
+    token = token_of(root, "fuzzer")
     settings = {"workers": 0, "jobs_waiting": 5, "requests_per_minute": 1_000_000}
     with serve(root, root.parent / "log", query_time_s=2.0, **settings) as served:
         yield served, token
@@ -83,9 +77,7 @@ def run_tool(attacked: tuple[Served, str], report: Path, *options: str) -> None:
     assert not [entry for entry in broken if entry["status"] not in MAY_BE_BUSY]
 
 
-def test_each_operation_is_described_with_an_example_of_how_it_refuses(
-    attacked: tuple[Served, str],
-) -> None:
+def test_each_operation_is_described_with_an_example_of_how_it_refuses(attacked):
     served, token = attacked
     answer = served.raw("GET", "/api/openapi.json", {"Authorization": f"Bearer {token}"})
     schema = json.loads(answer.body)
@@ -101,15 +93,11 @@ def test_each_operation_is_described_with_an_example_of_how_it_refuses(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_no_request_that_the_schema_allows_or_forbids_breaks_it(
-    attacked: tuple[Served, str], tmp_path: Path
-) -> None:
+def test_no_request_that_the_schema_allows_or_forbids_breaks_it(attacked, tmp_path):
     fuzz(attacked, tmp_path, 12, "examples,coverage,fuzzing")
 
 
 @pytest.mark.timeout(120)
 @pytest.mark.slow
-def test_the_examples_of_the_schema_are_answered(
-    attacked: tuple[Served, str], tmp_path: Path
-) -> None:
+def test_the_examples_of_the_schema_are_answered(attacked, tmp_path):
     fuzz(attacked, tmp_path, 2, "examples")

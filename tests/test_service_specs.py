@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from shelved import client_of
+from services import client_of
 
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
 from starcat.pipeline.estimate import choose_stars
@@ -247,7 +247,7 @@ def test_a_first_spec_is_that_of_init(client):
     wrong = {**camera, "fov_x_deg": 500.0}
     assert refused(client.post(f"{API}/specs/starter", json={"camera": wrong}), 422)
     deep = {"camera": {**camera, "fov_x_deg": 100.0}, "faint_limit_mag": 12.0}
-    assert "more than the 4,000,000" in refused(
+    assert "limit 4,000,000" in refused(
         client.post(f"{API}/specs/starter", json=deep), 422
     )["detail"]  # fmt: skip
 
@@ -263,19 +263,6 @@ def test_catalogs_say_whether_they_are_here_and_what_was_read(client, small_spec
         "band": "V", "epoch_jyear": 2026.0, "stars": 600, "brightest_mag": 2.0,
         "faintest_mag": 6.4,
     }  # fmt: skip
-
-
-def test_every_operation_is_described(client):
-    paths = client.get("/api/openapi.json").json()["paths"]
-    mine = {path: one for path, one in paths.items() if "/specs" in path or "/catalogs" in path}
-    assert len(mine) == 9
-    for path, operations in mine.items():
-        for method, one in operations.items():
-            assert one["summary"], path
-            assert one["responses"]["200"]["content"], path
-            if method == "post":
-                assert one["requestBody"]["content"]["application/json"]["schema"], path
-                assert "503" in one["responses"] or path.endswith("validate"), path
 
 
 # --- What is kept

@@ -68,6 +68,7 @@ def test_letters_stand_where_there_is_no_name_and_numbers_where_there_is_no_lett
     assert named_stars().label_of("HIP 19") == "HIP 19"
     for other in ("HIP 118999", "SAO 308", "HIP", "HIP x", "", "Gaia DR3 27989"):
         assert named_stars().label_of(other) is None
+    assert short_name("") == ""
 
 
 def test_letters_are_in_the_constellation_that_they_name():
@@ -104,10 +105,6 @@ def test_of_two_stars_close_by_the_one_of_like_magnitude_has_the_name():
     assert np.degrees(separation(stars.directions[one], middle)) * 3600.0 < 20.0
     both = common_names(["", ""], np.stack([middle] * 2), np.array([-0.1, 1.4]), 2000.0)
     assert both == ["Rigil Kentaurus", "Toliman"]
-
-
-def test_short_names_of_nothing():
-    assert short_name("") == ""
 
 
 # --- constellations ---------------------------------------------------------------------------
@@ -175,19 +172,6 @@ def test_any_field_has_a_grid_that_can_be_read(dec_deg, fov_deg):
     assert 2 <= len(overlay.grid) - len(parallels) <= 36
 
 
-def words_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Everything that matplotlib is given to write from now on."""
-    written: list[str] = []
-    write = matplotlib.text.Text.__init__
-
-    def listen(self: Any, x: float = 0, y: float = 0, text: str = "", **options: Any) -> None:
-        written.append(text)
-        write(self, x, y, text, **options)
-
-    monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
-    return written
-
-
 def draw(path: Path, overlay: Overlay | None) -> bytes:
     spots = np.array([[500.0, 400.0], [200.0, 300.0]])
     draw_identified(
@@ -197,23 +181,22 @@ def draw(path: Path, overlay: Overlay | None) -> bytes:
     return path.read_bytes()
 
 
-def test_a_picture_shows_the_grid_the_lines_and_the_planets(tmp_path, monkeypatch):
+def test_a_picture_shows_the_grid_the_lines_and_the_planets(tmp_path, written_words):
     matrix = matrix_from_radec_roll(84.0, 2.0, 0.0)
     jupiter = BodyInFrame("Jupiter", 700.0, 600.0, -2.7, 23.0, 5.0, None)
-    written = words_of(monkeypatch)
     overlay = overlay_from_attitude(matrix, ORION, 2026.0, (jupiter,))
     first = draw(tmp_path / "a.png", overlay)
     for word in ("Alnilam", "Jupiter", "+0°", "80°"):
-        assert word in written
+        assert word in written_words
     assert draw(tmp_path / "b.png", overlay) == first
     pixels = matplotlib.image.imread(tmp_path / "a.png")[:, :, :3]
     for colour in ("#8f86c9", "#ffe08a"):
         rgb = np.array(matplotlib.colors.to_rgb(colour))
         assert (np.abs(pixels - rgb).max(axis=2) < 0.25).sum() > 50
-    written.clear()
+    written_words.clear()
     draw(tmp_path / "c.png", None)
-    assert "Alnilam" in written
-    assert not {"Jupiter", "+0°", "80°"} & set(written)
+    assert "Alnilam" in written_words
+    assert not {"Jupiter", "+0°", "80°"} & set(written_words)
 
 
 def test_names_of_planets_stay_in_the_frame(tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ import copy
 import math
 import tomllib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -87,7 +86,7 @@ def refusal(content: dict[str, Any]) -> ConfigError | None:
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_preset(name: str) -> None:
+def test_preset(name):
     spec = preset(name)
     assert spec.name == name
     assert spec.description
@@ -99,19 +98,19 @@ def test_preset(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_a_spec_survives_being_written(name: str) -> None:
+def test_a_spec_survives_being_written(name):
     spec = preset(name)
     assert spec_from_dict(spec.model_dump(mode="json"), "manifest") == spec
     assert BuildSpec.model_validate_json(spec.model_dump_json()) == spec
 
 
-def test_unknown_preset_names_the_nearest() -> None:
+def test_unknown_preset_names_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'sao-6deg'") as caught:
         preset("sao-6degree")
     assert caught.value.key == "preset"
 
 
-def test_a_spec_cannot_be_changed() -> None:
+def test_a_spec_cannot_be_changed():
     with pytest.raises(ValidationError):
         preset("sao-12deg").name = "other"
 
@@ -124,7 +123,7 @@ def test_a_spec_cannot_be_changed() -> None:
     [(path, value) for path, entry in KEYS.items() for value in outside(entry)],
     ids=str,
 )
-def test_values_outside_are_refused(path: str, value: object) -> None:
+def test_values_outside_are_refused(path, value):
     with pytest.raises(ConfigError) as caught:
         spec_from_dict(changed(path, value), "spec.toml")
     assert caught.value.key is not None
@@ -138,14 +137,14 @@ def test_values_outside_are_refused(path: str, value: object) -> None:
     [(p, e[end]) for p, e in KEYS.items() for end in ("minimum", "maximum") if end in e],
     ids=str,
 )
-def test_ends_of_a_range_belong_to_it(path: str, value: float) -> None:
+def test_ends_of_a_range_belong_to_it(path, value):
     # Two keys may contradict each other at the end of a range: that is for their section.
     error = refusal(changed(path, value))
     assert error is None or error.key != path
 
 
 @pytest.mark.parametrize("path", SECTIONS, ids=lambda path: path or "top")
-def test_unknown_keys_name_the_nearest_and_all(path: str) -> None:
+def test_unknown_keys_name_the_nearest_and_all(path):
     known = sorted(SECTIONS[path]["properties"])
     wrong = f"{known[0]}s_"
     with pytest.raises(ConfigError, match=f"did you mean {known[0]!r}") as caught:
@@ -154,34 +153,25 @@ def test_unknown_keys_name_the_nearest_and_all(path: str) -> None:
     assert caught.value.key == f"{path}.{wrong}".lstrip(".")
 
 
-def test_a_misspelt_key_is_named_before_the_one_it_leaves_missing() -> None:
+def test_a_misspelt_key_is_named_before_the_one_it_leaves_missing():
     spec = good()
     spec["selection"]["faint_limit"] = spec["selection"].pop("faint_limit_mag")
-    with pytest.raises(ConfigError, match="did you mean 'faint_limit_mag'"):
-        spec_from_dict(spec, "spec.toml")
+    assert "did you mean 'faint_limit_mag'" in str(refusal(spec))
+    like_no_other = str(refusal(changed("xyzzyx", 1)))
+    assert "unknown key; known keys here" in like_no_other
+    assert "did you mean" not in like_no_other
 
 
-def test_an_unknown_key_like_no_other_gets_no_suggestion() -> None:
-    with pytest.raises(ConfigError, match="unknown key; known keys here") as caught:
-        spec_from_dict(changed("xyzzyx", 1), "spec.toml")
-    assert "did you mean" not in str(caught.value)
+def test_sections_are_no_values_and_what_is_required_has_to_be_there():
+    for path in filter(None, SECTIONS):
+        assert path in str(refusal(changed(path, 3)))
+    for key in JSON_SCHEMA["required"]:
+        spec = good()
+        del spec[key]
+        assert f"{key}: missing; every spec needs it" in str(refusal(spec))
 
 
-@pytest.mark.parametrize("path", [path for path in SECTIONS if path])
-def test_a_section_is_no_value(path: str) -> None:
-    with pytest.raises(ConfigError, match=path):
-        spec_from_dict(changed(path, 3), "spec.toml")
-
-
-@pytest.mark.parametrize("key", sorted(JSON_SCHEMA["required"]))
-def test_missing_keys(key: str) -> None:
-    spec = good()
-    del spec[key]
-    with pytest.raises(ConfigError, match=f"{key}: missing; every spec needs it"):
-        spec_from_dict(spec, "spec.toml")
-
-
-def test_every_key_has_its_unit_in_its_name() -> None:
+def test_every_key_has_its_unit_in_its_name():
     units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec", "_mas_yr")
     plain = {"min_identified", "outlier_share", "completeness", "ambiguous_odds", "min_probability",
              "max_ratio"}  # fmt: skip
@@ -197,36 +187,43 @@ ANYTHING = st.recursive(
 
 
 @given(st.sampled_from([*KEYS, *filter(None, SECTIONS)]), ANYTHING)
-def test_anything_else_is_refused_in_one_printable_line(path: str, value: object) -> None:
+def test_anything_else_is_refused_in_one_printable_line(path, value):
     assert str(refusal(changed(path, value))).isprintable()
 
 
 # Keys that speak of one another -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bright", [6.0, 7.0])
-def test_limits_are_in_order(bright: float) -> None:
-    with pytest.raises(ConfigError, match="larger is fainter, so they may be swapped"):
-        spec_from_dict(changed("selection.bright_limit_mag", bright), "spec.toml")
+SQUARE = {"width_px": 512, "height_px": 512}
+ONE_SCALE = "either fov_x_deg, or focal_length_mm and pixel_um"
 
 
 @pytest.mark.parametrize(
-    "scale",
+    ("path", "value", "words"),
     [
-        {},
-        {"focal_length_mm": 40.0},
-        {"pixel_um": 16.0},
-        {"fov_x_deg": 12.0, "pixel_um": 16.0},
-        {"fov_x_deg": 12.0, "focal_length_mm": 40.0, "pixel_um": 16.0},
+        ("selection.bright_limit_mag", 6.0, "larger is fainter, so they may be swapped"),
+        ("selection.bright_limit_mag", 7.0, "larger is fainter, so they may be swapped"),
+        ("camera", SQUARE, ONE_SCALE),
+        ("camera", {**SQUARE, "focal_length_mm": 40.0}, ONE_SCALE),
+        ("camera", {**SQUARE, "pixel_um": 16.0}, ONE_SCALE),
+        ("camera", {**SQUARE, "fov_x_deg": 12.0, "pixel_um": 16.0}, ONE_SCALE),
+        (
+            "camera",
+            {**SQUARE, "fov_x_deg": 12.0, "focal_length_mm": 40.0, "pixel_um": 16.0},
+            ONE_SCALE,
+        ),
+        (
+            "camera",
+            {**SQUARE, "focal_length_mm": 0.04, "pixel_um": 16.0},
+            "field of 120 deg or more; check its units",
+        ),
     ],
 )
-def test_a_camera_has_one_scale(scale: dict[str, float]) -> None:
-    camera = {"width_px": 512, "height_px": 512, **scale}
-    with pytest.raises(ConfigError, match="either fov_x_deg, or focal_length_mm and pixel_um"):
-        spec_from_dict(changed("camera", camera), "spec.toml")
+def test_keys_do_not_contradict_each_other(path, value, words):
+    assert words in str(refusal(changed(path, value)))
 
 
-def test_a_lens_and_its_field_are_the_same_camera() -> None:
+def test_a_lens_and_its_field_are_the_same_camera():
     lens = CameraSpec(width_px=512, height_px=512, focal_length_mm=40.0, pixel_um=16.0).camera()
     # Half a detector of 512 * 0.016 mm over 40 mm.
     assert lens.fov_x_deg == pytest.approx(2.0 * math.degrees(math.atan(4.096 / 40.0)), rel=1e-14)
@@ -235,36 +232,27 @@ def test_a_lens_and_its_field_are_the_same_camera() -> None:
     assert lens.focal_length_px == pytest.approx(2500.0)
 
 
-def test_a_lens_in_the_wrong_unit_is_noticed() -> None:
-    camera = {"width_px": 512, "height_px": 512, "focal_length_mm": 0.04, "pixel_um": 16.0}
-    with pytest.raises(ConfigError, match="field of 120 deg or more; check its units"):
-        spec_from_dict(changed("camera", camera), "spec.toml")
-
-
 # Files --------------------------------------------------------------------------------------
 
 
-def test_a_whole_number_will_do_for_a_magnitude(tmp_path: Path, small_spec: str) -> None:
+def test_a_whole_number_will_do_for_a_magnitude(tmp_path, small_spec):
     path = tmp_path / "spec.toml"
     path.write_text(small_spec.replace("faint_limit_mag = 6.0", "faint_limit_mag = 6"))
     assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
 
 
 @pytest.mark.parametrize("content", [b"", b"name", b"\xff\xfe", b'name = "a"\nname = "b"'])
-def test_files_that_are_no_spec(content: bytes, tmp_path: Path) -> None:
+def test_files_that_are_no_spec(content, tmp_path):
     path = tmp_path / "spec.toml"
+    for name in (".", "spec.toml"):
+        with pytest.raises(ConfigError):
+            read_spec(tmp_path / name)
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=r"spec\.toml"):
         read_spec(path)
 
 
-@pytest.mark.parametrize("name", [".", "none.toml"])
-def test_paths_that_are_no_file(name: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError):
-        read_spec(tmp_path / name)
-
-
-def test_all_sections_are_models_that_refuse_unknown_keys() -> None:
+def test_all_sections_are_models_that_refuse_unknown_keys():
     def check(model: type[BaseModel]) -> None:
         assert model.model_config["extra"] == "forbid"
         assert model.model_config["frozen"]

@@ -31,14 +31,9 @@ def direction(position: tuple[float, float]) -> np.ndarray:
 
 
 @given(positions)
-def test_identical_directions_are_zero_apart(position):
+def test_identical_directions_are_zero_and_antipodes_pi_apart(position):
     u = direction(position)
     assert separation(u, u) == 0.0
-
-
-@given(positions)
-def test_antipodes_are_pi_apart(position):
-    u = direction(position)
     assert separation(u, -u) == np.pi
 
 
@@ -72,17 +67,12 @@ def test_separation_agrees_with_the_haversine_formula():
     assert np.abs(separation(u, v) - 2.0 * np.arcsin(np.sqrt(haversine))).max() < 1e-13
 
 
-@given(positions, positions, positions)
-def test_separation_is_a_metric(a, b, c):
+@given(positions, positions, positions, st.integers(0, 2**32 - 1))
+def test_separation_is_a_metric_that_rotations_do_not_change(a, b, c, seed):
     u, v, w = direction(a), direction(b), direction(c)
     assert separation(u, v) == separation(v, u)
     assert separation(u, w) <= separation(u, v) + separation(v, w) + ROUNDING_RAD
-
-
-@given(positions, positions, st.integers(0, 2**32 - 1))
-def test_separation_does_not_change_with_rotation(a, b, seed):
     matrix = random_attitudes(1, np.random.default_rng(seed))[0]
-    u, v = direction(a), direction(b)
     turned = separation(matrix @ u, matrix @ v)
     assert turned == pytest.approx(separation(u, v), rel=0.0, abs=2 * ROUNDING_RAD)
 
@@ -92,11 +82,8 @@ def test_chord_spans_its_separation(angle_rad):
     v = np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
     length = np.linalg.norm(v - [1.0, 0.0, 0.0])
     assert chord_from_separation(angle_rad) == pytest.approx(length, rel=0.0, abs=ROUNDING_RAD)
-
-
-@pytest.mark.parametrize(("angle_rad", "chord"), [(-1.0, 0.0), (4.0, 2.0)])
-def test_chord_of_an_impossible_separation_is_held_at_the_end(angle_rad, chord):
-    assert chord_from_separation(angle_rad) == chord
+    # Impossible separations are held at the end.
+    assert [chord_from_separation(angle) for angle in (-1.0, 4.0)] == [0.0, 2.0]
 
 
 @given(positions)
@@ -116,13 +103,10 @@ def test_right_ascension_comes_back(ra_deg, dec_deg):
     assert back == pytest.approx(ra_deg, rel=0.0, abs=tolerance_deg)
 
 
-@pytest.mark.parametrize("dec_deg", [-90.0, 90.0])
-def test_declination_is_exact_at_the_poles(dec_deg):
-    assert radec_from_directions(directions_from_radec(123.0, dec_deg))[1] == dec_deg
-    assert radec_from_directions([0.0, 0.0, np.sign(dec_deg)])[1] == dec_deg
-
-
-def test_right_ascension_360_is_0():
+def test_the_poles_are_exact_and_right_ascension_360_is_0():
+    for dec_deg in (-90.0, 90.0):
+        assert radec_from_directions(directions_from_radec(123.0, dec_deg))[1] == dec_deg
+        assert radec_from_directions([0.0, 0.0, np.sign(dec_deg)])[1] == dec_deg
     ra_deg, _ = radec_from_directions([[1.0, -1e-20, 0.0], [1.0, -0.0, 0.0], [1.0, 0.0, 0.0]])
     assert ra_deg.tolist() == [0.0, 0.0, 0.0]
 
@@ -183,7 +167,7 @@ def test_spiral_points_fill_equal_areas_equally():
     assert np.abs(found / 125.0 - 1.0).max() < 0.15
 
 
-@pytest.mark.parametrize("count", [0, -1])
-def test_spiral_of_no_points_is_refused(count):
-    with pytest.raises(ValueError, match=f"count is {count}"):
-        saff_kuijlaars(count)
+def test_spiral_of_no_points_is_refused():
+    for count in (0, -1):
+        with pytest.raises(ValueError, match=f"count is {count}"):
+            saff_kuijlaars(count)

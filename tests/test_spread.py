@@ -133,8 +133,7 @@ def test_a_missed_star_counts_the_more_the_farther_it_is(seed, angle, distance_p
     along = np.array([np.cos(angle), np.sin(angle)])
     shares = [
         weighted_share(
-            covariance,
-            rays(np.vstack([matched_px, matched_px.mean(axis=0) + r * along])),
+            covariance, rays(np.vstack([matched_px, matched_px.mean(axis=0) + r * along]))
         )
         for r in (0.0, distance_px, 1.2 * distance_px)
     ]

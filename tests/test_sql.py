@@ -55,6 +55,12 @@ def rows(session: Session, text: str, **values: Any) -> list[tuple[Any, ...]]:
         return answer.rows(100_000)
 
 
+def asked(session: Session, name: str, **values: str) -> list[tuple[Any, ...]]:
+    """Return the rows of a named query."""
+    query = named_query(name)
+    return rows(session, query.text, **query.with_values(values))
+
+
 # Targets and views ----------------------------------------------------------------------------
 
 
@@ -81,13 +87,8 @@ def test_columns_are_described_with_their_units(session, small_artifact):
 def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
     text = "SELECT ra_deg, mag, mag - 1 AS other_mag, 1.5 AS x_mas_yr, 3 AS plain FROM stars"
     with session.ask(text) as answer:
-        assert [column.unit for column in answer.table(1).columns] == [
-            "deg",
-            "mag",
-            "mag",
-            "mas/yr",
-            "",
-        ]
+        units = [column.unit for column in answer.table(1).columns]
+        assert units == ["deg", "mag", "mag", "mas/yr", ""]
         assert answer.batches().schema.field("mag").metadata[b"unit"] == b"mag"
 
 
@@ -101,15 +102,11 @@ def test_several_targets_have_schemas(small_artifact, archive):
             rows(session, "FROM stars")
 
 
-def test_two_versions_of_an_artifact_have_schemas_of_their_own(small_artifact, artifact_version):
-    with open_session([str(small_artifact), str(artifact_version("1.1.0"))]) as session:
+def test_versions_of_an_artifact_have_schemas_of_their_own(small_artifact, artifact_version):
+    given = [small_artifact, artifact_version("1.1.0"), small_artifact]
+    with open_session(list(map(str, given))) as session:
         names = [target.name for target in session.targets]
-    assert names == ["small_1_0_0", "small_1_1_0"]
-
-
-def test_one_thing_twice_is_numbered(small_artifact):
-    with open_session([str(small_artifact)] * 3) as session:
-        assert len({target.name for target in session.targets}) == 3
+    assert names == ["small_1_0_0", "small_1_1_0", "small_1_0_0_2"]
 
 
 def test_archives_are_read_with_their_rejected_rows(archive, tmp_path):
@@ -125,10 +122,8 @@ def test_archives_are_read_with_their_rejected_rows(archive, tmp_path):
 def test_archives_of_another_name_need_their_source(archive, tmp_path):
     copied = tmp_path / "mine.txt"
     shutil.copy(archive, copied)
-    with (
-        pytest.raises(QueryError, match=r"cannot tell what it is.*SOURCE=PATH"),
-        open_session([str(copied)]),
-    ):
+    refused = pytest.raises(QueryError, match=r"cannot tell what it is.*SOURCE=PATH")
+    with refused, open_session([str(copied)]):
         pass
     with open_session([f"sao={copied}"]) as session:
         assert rows(session, "SELECT count(*) FROM stars")[0][0] > 500
@@ -139,12 +134,6 @@ def test_ingested_tables_are_targets(starcat, archive, tmp_path):
     with open_session([str(tmp_path / "t.parquet")]) as session:
         assert session.targets[0].name == "t"
         assert [facts for _, _, facts, _ in rows(session, "DESCRIBE stars")][5] == "deg"
-
-
-def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
-    pq.write_table(pa.table({"a": [1, 2]}), tmp_path / "My Table.parquet")
-    with open_session([str(tmp_path / "My Table.parquet")]) as session:
-        assert rows(session, "SELECT sum(a) FROM my_table") == [(3,)]
 
 
 def test_a_folder_of_parquet_files_is_a_schema(tmp_path):
@@ -196,60 +185,58 @@ def test_no_word_of_sql_needs_quotes():
             assert connection.execute(query).fetchall() == [(1, 2)]
 
 
-def test_files_named_by_words_of_sql_are_targets(tmp_path):
-    for name in ("group", "order", "a"):
-        pq.write_table(pa.table({"n": [len(name)]}), tmp_path / f"{name}.parquet")
-    given = [str(tmp_path / f"{name}.parquet") for name in ("group", "order", "a")]
-    with open_session(given[:1]) as session:
-        assert rows(session, "SELECT n FROM group_") == [(5,)]
+def tables_named(folder: Path, *names: str) -> list[str]:
+    """Write tables of one row, which has the number of the table; return their files."""
+    for number, name in enumerate(names):
+        pq.write_table(pa.table({"n": [number]}), folder / f"{name}.parquet")
+    return [str(folder / f"{name}.parquet") for name in names]
+
+
+def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
+    given = tables_named(tmp_path, "group", "order", "a", "My Table")
+    for one, name in ((given[0], "group_"), (given[3], "my_table")):
+        with open_session([one]) as session:
+            assert rows(session, f"SELECT n FROM {name}") == [(given.index(one),)]
     with open_session(given) as session:
         joined = "SELECT group_.n, order_.n, a_.n FROM group_.group_, b.order_, a_.a AS a_"
-        assert rows(session, joined) == [(5, 5, 1)]
-        assert rows(session, "SELECT n FROM a.group_") == [(5,)], "a is the first target"
+        assert rows(session, joined) == [(0, 1, 2)]
+        assert rows(session, "SELECT n FROM a.group_") == [(0,)], "a is the first target"
 
 
 def test_more_targets_than_letters(tmp_path):
-    given = []
-    for k in range(30):
-        given.append(str(tmp_path / f"t{k}.parquet"))
-        pq.write_table(pa.table({"n": [k]}), given[-1])
-    with open_session(given) as session:
-        assert rows(session, "SELECT z.t25.n, ad.t29.n, t7.t7.n FROM z.t25, ad.t29, t7.t7") == [
-            (25, 29, 7)
-        ]
+    with open_session(tables_named(tmp_path, *(f"t{k}" for k in range(30)))) as session:
+        found = rows(session, "SELECT z.t25.n, ad.t29.n, t7.t7.n FROM z.t25, ad.t29, t7.t7")
+        assert found == [(25, 29, 7)]
 
 
-def damaged(small_artifact: Path, folder: Path, damage: str) -> Path:
-    copied = folder / "artifact"
-    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
-    manifest = json.loads((copied / "manifest.json").read_text())
-    if damage == "cut":
-        data = (copied / "pairs.parquet").read_bytes()
-        (copied / "pairs.parquet").write_bytes(data[: len(data) // 2])
-    elif damage == "footer":
-        data = bytearray((copied / "pairs.parquet").read_bytes())
-        data[-8:-4] = b"\xff\xff\xff\x0f"
-        (copied / "pairs.parquet").write_bytes(data)
-    elif damage == "gone":
-        (copied / "pairs.parquet").unlink()
-    elif damage == "link":
-        (copied / "pairs.parquet").unlink()
-        (copied / "pairs.parquet").symlink_to("/etc/passwd")
-    elif damage == "outside":
-        manifest["products"]["pairs"]["parquet"] = "../../secret.parquet"
-    elif damage == "injection":
-        manifest["products"]["x; DROP VIEW stars"] = manifest["products"].pop("pairs")
-    elif damage == "schema":
-        manifest["products"]["pairs"]["schema"] = "pairs-9.0.0"
-    (copied / "manifest.json").write_text(json.dumps(manifest))
-    return copied
+DAMAGED_FILES: dict[str, Callable[[bytes], bytes | None]] = {
+    "cut": lambda data: data[: len(data) // 2],
+    "footer": lambda data: data[:-8] + b"\xff\xff\xff\x0f" + data[-4:],
+    "gone": lambda _: None,
+}
+DAMAGED_PRODUCTS: dict[str, tuple[str, dict[str, str]]] = {
+    "outside": ("pairs", {"parquet": "../../secret.parquet"}),
+    "injection": ("x; DROP VIEW stars", {}),
+    "schema": ("pairs", {"schema": "pairs-9.0.0"}),
+}
 
 
-@pytest.mark.parametrize(
-    "damage", ["cut", "footer", "gone", "link", "outside", "injection", "schema"]
-)
-def test_damaged_artifacts_are_told(small_artifact, tmp_path, damage):
-    folder = damaged(small_artifact, tmp_path, damage)
+@pytest.mark.parametrize("damage", [*DAMAGED_FILES, "link", *DAMAGED_PRODUCTS])
+def test_damaged_artifacts_are_told(artifact_copy, damage):
+    folder = artifact_copy
+    if damage in DAMAGED_PRODUCTS:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        name, change = DAMAGED_PRODUCTS[damage]
+        manifest["products"][name] = manifest["products"].pop("pairs") | change
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+    else:
+        pairs = folder / "pairs.parquet"
+        left = DAMAGED_FILES[damage](pairs.read_bytes()) if damage in DAMAGED_FILES else None
+        pairs.unlink()
+        if left is not None:
+            pairs.write_bytes(left)
+        elif damage == "link":
+            pairs.symlink_to("/etc/passwd")
     expected = SchemaVersionError if damage == "schema" else ProductError
     with pytest.raises(expected, match=r"pairs|small"), open_session([str(folder)]):
         pass
@@ -279,86 +266,64 @@ def test_every_named_query_answers(query, small_artifact, artifact_version):
 def test_the_values_of_a_named_query_have_its_types():
     query = named_query("crossmatch")
     assert query.with_values({"radius_arcsec": "3"}) == {"radius_arcsec": 3.0}
-    with pytest.raises(QueryError, match="'x' is not a number"):
-        query.with_values({"radius_arcsec": "x"})
+    for text in ("x", "nan", "1_0", "٧"):
+        with pytest.raises(QueryError, match=f"'{text}' is not a number"):
+            query.with_values({"radius_arcsec": text})
+    assert named_query("star").with_values({"designation": "007"}) == {"designation": "007"}
+    assert named_query("closest-pairs").with_values({"count": "007"}) == {"count": 7}
     with pytest.raises(QueryError, match="no value 'radius'; it has: radius_arcsec"):
         query.with_values({"radius": "1"})
     with pytest.raises(QueryError, match="did you mean 'crossmatch'"):
         named_query("crosmatch")
 
 
-@pytest.mark.parametrize(
-    "text", ["007", "1_000", "nan", "inf", "+5", "٧", "７", " 7", "0x1F", "1e9999"]
-)
-def test_what_is_no_plain_number_stays_text(text):
-    assert guessed(text) == text
+def test_only_plain_numbers_are_numbers_where_no_type_is_declared():
+    for text in ("007", "1_000", "nan", "inf", "+5", "٧", "７", " 7", "0x1F", "1e9999"):
+        assert guessed(text) == text
+    for text, value in {"7": 7, "-0.5": -0.5, "0": 0, "1e-3": 0.001, ".5": 0.5}.items():
+        assert guessed(text) == value
+        assert type(guessed(text)) is type(value)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"), [("7", 7), ("-0.5", -0.5), ("0", 0), ("1e-3", 0.001), (".5", 0.5)]
-)
-def test_plain_numbers_are_numbers(text, value):
-    assert guessed(text) == value
-    assert type(guessed(text)) is type(value)
-
-
-def test_a_value_keeps_its_zeros(starcat, small_artifact):
+@pytest.mark.parametrize(("value", "row"), [("007", '"007","VARCHAR"'), ("7", '7,"INTEGER"')])
+def test_a_value_keeps_its_zeros(starcat, small_artifact, value, row):
     query = "SELECT $id AS id, typeof($id) AS kind"
-    run = starcat(["sql", small_artifact, query, "--set", "id=007", "--format", "csv"])
-    assert run.out.splitlines()[1] == '"007","VARCHAR"'
-    run = starcat(["sql", small_artifact, query, "--set", "id=7", "--format", "csv"])
-    assert run.out.splitlines()[1] == '7,"INTEGER"'
-
-
-def test_declared_types_decide_for_named_queries():
-    assert named_query("star").with_values({"designation": "007"}) == {"designation": "007"}
-    assert named_query("closest-pairs").with_values({"count": "007"}) == {"count": 7}
-    for text in ("nan", "1_0", "٧"):
-        with pytest.raises(QueryError, match="is not a number"):
-            named_query("crossmatch").with_values({"radius_arcsec": text})
+    run = starcat(["sql", small_artifact, query, "--set", f"id={value}", "--format", "csv"])
+    assert run.out.splitlines()[1] == row
 
 
 def test_emptiest_fields_are_those_of_the_boresights(session, small_artifact):
     counts = np.sort(open_artifact(small_artifact).table("boresights")["star_count"].to_numpy())
     for name, expected in (("emptiest-fields", counts), ("densest-fields", counts[::-1])):
-        query = named_query(name)
-        found = rows(session, query.text, **query.with_values({"count": "7"}))
+        found = asked(session, name, count="7")
         assert [row[3] for row in found] == expected[:7].tolist()
 
 
 def test_near_equal_pairs_are_those_of_numpy(session, small_artifact):
     table = open_artifact(small_artifact).table("pairs")
     gaps = 3600 * np.degrees(np.diff(table["separation_rad"].to_numpy()))
-    query = named_query("near-equal-pairs")
-    found = rows(
-        session, query.text, **query.with_values({"difference_arcsec": "20", "count": "5"})
-    )
+    found = asked(session, "near-equal-pairs", difference_arcsec="20", count="5")
     assert np.allclose([row[3] for row in found], np.sort(gaps)[:5], rtol=1e-6)
 
 
 def test_the_cells_of_the_sky_hold_all_stars(session, small_artifact):
-    query = named_query("sky-density")
-    found = rows(session, query.text, **query.with_values({"cell_order": "1", "count": "48"}))
+    found = asked(session, "sky-density", cell_order="1", count="48")
     assert len(found) == 48
     assert sum(row[1] for row in found) == len(open_artifact(small_artifact).table("stars"))
 
 
 def test_what_changed_between_versions(archive, small_artifact, tmp_path):
     table = open_artifact(small_artifact).table("stars")
-    mag = table["mag"].to_numpy().copy()
-    mag[5] += 0.5
-    dec = table["dec_deg"].to_numpy().copy()
-    dec[7] += 1e-5
-    names = table.column_names
-    changed = table.set_column(names.index("mag"), table.schema.field("mag"), pa.array(mag))
-    changed = changed.set_column(
-        names.index("dec_deg"), table.schema.field("dec_deg"), pa.array(dec)
-    )
+    changed = table
+    for name, row, more in (("mag", 5, 0.5), ("dec_deg", 7, 1e-5)):
+        values = table[name].to_numpy().copy()
+        values[row] += more
+        place = table.column_names.index(name)
+        changed = changed.set_column(place, table.schema.field(name), pa.array(values))
     pq.write_table(table.slice(1), tmp_path / "old.parquet")
     pq.write_table(changed.slice(0, len(table) - 2), tmp_path / "new.parquet")
-    query = named_query("changed-stars")
     with open_session([str(tmp_path / "old.parquet"), str(tmp_path / "new.parquet")]) as session:
-        found = rows(session, query.text, **query.with_values({}))
+        found = asked(session, "changed-stars")
     names = table["designation"].to_pylist()
     expected = [("came", names[0]), ("magnitude", names[5]), ("moved", names[7]),
                 ("went", names[-2]), ("went", names[-1])]  # fmt: skip
@@ -367,10 +332,8 @@ def test_what_changed_between_versions(archive, small_artifact, tmp_path):
 
 
 def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
-    given = [str(small_artifact)] * 2
-    query = named_query("crossmatch")
-    with open_session(given) as both:
-        found = rows(both, query.text, **query.with_values({"radius_arcsec": "36000"}))
+    with open_session([str(small_artifact)] * 2) as both:
+        found = asked(both, "crossmatch", radius_arcsec="36000")
     [(count,)] = rows(session, "SELECT count(*) FROM stars")
     [(near,)] = rows(session, "SELECT count(*) FROM stars a JOIN stars b ON separation(a.ra_deg, "
                               "a.dec_deg, b.ra_deg, b.dec_deg) <= 10")  # fmt: skip
@@ -399,15 +362,12 @@ def test_wide_answers_stand_one_row_below_the_other(starcat, small_artifact):
     assert "the first 2 rows" in run.err
 
 
-@pytest.mark.parametrize("form", ["csv", "json"])
-def test_text_goes_to_the_terminal(starcat, small_artifact, form):
-    run = starcat(["sql", small_artifact, QUERY, "--format", form])
-    assert run.code == 0
-    if form == "json":
-        assert len(json.loads(run.out)) == 7
-        assert run.out == starcat(["sql", small_artifact, QUERY, "--json"]).out
-    else:
-        assert run.out.splitlines()[0] == ",".join(f'"{name}"' for name in COLUMNS)
+def test_text_goes_to_the_terminal(starcat, small_artifact):
+    run = starcat(["sql", small_artifact, QUERY, "--format", "json"])
+    assert (run.code, len(json.loads(run.out))) == (0, 7)
+    assert run.out == starcat(["sql", small_artifact, QUERY, "--json"]).out
+    run = starcat(["sql", small_artifact, QUERY, "--format", "csv"])
+    assert run.out.splitlines()[0] == ",".join(f'"{name}"' for name in COLUMNS)
 
 
 @pytest.mark.parametrize("suffix", ["vot", "fits", "ecsv", "parquet", "csv", "json", "npz"])
@@ -465,14 +425,15 @@ def test_wrong_questions_are_told(starcat, small_artifact, arguments, words, tmp
 
 
 def test_the_lists(starcat, small_artifact):
-    assert "densest-fields" in starcat(["sql", "--list"]).out
-    assert "FROM cone(ra, dec, radius" in starcat(["sql", "--macros"]).out
-    views = starcat(["sql", small_artifact, "--views"]).out
-    assert "small.triangles" in views
-    for arguments in (["--list"], ["--macros"], [small_artifact, "--views"]):
+    for arguments, found in (
+        (["--list"], "densest-fields"),
+        (["--macros"], "FROM cone(ra, dec, radius"),
+        ([small_artifact, "--views"], "small.triangles"),
+    ):
+        shown = starcat(["sql", *arguments]).out
+        assert found in shown
+        assert all(len(line) <= 100 for line in shown.splitlines())
         assert json.loads(starcat(["sql", *arguments, "--json"]).out)
-    for arguments in (["--list"], ["--macros"], [small_artifact, "--views"]):
-        assert all(len(line) <= 100 for line in starcat(["sql", *arguments]).out.splitlines())
 
 
 def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_artifact, session):
@@ -499,6 +460,9 @@ def test_a_query_comes_from_stdin(ask_stdin):
     assert (run.code, run.err, run.out) == (0, "", '"one"\n1\n"two"\n";"\n')
     run = ask_stdin("SELECT 1 AS one", "-", "--format", "csv")
     assert (run.code, run.err, run.out) == (0, "", '"one"\n1\n')
+    run = ask_stdin("SELEC 1; SELECT 2")
+    assert (run.code, run.out) == (2, "")
+    assert run.err.startswith("starcat: error: no valid SQL")
 
 
 def test_two_answers_do_not_share_a_file(ask_stdin, tmp_path):
@@ -506,12 +470,6 @@ def test_two_answers_do_not_share_a_file(ask_stdin, tmp_path):
     assert run.code == 2
     assert "2 queries for one file" in run.err
     assert not (tmp_path / "a.csv").exists()
-
-
-def test_what_stdin_has_that_is_no_sql_is_told(ask_stdin):
-    run = ask_stdin("SELEC 1; SELECT 2")
-    assert (run.code, run.out) == (2, "")
-    assert run.err.startswith("starcat: error: no valid SQL")
 
 
 def test_a_query_loads_nothing_heavy(small_artifact):

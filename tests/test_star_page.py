@@ -73,10 +73,7 @@ def test_astropy_finds_the_positions_on_the_page(told: str) -> None:
     fk5 = cells(told, "FK5, as the record has it")[1:3]
     icrs = cells(told, "ICRS, J2000.0")[1:3]
     # Six decimals of a degree of declination are 1.8 mas.
-    for found, frame, truth in (
-        (fk5, FK5(equinox="J2000"), written),
-        (icrs, ICRS(), written.icrs),
-    ):
+    for found, frame, truth in ((fk5, FK5(equinox="J2000"), written), (icrs, ICRS(), written.icrs)):
         told = SkyCoord(*map(float, found), unit=u.deg, frame=frame)
         assert told.separation(truth) < 2.0 * u.mas
 

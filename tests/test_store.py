@@ -12,7 +12,7 @@ import pytest
 from genuine_records import SAO
 
 from starcat.catalog.ingest import ingest
-from starcat.exchange.hats import write_hats
+from starcat.exchange.export import write_hats
 from starcat.storage.digests import file_sha256
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store

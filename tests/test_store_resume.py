@@ -97,13 +97,13 @@ def test_what_is_done_is_not_done_again_and_what_was_changed_is(
         make(copies, store, workers=1)
     copies[1].write_bytes(content)
     opened = []
-    reading = splitting.FileReading
+    reading = splitting.read_files
 
-    def spy(file, *rest):
-        opened.append(file.path.name)
-        return reading(file, *rest)
+    def spy(files, *rest):
+        opened.extend(file.path.name for file in files)
+        return reading(files, *rest)
 
-    monkeypatch.setattr(splitting, "FileReading", spy)
+    monkeypatch.setattr(splitting, "read_files", spy)
     assert ResumePlan.of(store).done("file-00000") is not None
     next((ResumePlan.of(store) / "runs").glob("file-00000*.arrow")).write_bytes(b"no longer")
     make(copies, store, resume=True)

@@ -7,7 +7,7 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,36 +19,23 @@ from astropy.io.votable import from_table, parse_single_table
 from astropy.table import MaskedColumn, Table
 from fastapi.testclient import TestClient
 from httpx2 import Response
-from shelved import LOCAL, client_of, shelve
+from services import LOCAL, add_database, client_of
 
 from starcat.errors import QueryError
 from starcat.exchange.formats import response_format
 from starcat.query.session import open_session
 from starcat.service.app import make_app
-from starcat.service.jobs.job import QUERY
-from starcat.service.jobs.job_states import begin_next
+from starcat.service.jobs.job import QUERY, begin_next
 from starcat.service.jobs.slots import ENDED_WITH_SERVER
 from starcat.service.service import Service
 from starcat.service.settings import Settings
 from starcat.service.vo.tap import ClientGone, Spool
 from starcat.vo.parameters import Question
 
+SETTINGS = {"upload_mib": 0.5, "max_rows": 1_000_000}
 BRIGHT = "SELECT star_id, ra_deg, mag FROM small.stars WHERE mag < 2.5 ORDER BY star_id"
 SLOW = "SELECT COUNT(*) AS n FROM small.pairs a, small.pairs b, small.pairs c WHERE a.i < b.j + c.i"
 UWS = {"uws": "http://www.ivoa.net/xml/UWS/v1.0", "xlink": "http://www.w3.org/1999/xlink"}
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    folder = tmp_path_factory.mktemp("tap") / "service"
-    shelve(folder, small_artifact)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def client(root: Path) -> Iterator[TestClient]:
-    with client_of(root, upload_mib=0.5, max_rows=1_000_000) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +149,7 @@ def test_who_reads_slowly_keeps_nobody_waiting(root):
         asked = Question("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
         spools = []
         for _ in range(4):
-            parts = service.tap.queries.answer(asked, {})
+            parts = service.tap.answer(asked, {})
             next(parts)
             spools.append(Spool(parts, service.paths.scratch, threading.Event()))
             next(iter(spools[-1]))
@@ -197,7 +184,7 @@ def test_a_query_ends_when_its_client_goes(root):
                 raise ClientGone
 
         asked = Question(SLOW, response_format("csv"), 10)
-        spool = Spool(service.tap.queries.answer(asked, {}, progress=watch), root, gone)
+        spool = Spool(service.tap.answer(asked, {}, progress=watch), root, gone)
         time.sleep(0.5)
         spool.close()
         assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
@@ -323,20 +310,20 @@ UPLOADED = Table(
 )
 
 
+def ask_with(client: TestClient, name: str, content: bytes, query: str) -> Response:
+    """Send a query together with a table."""
+    given = {"QUERY": query, "UPLOAD": f"{name},param:file1"}
+    return client.post("/tap/sync", data=given, files={"file1": ("any.vot", content)})
+
+
 @pytest.mark.parametrize("serialization", ["tabledata", "binary", "binary2"])
 def test_an_uploaded_table_comes_back(client, serialization):
     # BINARY has no way to say that an integer is missing.
     has_nulls = serialization != "binary"
-    sent = UPLOADED if has_nulls else UPLOADED.filled(2)
-    answer = client.post(
-        "/tap/sync",
-        data={
-            "QUERY": 'SELECT * FROM TAP_UPLOAD."Group" ORDER BY ra',
-            "UPLOAD": "Group,param:file1",
-        },
-        files={"file1": ("any.vot", votable(sent, serialization))},
+    sent = votable(UPLOADED if has_nulls else UPLOADED.filled(2), serialization)
+    found = table_of(
+        ask_with(client, "Group", sent, 'SELECT * FROM TAP_UPLOAD."Group" ORDER BY ra')
     )
-    found = table_of(answer)
     assert found.colnames == UPLOADED.colnames
     assert np.ma.getmaskarray(found["id"]).tolist() == [False, has_nulls, False]
     assert found["id"].dtype == np.int32
@@ -349,47 +336,49 @@ def test_an_uploaded_table_comes_back(client, serialization):
 
 def test_an_uploaded_table_is_joined(client, bright):
     ids = Table({"star_id": [*(row[0] for row in bright[::2]), 999_999]})
-    answer = client.post(
-        "/tap/sync",
-        data={"QUERY": "SELECT s.star_id FROM TAP_UPLOAD.mine AS m JOIN small.stars AS s USING "
-              "(star_id) ORDER BY star_id", "UPLOAD": "mine,param:p"},
-        files={"p": ("p", votable(ids))},
-    )  # fmt: skip
+    query = (
+        "SELECT s.star_id FROM TAP_UPLOAD.mine AS m JOIN small.stars AS s USING (star_id) "
+        "ORDER BY star_id"
+    )
+    answer = ask_with(client, "mine", votable(ids), query)
     assert list(table_of(answer)["star_id"]) == [row[0] for row in bright][::2]
 
 
-FIELD = '<FIELD name="a" datatype="{}" arraysize="{}"/>'
-DOCUMENT = (
-    '<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3"><RESOURCE><TABLE{}>{}'
-    "<DATA>{}</DATA></TABLE></RESOURCE></VOTABLE>"
-)
+def document(fields: str, data: str = "", **facts: object) -> bytes:
+    told = "".join(f' {name}="{value}"' for name, value in facts.items())
+    space = "http://www.ivoa.net/xml/VOTable/v1.3"
+    table = f"<TABLE{told}>{fields}<DATA>{data}</DATA></TABLE>"
+    return f'<VOTABLE version="1.4" xmlns="{space}"><RESOURCE>{table}</RESOURCE></VOTABLE>'.encode()
+
+
+def field(datatype: str, arraysize: int = 1) -> str:
+    return f'<FIELD name="a" datatype="{datatype}" arraysize="{arraysize}"/>'
+
+
+def elsewhere(address: str) -> bytes:
+    return document(field("double"), f'<BINARY><STREAM href="{address}"/></BINARY>')
+
+
 ROWS = "<TABLEDATA>" + "<TR><TD/></TR>" * 100 + "</TABLEDATA>"
-ELSEWHERE = '<BINARY><STREAM href="{}"/></BINARY>'
 HOSTILE = [
     (b"", 422, "is no XML"),
     (b"a,b\n1,2\n", 422, "is no XML"),
     (b"<html/>", 422, "cannot be read as a VOTable"),
-    (DOCUMENT.format("", FIELD.format("double", "1"), ELSEWHERE.format("file:///etc/passwd")).encode(),
-     422, "has its rows elsewhere"),
-    (DOCUMENT.format("", FIELD.format("double", "1"), ELSEWHERE.format("http://127.0.0.1/")).encode(),
-     422, "has its rows elsewhere"),
-    (DOCUMENT.format("", FIELD.format("char", "100000000"), ROWS).encode(), 422, "give fields an"),
-    (DOCUMENT.format(' nrows="9999999999"', FIELD.format("int", "1"), ROWS).encode(), 422, "rows"),
+    (elsewhere("file:///etc/passwd"), 422, "has its rows elsewhere"),
+    (elsewhere("http://127.0.0.1/"), 422, "has its rows elsewhere"),
+    (document(field("char", 100_000_000), ROWS), 422, "give fields an"),
+    (document(field("int"), ROWS, nrows=9999999999), 422, "rows"),
     (b'<!DOCTYPE v [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><VOTABLE>&b;</VOTABLE>', 422, "entity"),
-    (DOCUMENT.format("", FIELD.format("int", "1") * 1001, ROWS).encode(), 422, "more than 1000"),
-    (DOCUMENT.format("", FIELD.format("int", "1") * 2, "").encode(), 422, "two columns 'a'"),
+    (document(field("int") * 1001, ROWS), 422, "more than 1000"),
+    (document(field("int") * 2), 422, "two columns 'a'"),
     (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is no XML"),
     (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("content", "status", "told"), HOSTILE, ids=range(len(HOSTILE)))
 def test_uploads_that_must_not_be_read_are_refused(client, content, status, told):
-    answer = client.post(
-        "/tap/sync",
-        data={"QUERY": "SELECT * FROM TAP_UPLOAD.t", "UPLOAD": "t,param:f"},
-        files={"f": ("f", content)},
-    )
+    answer = ask_with(client, "t", content, "SELECT * FROM TAP_UPLOAD.t")
     assert answer.status_code == status
     assert told in answer.text
 
@@ -559,10 +548,10 @@ def test_a_job_that_is_not_there_is_not_found(client, job):
 
 def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     root = tmp_path / "service"
-    shelve(root, small_artifact)
+    add_database(root, small_artifact)
     settings = Settings(root=root)
     service = Service(settings)
-    jobs = service.tap.jobs
+    jobs = service.query_jobs
     made = [jobs.create("anonymous").job_id for _ in range(3)]
     for job_id in made:
         jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
@@ -589,9 +578,9 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
             return list(table_of(client.get("/tap/sync", params={"QUERY": query}))["schema_name"])
 
         assert names() == ["tap_schema"]
-        shelve(root, small_artifact)
+        add_database(root, small_artifact)
         assert names() == ["small", "tap_schema"]
-        other = shelve(root, small_artifact, "fedcba9876543210")
+        other = add_database(root, small_artifact, "fedcba9876543210")
         catalog = f"2mass-{'0' * 16}.parquet"
         shutil.copyfile(stars, root / "catalogs" / catalog)
         quoted = f'"_2mass_{"0" * 16}"'

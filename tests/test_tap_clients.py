@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import socket
 import subprocess
-import sys
-import time
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from astropy.table import Table
-from shelved import shelve
+from pyvo.dal import DALQueryError, TAPService
+from served import serve
+from services import add_database
 
 from starcat.query.session import open_session
 
@@ -55,35 +52,10 @@ def rows(small_artifact: Path) -> list[tuple[object, ...]]:
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[str]:
     """Address of TAP at a server that runs."""
-    root = tmp_path_factory.mktemp("served") / "service"
-    shelve(root, small_artifact)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "starcat", "serve", "--root", root, "--port", str(port)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(command, env=environment) as process:
-        try:
-            wait_until_it_answers(f"http://127.0.0.1:{port}/healthz", process)
-            yield f"http://127.0.0.1:{port}/tap"
-        finally:
-            process.terminate()
-            try:
-                process.wait(30)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-def wait_until_it_answers(address: str, process: subprocess.Popen[bytes]) -> None:
-    ends = time.monotonic() + 60.0
-    while True:
-        try:
-            with urllib.request.urlopen(address, timeout=5):
-                return
-        except OSError:
-            assert process.poll() is None
-            assert time.monotonic() < ends
-            time.sleep(0.2)
+    folder = tmp_path_factory.mktemp("served")
+    add_database(folder / "root", small_artifact)
+    with serve(folder / "root", folder / "log") as served:
+        yield f"{served.address}/tap"
 
 
 def rows_of(table: Table) -> list[tuple[object, ...]]:
@@ -107,8 +79,6 @@ def test_taplint_finds_no_error(url, tmp_path):
 
 @pytest.fixture
 def service(url):
-    from pyvo.dal import TAPService
-
     return TAPService(url)
 
 
@@ -142,8 +112,6 @@ def test_pyvo_uploads(service, rows):
 
 
 def test_pyvo_follows_a_job(service, rows):
-    from pyvo.dal import DALQueryError
-
     job = service.submit_job(CONE, maxrec=3)
     assert job.phase == "PENDING"
     job.run()
@@ -160,8 +128,6 @@ def test_pyvo_follows_a_job(service, rows):
 
 
 def test_pyvo_is_told_what_is_wrong(service):
-    from pyvo.dal import DALQueryError
-
     with pytest.raises(DALQueryError, match="LIMIT is not ADQL"):
         service.run_sync("SELECT star_id FROM small.stars LIMIT 3")
     found = service.run_sync(CONE, maxrec=2)
@@ -170,7 +136,7 @@ def test_pyvo_is_told_what_is_wrong(service):
 
 @pytest.fixture
 def tap_plus(url):
-    from astroquery.utils.tap.core import TapPlus
+    from astroquery.utils.tap.core import TapPlus  # which looks for a server when it is loaded
 
     return TapPlus(url=url)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from starcat.evaluation.papers.s3 import optimised_triangle
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.order import is_well_shaped, select_triangles
+from starcat.matcher.methods.triangle import is_well_shaped, select_triangles
 from starcat.matcher.observation import Observation
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)

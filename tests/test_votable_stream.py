@@ -23,10 +23,11 @@ from astropy.io.votable.tree import VOTableFile
 from table_formats import column_of
 
 from starcat.errors import QueryLimitError, SchemaError
-from starcat.exchange import votable_stream
+from starcat.exchange import columns as shared_columns
 from starcat.exchange.columns import Label
 from starcat.exchange.votable_stream import Serialization, votable_chunks
 
+DAY = "2026-01-31"
 SERIALIZATIONS: tuple[Serialization, ...] = get_args(Serialization)
 both = pytest.mark.parametrize("serialization", SERIALIZATIONS)
 
@@ -59,22 +60,15 @@ def statuses(content: bytes) -> list[tuple[str, str]]:
 
 @both
 def test_times_decimals_and_records_become_what_votable_has(serialization: Serialization) -> None:
-    table = pa.table(
-        {
-            "t": pa.array([datetime(2026, 1, 31, 12, 0, 0, 5), None], pa.timestamp("us")),
-            "z": pa.array([datetime(2026, 1, 31, tzinfo=UTC), None], pa.timestamp("us", "UTC")),
-            "d": pa.array([date(2026, 1, 31), None]),
-            "n": pa.array([Decimal("1.50"), None], pa.decimal128(5, 2)),
-            "r": [{"p": 1}, None],
-            "b": [[True, False], None],
-        }
-    )
+    table = pa.table({
+        "t": pa.array([datetime(2026, 1, 31, 12, 0, 0, 5), None], pa.timestamp("us")),
+        "z": pa.array([datetime(2026, 1, 31, tzinfo=UTC), None], pa.timestamp("us", "UTC")),
+        "d": pa.array([date(2026, 1, 31), None]), "r": [{"p": 1}, None],
+        "n": pa.array([Decimal("1.50"), None], pa.decimal128(5, 2)), "b": [[True, False], None],
+    })  # fmt: skip
     content = document(table, serialization=serialization)
-    assert rows_of(content) == [
-        ("2026-01-31T12:00:00.000005", "2026-01-31T00:00:00.000000Z", "2026-01-31", 1.5,
-         '{"p": 1}', "[true,false]"),
-        ("", "", "", None, "", ""),
-    ]  # fmt: skip
+    values = (f"{DAY}T12:00:00.000005", f"{DAY}T00:00:00.000000Z", DAY, '{"p": 1}')
+    assert rows_of(content) == [(*values, 1.5, "[true,false]"), ("", "", "", "", None, "")]
     fields = {field.name: field for field in parsed(content).get_first_table().fields}
     for name in "tzd":
         assert (fields[name].datatype, fields[name].xtype) == ("char", "timestamp")
@@ -91,10 +85,8 @@ def test_an_xtype_of_the_metadata_is_passed_on(serialization: Serialization) -> 
 
 @both
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 64, 65, 1000])
-def test_rows_go_on_from_step_to_step(
-    serialization: Serialization, count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(votable_stream, "_STEP_ROWS", 64)
+def test_rows_go_on_from_step_to_step(serialization, count, monkeypatch):
+    monkeypatch.setattr(shared_columns, "STEP_ROWS", 64)
     # Texts of 0 to 6 letters, so that base64 is cut at all three places.
     texts = ["abcdef"[: k % 7] for k in range(count)]
     table = pa.table({"k": np.arange(count), "t": pa.array(texts, pa.string())})
@@ -112,19 +104,13 @@ def test_rows_go_on_from_step_to_step(
 @pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
 @both
 def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serialization) -> None:
-    table = pa.table(
-        {
-            "long": [4472832130942575872, None, -(2**63)],
-            "double": [0.1, None, 5e-324],
-            "single": pa.array([0.1, None, 3.4028235e38], pa.float32()),
-            "byte": pa.array([255, None, 0], pa.uint8()),
-            "short": pa.array([-32768, None, 7], pa.int16()),
-            "truth": [True, None, False],
-            "text": ["a<b>&c", None, "α \U0001f52d"],
-            "time": pa.array([datetime(2026, 1, 31), None, datetime(1, 1, 1)], pa.timestamp("s")),
-            "list": [[1.5, 2.5], None, [3.5]],
-        }
-    )
+    table = pa.table({
+        "long": [4472832130942575872, None, -(2**63)], "double": [0.1, None, 5e-324],
+        "single": pa.array([0.1, None, 3.4028235e38], pa.float32()), "truth": [True, None, False],
+        "byte": pa.array([255, None, 0], pa.uint8()), "list": [[1.5, 2.5], None, [3.5]],
+        "short": pa.array([-32768, None, 7], pa.int16()), "text": ["a<b>&c", None, "α \U0001f52d"],
+        "time": pa.array([datetime(2026, 1, 31), None, datetime(1, 1, 1)], pa.timestamp("s")),
+    })  # fmt: skip
     path, out = tmp_path / "a.vot", tmp_path / "a.csv"
     path.write_bytes(document(table, 2, serialization=serialization))
     lint = subprocess.run(
@@ -170,9 +156,7 @@ def test_infos_and_the_name_are_escaped(serialization: Serialization) -> None:
     [([2026.0] * 4, 10, "J2026"), ([1991.25] * 4, 10, "J1991.25"), ([2026.0, 2000.5], 10, None),
      ([2026.0] * 4, 2, None), ([2015.123456789], 10, "J2015.123456789"), ([], 10, None)],
 )  # fmt: skip
-def test_an_epoch_is_said_where_it_is_sure_to_be_that_of_all_rows(
-    epochs: list[float], rows_a_batch: int, expected: str | None
-) -> None:
+def test_an_epoch_is_said_where_it_is_sure_to_be_that_of_all_rows(epochs, rows_a_batch, expected):
     fields = [
         pa.field("ra_deg", pa.float64(), metadata={"ucd": "pos.eq.ra;meta.main"}),
         pa.field("epoch_jyear", pa.float64()),
@@ -200,9 +184,7 @@ def test_a_name_that_is_no_identifier_is_a_name_all_the_same(name: str) -> None:
     [(None, 10, False), (11, 10, False), (10, 10, False), (9, 9, True), (4, 4, True),
      (3, 3, True), (1, 1, True), (0, 0, True)],
 )  # fmt: skip
-def test_overflow_is_told_when_rows_were_left_out(
-    serialization: Serialization, maxrec: int | None, kept: int, is_over: bool
-) -> None:
+def test_overflow_is_told_when_rows_were_left_out(serialization, maxrec, kept, is_over):
     table = pa.table({"k": range(10), "t": [str(k) for k in range(10)]})
     for rows_a_batch in (1, 3, 4, 10):
         content = document(table, rows_a_batch, serialization=serialization, maxrec=maxrec)

@@ -23,12 +23,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 class Artifact(reader.Artifact):
     """A guide-star database on disk, opened by `open_artifact` (``starcat.open``).
 
-    Parameters
-    ----------
-    folder : Path
-        The folder ``<name>-<version>``.
-    manifest : dict
-        What it is made of: spec, sources, products, digests.
+    ``folder`` is where it is, ``manifest`` what it is made of: spec, sources, products, digests.
     """
 
     def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
@@ -75,25 +70,13 @@ class Artifact(reader.Artifact):
             return connection.sql(text, **values)
 
     def coverage(self) -> CoverageReport:
-        """Return how many stars, pairs and triangles the fields hold.
-
-        Returns
-        -------
-        CoverageReport
-            As the report of the build has it.
-        """
+        """Return how many stars, pairs and triangles the fields hold, as the report has it."""
         from starcat.pipeline.report_data import artifact_coverage
 
         return artifact_coverage(self)
 
     def verify(self) -> Verification:
-        """Check every file, order, index and reference.
-
-        Returns
-        -------
-        Verification
-            With its findings; none where all is well.
-        """
+        """Check every file, order, index and reference, as `starcat.verify`."""
         from starcat.artifact.verify import verify_artifact
 
         return verify_artifact(self.folder)
@@ -135,15 +118,7 @@ def open_artifact(folder: PathLike) -> Artifact:
 
 
 class Connection:
-    """Tables to ask in SQL, opened by `connect`; a context manager.
-
-    Parameters
-    ----------
-    targets : sequence of str
-        As for ``starcat sql``.
-    limits : Limits, optional
-        Time and memory of a query.
-    """
+    """Tables to ask in SQL, opened by `connect`; a context manager."""
 
     def __init__(self, targets: Sequence[str], limits: Limits | None = None) -> None:
         from starcat.query.session import open_session
@@ -153,27 +128,7 @@ class Connection:
         self._session = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> Answer:
-        """Ask a query.
-
-        Parameters
-        ----------
-        text : str
-            SQL, one statement that reads.
-        **values
-            Values of the ``$name`` in it.
-
-        Returns
-        -------
-        Answer
-            All rows.
-
-        Raises
-        ------
-        QueryError
-            If the text is no query that may run.
-        QueryLimitError
-            If it takes more time or memory than it may.
-        """
+        """Run a query, as `Artifact.sql`; QueryLimitError if it takes more than it may."""
         from starcat.query.result import Answer
 
         with self._session.ask(text, values) as answer:
@@ -184,15 +139,12 @@ class Connection:
         self._open.close()
 
     def __enter__(self) -> Connection:
-        """Return itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self.close()
 
     def __repr__(self) -> str:
-        """Return the targets in one line."""
         return f"<Connection to {', '.join(self._targets)}>"
 
 

@@ -36,11 +36,7 @@ def write_root(file: h5py.File, facts: Mapping[str, str | float]) -> None:
 
 
 def write_product(
-    file: h5py.File,
-    table: pa.Table,
-    schema: ProductSchema,
-    index: Index,
-    star_count: int,
+    file: h5py.File, table: pa.Table, schema: ProductSchema, index: Index, star_count: int
 ) -> None:
     """Write a product as a group of contiguous datasets."""
     expected = indices_of(schema.product)

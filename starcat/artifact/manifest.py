@@ -20,7 +20,6 @@ from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.source_files import FileFacts
-    from starcat.storage.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.1.0"
@@ -83,30 +82,6 @@ class SourceFacts:
         """Return the facts as the manifest holds them."""
         facts = {name: value for name, value in asdict(self).items() if value is not None}
         return {**facts, "files": list(facts["files"])}
-
-
-@dataclass(frozen=True)
-class ProductFacts:
-    """One product of an artifact as the manifest records it."""
-
-    schema: ProductSchema  # its contract
-    rows: int  # rows of its table
-    content_sha256: str  # digest of its values
-    in_database: bool  # whether the HDF5 file has it too
-    records: int | None = None  # for triangles, the sum over all boresights, which the papers count
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the facts as the manifest holds them."""
-        facts: dict[str, Any] = {
-            "schema": self.schema.name,
-            "rows": self.rows,
-            "content_sha256": self.content_sha256,
-            "parquet": f"{self.schema.product}.parquet",
-            "in_database": self.in_database,
-        }
-        if self.records is not None:
-            facts["records"] = self.records
-        return facts
 
 
 def software_versions() -> dict[str, str]:

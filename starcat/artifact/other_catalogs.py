@@ -6,7 +6,7 @@ both products are checked against the stars that they belong to.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,16 +23,8 @@ from starcat.products.match_figures import MovingStars
 from starcat.storage.schema import product_schema
 
 NEEDED = (
-    "star_id",
-    "catalog",
-    "designation",
-    "ra_deg",
-    "dec_deg",
-    "epoch_jyear",
-    "pm_ra_cosdec_mas_yr",
-    "pm_dec_mas_yr",
-    "mag",
-    "band",
+    *("star_id", "catalog", "designation", "ra_deg", "dec_deg", "epoch_jyear"),
+    *("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag", "band"),
 )
 """Columns of a star table that a cross-identification reads."""
 
@@ -138,9 +130,8 @@ def _moved_to(table: pa.Table, epoch: Array) -> Array:
 def _rank_problems(table: pa.Table) -> Iterator[str]:
     """Yield where ranks and counts of a star's candidates do not fit its rows."""
     star, catalog = table["star"].to_numpy(), table["catalog"].to_numpy()
-    begins = (np.diff(star, prepend=-1) != 0) | np.append(True, catalog[1:] != catalog[:-1])[
-        : len(star)
-    ]
+    begins = np.diff(star, prepend=-1) != 0
+    begins[1:] |= catalog[1:] != catalog[:-1]
     first = np.flatnonzero(begins)
     size = np.diff(np.append(first, len(star)))
     ranks = np.arange(len(star)) - np.repeat(first, size) + 1
@@ -197,11 +188,16 @@ def joined_of(table: pa.Table, catalog: str) -> int:
     return int(pc.sum(rows).as_py() or 0)
 
 
-def motion_count_problems(table: pa.Table, source: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the manifest says otherwise than the product ``motions`` of a catalog."""
-    found = joined_of(table, source["source"])
-    if found != source.get("joined"):
-        yield (
-            f"{source['source']}: {source.get('joined')} stars have their motion from it, but the "
-            f"product motions holds {found}"
-        )
+COUNTS: dict[str, tuple[Callable[[pa.Table, str], int], str]] = {
+    "motions": (joined_of, "have their motion from it"),
+    "crossmatch": (counterparts_of, "have a counterpart"),
+}
+"""What counts the stars that a product has from a catalog, and what these stars have."""
+
+
+def joined_problems(product: str, table: pa.Table, source: Mapping[str, Any]) -> Iterator[str]:
+    """Yield where the manifest's count of a catalog is not that of the product."""
+    count_of, have = COUNTS[product]
+    found, joined = count_of(table, source["source"]), source.get("joined")
+    if found != joined:
+        yield f"{source['source']}: {joined} stars {have}, but the product {product} holds {found}"

@@ -72,7 +72,6 @@ class Artifact:
             ) from error
 
     def __repr__(self) -> str:
-        """Return name, stars and field in one line."""
         stars = self.manifest["products"]["stars"]["rows"]
         name = f"{self.manifest['name']}-{self.manifest['version']}"
         epoch, count = self.manifest["epoch_jyear"], len(self.products)
@@ -87,25 +86,20 @@ class Products(Mapping[str, "pa.Table"]):
         self._facts: dict[str, Any] = artifact.manifest["products"]
 
     def __getitem__(self, name: str) -> pa.Table:
-        """Return a product as an Arrow table; `KeyError` if there is none of that name."""
         if name not in self._facts:
             raise KeyError(name)
         return self._artifact.table(name)
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is a product, without reading it."""
         return name in self._facts
 
     def __iter__(self) -> Iterator[str]:
-        """Go through the names."""
         return iter(self._facts)
 
     def __len__(self) -> int:
-        """Return the number of products."""
         return len(self._facts)
 
     def __repr__(self) -> str:
-        """Return the names and rows in one line."""
         counts = [f"{name} ({one['rows']:,})" for name, one in self._facts.items()]
         return f"<Products: {', '.join(counts)}>"
 

@@ -26,13 +26,8 @@ from starcat.artifact.checks import (
     index_problems,
     root_problems,
 )
-from starcat.artifact.manifest import (
-    DATABASE_NAME,
-    MANIFEST_NAME,
-    manifest_digest,
-    read_manifest,
-)
-from starcat.artifact.other_catalogs import counterparts_of, motion_count_problems
+from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
+from starcat.artifact.other_catalogs import COUNTS, joined_problems
 from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of
 from starcat.catalog.verdict import Reason
@@ -59,7 +54,6 @@ class Finding:
     problem: str  # what was found and what was expected
 
     def __str__(self) -> str:
-        """Return file, product and problem as one line."""
         product = f" ({self.product})" if self.product else ""
         return f"{self.file}{product}: {self.problem}"
 
@@ -73,7 +67,6 @@ class Verification:
     findings: tuple[Finding, ...]  # every problem; none for a sound artifact
 
     def __repr__(self) -> str:
-        """Return the outcome in one line."""
         found = len(self.findings)
         return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
 
@@ -265,17 +258,10 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                     f"{source['source']}: rejected {listed}, but the product rejected holds "
                     f"{held_rows}"
                 )
-        if source["role"] == "motions" and "motions" in held:
-            yield from motion_count_problems(held["motions"].table, source)
+        if source["role"] in COUNTS and source["role"] in held:
+            yield from joined_problems(source["role"], held[source["role"]].table, source)
         elif source["role"] == "motions" and "motions" not in products:
             yield f"{source['source']}: motions are from it, but there is no product motions"
-        if source["role"] == "crossmatch" and "crossmatch" in held:
-            found = counterparts_of(held["crossmatch"].table, source["source"])
-            if found != source["joined"]:
-                yield (
-                    f"{source['source']}: {source['joined']} stars have a counterpart, but the "
-                    f"product crossmatch holds {found}"
-                )
     for product, facts in products.items():
         if facts["parquet"] not in manifest["files"]:
             yield f"product {product}: {facts['parquet']} is not among the files"

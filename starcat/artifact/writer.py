@@ -22,7 +22,6 @@ from starcat.artifact.manifest import (
     MANIFEST_NAME,
     MANIFEST_VERSION,
     MOTIONS_VERSION,
-    ProductFacts,
     SourceFacts,
     manifest_digest,
     software_versions,
@@ -45,9 +44,12 @@ class Product:
 
 def write_products(
     folder: Path, products: Sequence[Product], facts: Mapping[str, str | float]
-) -> dict[str, ProductFacts]:
-    """Write the products of an artifact."""
-    made: dict[str, ProductFacts] = {}
+) -> dict[str, dict[str, Any]]:
+    """Write the products of an artifact; return what the manifest records of each.
+
+    ``records`` of the triangles is the sum over all boresights, which the papers count.
+    """
+    made: dict[str, dict[str, Any]] = {}
     star_count = next(len(product.table) for product in products if product.name == "stars")
     with open_for_writing(folder / DATABASE_NAME) as database:
         write_root(database, facts)
@@ -57,14 +59,15 @@ def write_products(
             write_parquet(product.table, folder / f"{product.name}.parquet")
             if product.in_database:
                 write_product(database, product.table, schema, product.index, star_count)
-            records = product.index.attributes.get("records")
-            made[product.name] = ProductFacts(
-                schema,
-                len(product.table),
-                content_sha256(product.table, schema),
-                product.in_database,
-                None if records is None else int(records),
-            )
+            made[product.name] = {
+                "schema": schema.name,
+                "rows": len(product.table),
+                "content_sha256": content_sha256(product.table, schema),
+                "parquet": f"{product.name}.parquet",
+                "in_database": product.in_database,
+            }
+            if "records" in product.index.attributes:
+                made[product.name]["records"] = int(product.index.attributes["records"])
     return made
 
 
@@ -72,7 +75,7 @@ def write_manifest(
     folder: Path,
     spec: dict[str, Any],
     sources: Sequence[SourceFacts],
-    products: Mapping[str, ProductFacts],
+    products: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Write the manifest of a folder whose other files are complete."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -86,7 +89,7 @@ def write_manifest(
         "epoch_jyear": spec["epoch_jyear"],
         "spec": spec,
         "sources": [source.as_dict() for source in sources],
-        "products": {name: facts.as_dict() for name, facts in products.items()},
+        "products": products,
         "files": {
             path.relative_to(folder).as_posix(): {
                 "bytes": path.stat().st_size,

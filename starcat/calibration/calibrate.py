@@ -98,7 +98,6 @@ class Calibration:
         )
 
     def __repr__(self) -> str:
-        """Return the camera and what it rests on in one line."""
         return (
             f"<Calibration {self.camera.in_words}: {self.n_identified} of {len(self.frames)} "
             f"frames, {len(self.fit.seen)} stars, residual {self.fit.noise_px:.3f} px, "
@@ -113,31 +112,7 @@ def calibrate_frames(
     focal_px: tuple[float, float],
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Find the camera that took frames.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The database and the method. The tolerance is found here.
-    frames : sequence of MeasuredFrame
-        Centroids of the frames, of one camera.
-    camera : Camera
-        Its size, and principal point and distortion to start from.
-    focal_px : tuple of float
-        Shortest and longest focal length that it may have.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Calibration
-        The camera, its errors and how it was chosen.
-
-    Raises
-    ------
-    CalibrationError
-        If fewer than `MIN_FRAMES` frames can be identified; says which and why.
-    """
+    """Find the camera that took frames, with a focal length in a range; the tolerance is found."""
     begun = first_answer(matcher, frames, camera, focal_px)
     if begun is None:
         asked = identify_part(matcher, frames, camera)

@@ -15,7 +15,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration, calibrate_frames
 from starcat.calibration.fit import PARAMETERS
-from starcat.errors import ConfigError, OutputError, reason
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.figure_file import check_kind, own_style, write_figure
 from starcat.images.solve_files import IdentifyOptions, measure
@@ -24,6 +24,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress
 from starcat.report.plots import STYLE, headline
 from starcat.specs.camera_file import camera_toml
+from starcat.storage.atomic import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,10 +140,7 @@ def calibrated_toml(calibration: Calibration) -> str:
 
 def write_camera(calibration: Calibration, path: Path) -> None:
     """Write a calibrated camera as a camera file."""
-    try:
-        path.write_text(calibrated_toml(calibration), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+    write_file(path, calibrated_toml(calibration).encode())
 
 
 _BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"

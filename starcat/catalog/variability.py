@@ -80,14 +80,15 @@ def read_amplitudes(
 def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> AmplitudeTable:
     """Read the General Catalogue of Variable Stars."""
     files = SourceFiles.find(data_source("gcvs"), paths)
-    readings = [FileReading(file, n, files.source) for n, file in enumerate(files.files)]
 
-    def parse(block: Block, _: int) -> Records:
+    def parse(block: Block) -> Records:
         return parse_delimited(block.data, block.file.layout, GCVS_COLUMNS, block.first_line)
 
-    parts = [
-        part for _, parsed in read_files(readings, parse, progress=progress) for part in parsed
-    ]
+    parts: list[Records] = []
+    readings: list[FileReading] = []
+    for reading, parsed in read_files(files.files, parse, progress=progress):
+        parts += parsed
+        readings.append(reading)
     facts = tuple(reading.facts for reading in readings)
     files.check_contents(facts)
 

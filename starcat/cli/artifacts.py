@@ -22,7 +22,7 @@ from starcat.cli.options import Input, Json, inputs_by_source
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
-    from starcat.artifact.diff import Change, Difference, Moved, OneSided
+    from starcat.artifact.diff import Change, Difference
     from starcat.artifact.reader import Artifact
     from starcat.artifact.verify import Verification
     from starcat.pipeline.rebuild import Rebuilt
@@ -126,7 +126,7 @@ def rebuild(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     inputs: Input = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder to keep the new artifact in.")
+        Path | None, typer.Option("--output", "-o", help="Folder for the new artifact.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -146,8 +146,7 @@ def rebuild(
         raise typer.Exit(ProductError.exit_code)
 
 
-MAX_STARS = 20
-"""Stars of each kind that a table shows; JSON has all."""
+MAX_STARS = 20  # stars of each kind that a table shows; JSON has all
 
 
 def print_verification(found: Verification) -> None:
@@ -167,9 +166,16 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     _print_changes("Spec", found.spec)
     _print_changes("Sources", found.sources)
     _print_changes("Software", found.software)
-    _print_one_sided(f"{len(found.came):,} stars came", found.came)
-    _print_one_sided(f"{len(found.went):,} stars went", found.went)
-    _print_moved(found.moved)
+    one_sided = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
+    _print_stars("came", found.came, one_sided)
+    _print_stars("went", found.went, one_sided)
+    moved = {
+        "star": "{0.designation}",
+        "arcsec": "{0.moved_arcsec:.4f}",
+        "mag A": "{0.mag_a:.2f}",
+        "mag B": "{0.mag_b:.2f}",
+    }
+    _print_stars("moved", found.moved, moved)
     print_table(
         "Products",
         ("product", f"rows of {name_a}", f"rows of {name_b}", "content"),
@@ -187,27 +193,12 @@ def _print_changes(title: str, changes: Sequence[Change], a: str = "A", b: str =
         print_table(title, ("", a, b), rows)
 
 
-def _print_one_sided(title: str, stars: Sequence[OneSided]) -> None:
-    columns = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
-    _print_stars(title, stars, columns, numbers=(1,))
-
-
-def _print_moved(stars: Sequence[Moved]) -> None:
-    columns = {
-        "star": "{0.designation}",
-        "arcsec": "{0.moved_arcsec:.4f}",
-        "mag A": "{0.mag_a:.2f}",
-        "mag B": "{0.mag_b:.2f}",
-    }
-    _print_stars(f"{len(stars):,} stars moved", stars, columns, numbers=(1, 2, 3))
-
-
-def _print_stars(
-    title: str, stars: Sequence[Any], columns: Mapping[str, str], numbers: Sequence[int]
-) -> None:
+def _print_stars(what: str, stars: Sequence[Any], columns: Mapping[str, str]) -> None:
     if stars:
         more = f" (first {MAX_STARS})" if len(stars) > MAX_STARS else ""
-        print_things(title + more, stars[:MAX_STARS], columns, numbers, nothing="-")
+        title = f"{len(stars):,} stars {what}{more}"
+        numbers = [k for k, cell in enumerate(columns.values()) if cell.endswith("f}")]
+        print_things(title, stars[:MAX_STARS], columns, numbers, nothing="-")
 
 
 def print_rebuilt(rebuilt: Rebuilt) -> None:

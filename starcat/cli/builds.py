@@ -58,7 +58,9 @@ def build(
     ] = 2,
     max_memory: Annotated[
         float | None,
-        typer.Option(min=0.1, help="GiB; refuse a build that takes more. Default: what is left."),
+        typer.Option(
+            min=0.1, help="GiB; refuse a build that needs more. Default: the free memory."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -105,18 +107,9 @@ def _build_remotely(
     warn(report["warnings"])
     artifact = open_artifact(folder)
     if as_json:
-        kept = ("filters", "coverage", "self_test", "warnings")
-        print_json(
-            {
-                "artifact": str(folder),
-                "report": str(folder / "report" / "index.html"),
-                "outcome": outcome,
-                "database": database,
-                "job": job["id"],
-                **{key: report[key] for key in kept},
-                **{key: artifact.manifest[key] for key in ("sources", "products", "files")},
-            }
-        )
+        facts = {key: report[key] for key in ("filters", "coverage", "self_test", "warnings")}
+        facts = {"database": database, "job": job["id"], **facts}
+        _print_facts(folder, outcome, artifact.manifest, facts)
         return
     print_artifact(artifact)
     print_rates(list(map(rates_of, report["self_test"])))
@@ -124,35 +117,37 @@ def _build_remotely(
     say(f"database {database} of {client.url}")
 
 
+def _print_facts(
+    folder: Path, outcome: str, manifest: dict[str, Any], facts: dict[str, Any]
+) -> None:
+    report = folder / "report" / "index.html"
+    where = {"artifact": str(folder), "report": str(report), "outcome": outcome}
+    contents = {key: manifest[key] for key in ("sources", "products", "files")}
+    print_json({**where, **facts, **contents})
+
+
 def print_built(built: Built, *, as_json: bool) -> None:
     """Print what a build made."""
-    manifest, report = built.manifest, built.folder / "report" / "index.html"
     warn(built.warnings)
     if as_json:
-        print_json(
-            {
-                "artifact": str(built.folder),
-                "report": str(report),
-                "outcome": built.outcome,
-                "filters": [vars(step) for step in built.filters],
-                "coverage": built.coverage.as_dict(),
-                "self_test": [rates.as_dict() for rates in built.rates],
-                "warnings": list(built.warnings),
-                "times_s": built.times_s,
-                **{key: manifest[key] for key in ("sources", "products", "files")},
-            }
-        )
+        facts = {
+            "filters": [vars(step) for step in built.filters],
+            "coverage": built.coverage.as_dict(),
+            "self_test": [rates.as_dict() for rates in built.rates],
+            "warnings": list(built.warnings),
+            "times_s": built.times_s,
+        }
+        _print_facts(built.folder, built.outcome, built.manifest, facts)
         return
     _print_contents(built)
     seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
     print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
     print_problems(built.problems)
     say(f"{built.outcome}: {built.folder}")
-    say(f"report: {report}")
+    say(f"report: {built.folder / 'report' / 'index.html'}")
 
 
 def _print_contents(built: Built) -> None:
-    """Print what went into a build, what it made and how that identifies."""
     manifest = built.manifest
     for source in manifest["sources"]:
         _print_records(f"{source['source']} ({source['role']})", source)

@@ -72,14 +72,11 @@ def _cells(fit: Fit, name: str) -> tuple[str, str]:
     return f"{fit.values[PARAMETERS.index(name)]:.{digits}f}", f"{error:.{digits}f}"
 
 
-def _terms(free: tuple[str, ...]) -> str:
-    return " + ".join(word for name in free if (word := _SHORT.get(name, name)))
-
-
 def _model(trial: Trial) -> tuple[str, ...]:
     worse = "" if trial.worse_error_px2 == 0.0 else _in_errors(trial)
+    terms = (_SHORT.get(name, name) for name in trial.free)
     return (
-        _terms(trial.free),
+        " + ".join(filter(None, terms)),
         f"{trial.held_out_px:.4f}",
         worse if trial.worse_px2 else "best",
         "chosen" if trial.is_chosen else "",

@@ -99,9 +99,7 @@ def ingest(
     inputs: Annotated[
         list[str] | None,
         typer.Option(
-            "--input",
-            metavar="[SOURCE=]PATH",
-            help="File or folder of the catalog. Repeatable.",
+            "--input", metavar="[SOURCE=]PATH", help="File or folder of the catalog. Repeatable."
         ),
     ] = None,
     to: ToFormat = "parquet",
@@ -192,10 +190,10 @@ def crossmatch(
 
 
 def _source_facts() -> list[dict[str, Any]]:
-    """Return the data sources and where each would be read from."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import locate
 
+    names = ("name", "kind", "identifier", "rows", "bands", "epoch_jyear", "licence", "citation")
     found: list[dict[str, Any]] = []
     for name in source_names():
         source = data_source(name)
@@ -203,19 +201,8 @@ def _source_facts() -> list[dict[str, Any]]:
             place = ", ".join(str(path) for path in locate(name, {}))
         except SourceError:
             place = ""
-        found.append(
-            {
-                "name": name,
-                "kind": source.kind,
-                "identifier": source.identifier,
-                "rows": source.rows,
-                "bands": list(source.bands),
-                "epoch_jyear": source.epoch_jyear,
-                "licence": source.licence,
-                "citation": source.citation,
-                "found_at": place or None,
-            }
-        )
+        facts = {fact: getattr(source, fact) for fact in names}
+        found.append({**facts, "found_at": place or None})
     return found
 
 
@@ -256,13 +243,9 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
 def print_stored(made: Stored, *, as_json: bool) -> None:
     """Print what became of the records of a catalog that was read into a store."""
     manifest = made.manifest
+    names = ("source", "band", "rows_read", "kept", "rejected", "files")
     facts = {
-        "source": manifest["source"],
-        "band": manifest["band"],
-        "rows_read": manifest["rows_read"],
-        "kept": manifest["kept"],
-        "rejected": manifest["rejected"],
-        "files": manifest["files"],
+        **{name: manifest[name] for name in names},
         "store": str(made.folder),
         "outcome": made.outcome,
         "partitions": len(manifest["partitions"]),
@@ -274,7 +257,6 @@ def print_stored(made: Stored, *, as_json: bool) -> None:
 
 
 def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
-    """Print what was read, kept and rejected, and where it is."""
     for note in facts["notes"]:
         say(f"note: {note}")
     if as_json:

@@ -17,9 +17,7 @@ if TYPE_CHECKING:
     from starcat.evaluation.run import Evaluation
 
 app = typer.Typer()
-
-METAVAR = "VALUE[,VALUE...]"
-"""Form of what is said of a quantity that a sweep varies."""
+METAVAR = "VALUE[,VALUE...]"  # form of what is said of a quantity that a sweep varies
 
 Folder = Annotated[
     Path | None, typer.Argument(help="The folder <name>-<version>; or else --paper.")

@@ -92,8 +92,7 @@ def export(
         show(json, image.as_dict(), print_exported_image, image)
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
-    from starcat.exchange.export import export_tables, tables_of
-    from starcat.exchange.hats import MAX_ROWS
+    from starcat.exchange.export import MAX_ROWS, export_tables, tables_of
     from starcat.exchange.peers import peer_tables
 
     exported = export_tables(
@@ -111,7 +110,6 @@ def export(
 
 
 def _refuse(form: str, options: Mapping[str, object]) -> None:
-    """Refuse options that a format has no use for."""
     for name, value in options.items():
         if value is not None:
             option = f"--{name.replace('_', '-')}"

@@ -34,8 +34,7 @@ from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__
 
-INTERRUPTED = 128 + signal.SIGINT
-"""Exit code after Ctrl-C, as the shells have it."""
+INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C, as the shells have it
 
 
 class WholeSummaries(TyperGroup):
@@ -88,8 +87,7 @@ def _options(
         bool, typer.Option("--debug", help="Show the traceback of errors; anywhere on the line.")
     ] = False,
     server: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="A service that builds, asks or identifies instead."),
+        str | None, typer.Option(metavar="URL", help="Address of a service that runs the command.")
     ] = None,
     token: Annotated[
         str | None,

@@ -18,8 +18,7 @@ from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame
 from starcat.sky.in_time import SkyInTime
 
-NAMED = 3
-"""Frames that are named where some were not identified."""
+NAMED = 3  # frames that are named where some were not identified
 
 
 @dataclass
@@ -52,7 +51,7 @@ class Tally:
 
 
 def print_answers(
-    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool = False
+    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool
 ) -> Tally:
     """Print the answers to the frames of a file."""
     tally, kept = Tally(), []
@@ -77,7 +76,7 @@ def print_answers(
 
 
 def print_contents(
-    contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool = False
+    contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool
 ) -> Tally:
     """Print the answers that a service gives to the frames of a file."""
     tally = Tally()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli import options as opt
+from starcat.cli.console import print_json, print_things, progress_bars, say, show
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
@@ -52,7 +53,6 @@ def methods(json: opt.Json = False) -> None:
 
     Example: starcat methods
     """
-    from starcat.cli.console import print_things, show
     from starcat.matcher.methods.table import METHODS
 
     rows = [
@@ -77,7 +77,6 @@ def simulate(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
-    from starcat.cli.console import print_json
     from starcat.cli.matches import simulated_facts
     from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
@@ -145,24 +144,12 @@ def identify(
 
 
 def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
-    """Return the answers to the frames of a file, by the options of the command line."""
-    from starcat.images.solve_files import (
-        IdentifyOptions,
-        LocalInputs,
-        identify_file,
-        open_matcher,
-    )
+    from starcat.images.solve_files import IdentifyOptions, LocalInputs, identify_file, open_matcher
     from starcat.specs.camera_file import read_camera
 
-    prior = opt.chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    error = opt.share_of_percent(given["fov_error"])
-    size_px, fov_deg = opt.unknown_field(given["size"], given["fov"], given["fov_error"])
-    options = {name: given[name] for name in IdentifyOptions.model_fields if name in given}
-    options |= {"fov_error": error, "size_px": size_px, "fov_deg": fov_deg}
-    options |= {"camera": None, "prior_q": prior[0] if prior else None}
     # The command line has checked what its options may be, and calls them by their own names.
-    chosen = IdentifyOptions.model_construct(**options)
+    chosen = IdentifyOptions.model_construct(**opt.identify_options(given), camera=None)
     matcher, path = open_matcher(artifact, chosen), given["camera"]
     local = LocalInputs(
         camera=read_camera(path) if path else None,
@@ -175,8 +162,6 @@ def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileA
 def _print_file_answers(
     answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
 ) -> Tally:
-    """Print answers with what a user should know of them, and write what is asked for beside."""
-    from starcat.cli.console import say
     from starcat.cli.matches import print_answers
     from starcat.images.image_file import expect_room_for_wcs
 
@@ -222,14 +207,13 @@ def calibrate(
     """
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
-    from starcat.cli.console import progress_bars
     from starcat.images.figure_file import check_kind
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
     known = read_camera(camera) if camera else None
-    size_px, fov_deg = opt.size_in_px(size), opt.field_range(fov)
+    size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
         found = calibrate_files(
             Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
@@ -255,7 +239,6 @@ def selftest(
     Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 100
     """
     from starcat.cli.builds import print_rates
-    from starcat.cli.console import progress_bars, show
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, overload
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -158,14 +158,8 @@ def camera_of_options(
         raise what_is_wrong(error, "camera") from error
 
 
-@overload
-def size_in_px(text: str) -> tuple[int, int]: ...
-@overload
-def size_in_px(text: str | None) -> tuple[int, int] | None: ...
-def size_in_px(text: str | None) -> tuple[int, int] | None:
+def size_in_px(text: str) -> tuple[int, int]:
     """Return the width and height of a ``--size``."""
-    if text is None:
-        return None
     found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
     if found is None:
         raise ConfigError(f"--size {text!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
@@ -206,7 +200,7 @@ def unknown_field(
         raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
     if size is not None and fov is None:
         raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
-    return size_in_px(size), field_range(fov)
+    return None if size is None else size_in_px(size), field_range(fov)
 
 
 def share_of_percent(text: str | None) -> float | None:
@@ -284,3 +278,19 @@ def chosen_prior(
             f"--prior-q {text!r} is not X,Y,Z,W, four numbers such as 0.1,-0.2,0.3,0.9"
         ) from error
     return [x, y, z, w], error_deg
+
+
+def identify_options(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a command line says of `IdentifyOptions`, by their names; not the camera."""
+    from starcat.images.solve_files import IdentifyOptions
+
+    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
+    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
+    options = {name: given.get(name) for name in IdentifyOptions.model_fields if name != "camera"}
+    return {
+        **options,
+        "prior_q": prior[0] if prior else None,
+        "fov_error": share_of_percent(given["fov_error"]),
+        "size_px": size_px,
+        "fov_deg": fov_deg,
+    }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What is asked, and how the answer is wanted."""
+class Question:
+    """A question in SQL, and how its answer is wanted."""
 
     query: str | None = None  # SQL
     named: str | None = None  # a query of the gallery instead
@@ -34,21 +33,21 @@ class Wish:
     output: Path | None = None  # file to write
 
 
-def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> None:
+def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int) -> None:
     """Answer a question, or ask for questions where there is none."""
-    form = format_of_wish(wish)
-    query, values = _query(wish, len(targets))
+    form = format_of_answer(question)
+    query, values = _query(question, len(targets))
     with opened(targets, limits) as session:
         if query is not None:
-            _give(session, query, values, form, wish.output, rows)
+            _give(session, query, values, form, question.output, rows)
         elif sys.stdin.isatty():
             prompt(session, rows)
         else:
             texts = session.statements(sys.stdin.read())
-            if wish.output is not None and len(texts) > 1:
+            if question.output is not None and len(texts) > 1:
                 raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
             for text in texts:
-                _give(session, text, values, form, wish.output, rows)
+                _give(session, text, values, form, question.output, rows)
 
 
 @contextmanager
@@ -60,34 +59,34 @@ def opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
         yield session
 
 
-def format_of_wish(wish: Wish) -> str:
+def format_of_answer(question: Question) -> str:
     """Return the format that an answer is wanted in."""
-    if wish.form in (None, "table") and wish.output is None:
+    if question.form in (None, "table") and question.output is None:
         return "table"
     from starcat.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
 
-    form = wish.form or (format_of(wish.output) if wish.output else "table")
+    form = question.form or (format_of(question.output) if question.output else "table")
     if form not in ("table", *FILE_FORMATS):
         raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
-    if wish.output is None and form not in ("table", *TEXT_FORMATS):
+    if question.output is None and form not in ("table", *TEXT_FORMATS):
         raise QueryError(f"--format {form} is no text for a terminal; give a file with -o")
-    if wish.output is not None and form == "table":
+    if question.output is not None and form == "table":
         raise QueryError("--format table goes to the terminal; leave out -o, or choose csv")
     return form
 
 
-def _query(wish: Wish, targets: int) -> tuple[str | None, Mapping[str, Any]]:
+def _query(question: Question, targets: int) -> tuple[str | None, Mapping[str, Any]]:
     if not targets:
         raise QueryError(
             "name what the query is about: an artifact's folder, a Parquet file or an archive "
             'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"'
         )
-    if wish.named is None:
-        return wish.query, {name: guessed(text) for name, text in wish.values.items()}
-    query = named_query(wish.named)
+    if question.named is None:
+        return question.query, {name: guessed(text) for name, text in question.values.items()}
+    query = named_query(question.named)
     if query.targets != targets:
         raise QueryError(f"{query.name} is about {query.targets} targets; {targets} given")
-    return query.text, query.with_values(wish.values)
+    return query.text, query.with_values(question.values)
 
 
 def _give(
@@ -156,7 +155,7 @@ def print_views(session: Session, *, as_json: bool) -> None:
         return
     names = [f"{target.name}.{view.name}" for target, view in views]
     rows = [
-        (name, _row_count(session, name), _first_sentence(_description(view)))
+        (name, _row_count(session, name), view.schema.summary if view.schema else "")
         for name, (_, view) in zip(names, views, strict=True)
     ]
     print_table("", ["view", "rows", "a row"], rows, (1,))
@@ -167,20 +166,12 @@ def _view_facts(target: Target, view: View) -> dict[str, Any]:
     return {
         "schema": target.name,
         "view": view.name,
-        "description": _description(view),
+        "description": view.schema.description if view.schema else "",
         "columns": [
             {"name": c.name, "dtype": c.dtype, "unit": c.unit, "description": c.description}
             for c in columns
         ],
     }
-
-
-def _description(view: View) -> str:
-    return view.schema.description if view.schema else ""
-
-
-def _first_sentence(text: str) -> str:
-    return re.split(r"[.:;] ", text)[0].rstrip(".")
 
 
 def _row_count(session: Session, view: str) -> int:
@@ -201,7 +192,6 @@ def print_macros(*, as_json: bool) -> None:
 
 
 def _print_entry(title: str, paragraphs: Sequence[str]) -> None:
-    """Print a title, and paragraphs below it that are indented."""
     indented = (textwrap.indent(textwrap.fill(text, MAX_WIDTH - 4), "    ") for text in paragraphs)
     sys.stdout.write("\n".join([title, *indented, "\n"]))
 

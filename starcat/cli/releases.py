@@ -45,13 +45,16 @@ def pull(
         typer.Argument(metavar="NAME@VERSION", help="Or NAME@latest, or NAME for the latest."),
     ] = None,
     registry: Annotated[
-        str | None, typer.Option(help="Folder or http(s) address; default: what the lock says.")
+        str | None, typer.Option(help="Folder or http(s) address; default: that of the lock file.")
     ] = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
     ] = Path("dist"),
     locked: Annotated[
-        bool, typer.Option("--locked", help="Exactly what the lock says: one artifact, or all.")
+        bool,
+        typer.Option(
+            "--locked", help="Pull the versions pinned in the lock file: one artifact, or all."
+        ),
     ] = False,
     lock: Annotated[Path, typer.Option(help="File that pins versions by digest.")] = Path(
         "starcat.lock"

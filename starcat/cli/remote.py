@@ -14,9 +14,8 @@ from starcat.cli.console import say
 from starcat.errors import ConfigError, QueryError
 
 if TYPE_CHECKING:
+    from starcat.cli.queries import Question
     from starcat.client import Client
-
-COMMANDS = ("build", "sql", "identify")
 
 LOCAL_OPTIONS = {
     "build": ("inputs", "replace", "workers", "max_memory"),
@@ -25,13 +24,6 @@ LOCAL_OPTIONS = {
 }
 """Options that a service does not take."""
 
-REMOTE_IDENTIFY_OPTIONS = (
-    *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
-    *("min_share", "max_steps", "time_limit_s", "flip", "psf_sigma_px", "threshold"),
-    *("most_spots", "plane", "bayer", "prior_error_deg"),
-)
-"""Options of identify that a service takes under the same name."""
-
 
 def open_remote(url: str, token: str | None, command: str) -> Client:
     """Return the service that a command line names."""
@@ -39,10 +31,10 @@ def open_remote(url: str, token: str | None, command: str) -> Client:
         raise ConfigError(
             f"--server {url!r}: expected an address such as http://127.0.0.1:8000", key="server"
         )
-    if command not in COMMANDS:
+    if command not in LOCAL_OPTIONS:
         raise ConfigError(
             f"--server does not go with 'starcat {command}', which runs here; it goes with "
-            + ", ".join(COMMANDS),
+            + ", ".join(LOCAL_OPTIONS),
             key="server",
         )
     from starcat.client import Client
@@ -51,42 +43,38 @@ def open_remote(url: str, token: str | None, command: str) -> Client:
 
 
 def sql_remotely(
-    context: typer.Context,
-    targets: list[str],
-    query: str | None,
-    named: str | None,
-    values: Mapping[str, str],
-    form: str | None,
-    output: Path | None,
-    rows: int,
-    time_limit_s: float,
+    context: typer.Context, targets: list[str], question: Question, rows: int, time_limit_s: float
 ) -> None:
-    """Ask a service a question in SQL, and print or keep the answer."""
-    from starcat.cli.queries import Wish, format_of_wish, print_result
+    """Ask a service a question in SQL, and print or write the answer."""
+    from starcat.cli.queries import format_of_answer, print_result
     from starcat.query.gallery import guessed
     from starcat.query.result import ResultTable
 
-    client = service_of(context)
-    if query is None and named is None:
+    client, output, named = service_of(context), question.output, question.named
+    if question.query is None and named is None:
         raise QueryError("--server needs the query on the line, or --named; there is no prompt")
     if not targets:
         raise QueryError("name what the query is about: the id or the title of a database")
-    wanted = format_of_wish(Wish(query, named, values, form, output))
-    texts = dict(values) if named else {name: guessed(text) for name, text in values.items()}
-    if wanted == "table":
-        found = client.sql(
-            targets, query, texts, named=named, max_rows=rows, time_limit_s=time_limit_s
-        )
-        print_result(ResultTable.from_json(found))
+    form = format_of_answer(question)
+    values: dict[str, Any] = dict(question.values)
+    if named is None:
+        values = {name: guessed(text) for name, text in values.items()}
+    asked: dict[str, Any] = {
+        "targets": targets,
+        "query": question.query,
+        "values": values,
+        "named": named,
+        "time_limit_s": time_limit_s,
+    }
+    if form == "table":
+        print_result(ResultTable.from_json(client.sql(**asked, max_rows=rows)))
         return
-    asked = (targets, query, texts)
     if output is not None:
-        count = client.sql_file(output, wanted, *asked, named=named, time_limit_s=time_limit_s)
-        say(f"{output}: {count:,} rows")
+        say(f"{output}: {client.sql_file(output, form, **asked):,} rows")
         return
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         path = Path(folder) / "answer"
-        client.sql_file(path, wanted, *asked, named=named, time_limit_s=time_limit_s)
+        client.sql_file(path, form, **asked)
         sys.stdout.write(path.read_text(encoding="utf-8"))
 
 
@@ -117,24 +105,15 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
 
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    from starcat.cli.options import chosen_prior, share_of_percent, unknown_field
+    from starcat.cli.options import identify_options
 
-    options = {name: given[name] for name in REMOTE_IDENTIFY_OPTIONS if given[name] is not None}
-    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=False)
-    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
     camera: Path | None = given["camera"]
     try:
         text = None if camera is None else camera.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{camera}: cannot be read ({error})", key="camera") from error
-    more = {
-        "prior_q": None if prior is None else prior[0],
-        "size_px": size_px,
-        "fov_deg": fov_deg,
-        "fov_error": share_of_percent(given["fov_error"]),
-        "camera": text,
-    }
-    return options | {name: value for name, value in more.items() if value is not None}
+    options = identify_options(given) | {"camera": text}
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _of_stdin(folder: Path) -> Path:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from starcat.cli.console import print_json, print_json_line, print_table, say, show
 from starcat.cli.options import Json
 from starcat.errors import ConfigError, TargetMissing
 
@@ -19,21 +19,13 @@ if TYPE_CHECKING:
 app = typer.Typer()
 tokens = typer.Typer(
     name="token",
-    help="Make, list and revoke the tokens that say who may do what.\n\n"
+    help="Create, list and revoke tokens, which set a user's permissions.\n\n"
     "Example: starcat token create anna --role builder --root service",
     no_args_is_help=True,
 )
 app.add_typer(tokens)
 
-Root = Annotated[Path, typer.Option(help="Folder with all that the service keeps.")]
-
-
-class RoleName(StrEnum):
-    """What somebody with a token may do."""
-
-    reader = "reader"
-    builder = "builder"
-    publisher = "publisher"
+Root = Annotated[Path, typer.Option(help="Folder with all data of the service.")]
 
 
 @app.command()
@@ -54,14 +46,11 @@ def serve(
 
     Example: starcat serve --root service --port 8000
     """
-    try:
+    with _service_installed():
         from starcat.service.server import run_server
-    except ModuleNotFoundError as error:
-        raise _not_installed(error) from error
     from starcat.service.settings import read_settings
 
     def announce(address: str) -> None:
-        from starcat.cli.console import print_json_line, say
 
         if json:
             print_json_line({"address": address, "root": str(root)})
@@ -75,7 +64,8 @@ def serve(
 def create(
     name: Annotated[str, typer.Argument(help="Of who gets it: letters, digits and ._@-.")],
     role: Annotated[
-        RoleName, typer.Option(help="A builder may also read, a publisher also build.")
+        Literal["reader", "builder", "publisher"],
+        typer.Option(help="A builder may also read, a publisher also build."),
     ],
     expires: Annotated[
         float | None, typer.Option(min=0.001, metavar="DAYS", help="Days that it is valid.")
@@ -88,10 +78,9 @@ def create(
     Example: starcat token create anna --role builder --expires 365 --root service
     """
     with _tokens_of(root, name) as store:
-        from starcat.service.access import Role
+        from starcat.service.settings import Role
 
         token, text = store.create(name, Role.named(role), expires)
-    from starcat.cli.console import print_json, say
 
     if json:
         print_json({**token.as_dict(), "token": text})
@@ -125,7 +114,6 @@ def revoke(
 
 
 def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
-    from starcat.cli.console import print_table, show
 
     rows = [token.as_dict() for token in found]
     columns = ("id", "name", "role", "state", "created", "expires")
@@ -136,12 +124,10 @@ def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
 @contextmanager
 def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
     """Return the tokens of a service, which is made where a new one is to be its first."""
-    try:
+    with _service_installed():
         from starcat.service.paths import ServicePaths
         from starcat.service.records import Records
         from starcat.service.security.tokens import TokenStore, check_name
-    except ModuleNotFoundError as error:
-        raise _not_installed(error) from error
     from starcat.service.settings import read_settings
 
     paths = ServicePaths(read_settings(root).root)
@@ -157,7 +143,11 @@ def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
         records.close()
 
 
-def _not_installed(error: ModuleNotFoundError) -> ConfigError:
-    return ConfigError(
-        f"the service needs {error.name}: python -m pip install 'starcat-guide-stars[service]'"
-    )
+@contextmanager
+def _service_installed() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the service needs {error.name}: python -m pip install 'starcat-guide-stars[service]'"
+        ) from error

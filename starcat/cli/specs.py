@@ -213,12 +213,7 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
             }
         )
         return
-    rows = {**cost.rows, "stars": cost.stars, "boresights": cost.fields}
-    rows["rejected"] = sum(found.rejected.values())
-    files = [
-        (name, rows.get(name.removesuffix(".parquet")), size) for name, size in cost.files.items()
-    ]
-    files.append(("all files", None, found.total_bytes))
+    files = [*found.files, ("all files", None, found.total_bytes)]
     title = f"{found.spec.name}-{found.spec.version}, by estimate"
     columns = {"file": "{0[0]}", "rows": "{0[1]:,}", "bytes": "{0[2]:,}"}
     print_things(title, files, columns, numbers=(1, 2))

@@ -31,7 +31,7 @@ Values = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
 ]
 OutputFile = Annotated[
-    Path | None, typer.Option("--output", "-o", help="File; its suffix says the format.")
+    Path | None, typer.Option("--output", "-o", help="File; its suffix selects the format.")
 ]
 FormatName = Annotated[
     str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
@@ -70,30 +70,29 @@ def sql(
 
         (print_gallery if show_list else print_macros)(as_json=json)
         return
-    if context.obj is not None:
-        from starcat.cli.remote import sql_remotely
+    if context.obj is None:
+        from starcat.query.engine import warm_up
 
-        targets, query = _split(arguments or [], named)
-        wanted = form or ("json" if json else None)
-        there = (targets, query, named, dict(_set(values)), wanted, output, rows, time_limit_s)
-        sql_remotely(context, *there)
-        return
-    from starcat.query.engine import warm_up
-
-    warm_up()  # it starts while the rest is imported
-    from starcat.cli.queries import Wish, answer, opened, print_views
+        warm_up()  # it starts while the rest is imported
+    from starcat.cli.queries import Question, answer, opened, print_views
+    from starcat.cli.remote import sql_remotely
     from starcat.query.session import Limits, preamble_of
 
     limits = Limits(time_limit_s, memory_limit_gb)
     targets, query = _split(arguments or [], named)
-    if preamble:
+    if context.obj is None and preamble:
         typer.echo(preamble_of(targets))
-    elif show_views:
+        return
+    if context.obj is None and show_views:
         with opened(targets, limits) as session:
             print_views(session, as_json=json)
+        return
+    form = form or ("json" if json else None)
+    question = Question(query, named, dict(_set(values)), form, output)
+    if context.obj is not None:
+        sql_remotely(context, targets, question, rows, time_limit_s)
     else:
-        wish = Wish(query, named, dict(_set(values)), form or ("json" if json else None), output)
-        answer(targets, wish, limits, rows)
+        answer(targets, question, limits, rows)
 
 
 def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | None]:

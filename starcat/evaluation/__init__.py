@@ -1,1 +1,1 @@
-"""Room 5: simulated skies, and how often and how well they are identified."""
+"""Simulated skies, and how often and how well they are identified."""

@@ -79,7 +79,7 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
-        labels = {group: _axis(rows) for group, rows in self._groups.items()}
+        labels = {one.row.group: self._axis(one.row.group) for one in self.rows}
         return {
             "name": self.paper.name,
             "title": self.paper.title,
@@ -92,12 +92,10 @@ class Outcome:
             ],
         }
 
-    @property
-    def _groups(self) -> dict[str, list[Row]]:
-        groups: dict[str, list[Row]] = {}
-        for one in self.rows:
-            groups.setdefault(one.row.group, []).append(one.row)
-        return groups
+    def _axis(self, group: str) -> str:
+        rows = [one.row for one in self.rows if one.row.group == group]
+        points = [(row.experiment, row.x) for row in rows if row.x is not None]
+        return axis_label([experiment for experiment, _ in points], [x for _, x in points])
 
 
 def is_goal_reached(statistic: Statistic) -> bool | None:
@@ -196,11 +194,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _axis(rows: list[Row]) -> str:
-    points = [(row.experiment, row.x) for row in rows if row.x is not None]
-    return axis_label([experiment for experiment, _ in points], [x for _, x in points])
 
 
 def _plain(value: Any) -> Any:

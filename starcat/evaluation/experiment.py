@@ -300,8 +300,7 @@ class Paper:
     title: str  # what it is about; who, where, when
     citation: str
     presets: tuple[str, ...]  # artifacts that it needs
-    # for a quick run (True) with fewer frames
-    rows: Callable[[bool], list[Row]] = lambda quick: []
+    rows: Callable[[bool], list[Row]] = lambda quick: []  # for a quick run (True) with fewer frames
     # from the artifacts' folders by preset
     statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
     deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead
@@ -310,6 +309,15 @@ class Paper:
 def tolerance_for(noise_px: float) -> float:
     """Return the tolerance that a matcher is given for a position noise."""
     return max(1.0, 3.0 * noise_px)
+
+
+def paper_experiment(
+    name: str, method: str, attitudes: Attitudes, noise: Noise, **others: Any
+) -> Experiment:
+    """Return an experiment of a paper, whose answers may be less certain than starcat's own."""
+    usual = {"tolerance_px": tolerance_for(noise.noise_px), "max_false_match_probability": 1e-3}
+    slug = name.lower().replace(" ", "-").replace(",", "")
+    return Experiment(slug, method, attitudes, noise, **{**usual, **others})
 
 
 def product_mib(artifact: Path, product: str) -> float:

@@ -22,7 +22,6 @@ from starcat.evaluation.campaign import run_paper
 from starcat.evaluation.experiment import Paper, code_sha256
 from starcat.evaluation.papers import s1, s2, s3, s4, s5
 from starcat.evaluation.report.files import RESULTS, write_evaluation
-from starcat.evaluation.report.files import write_reproduction as write_page
 from starcat.evaluation.sweep import Sweep, sweep_paper
 from starcat.pipeline.build import Inputs, build
 from starcat.progress import Progress, no_progress
@@ -121,11 +120,6 @@ def evaluate_artifact(
     contents = with_earlier(folder / RESULTS, content, sweep.artifact)
     page = write_evaluation(folder, f"{paper.name}, evaluated", contents, _machine())
     return Evaluation((content,), page)
-
-
-def write_reproduction(output: Path, docs: Path) -> Path:
-    """Write ``reproduction.md`` and its figures from the full run of all papers."""
-    return write_page(output / "all" / RESULTS, docs)
 
 
 def _quick(name: str, is_quick: bool) -> str:

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
+from starcat.matcher.stars import ARCSEC
 from starcat.simulation.simulate import Frame
 
 
@@ -98,13 +99,7 @@ def _attitude_errors(truth: Array, q: Array, camera: Camera) -> tuple[float, flo
     """Return the errors of an attitude: at the corners (pixels), across and about (arcsec)."""
     if not np.isfinite(q).all():
         return math.nan, math.nan, math.nan
-    turn = matrix_from_quaternion(q) @ truth.T
-    # The antisymmetric part of a small rotation is its angle about each axis.
-    x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
-    arcsec = math.degrees(1.0) * 3600.0
-    right_angle = math.atan2(math.hypot(x, y, z), float(np.trace(turn)) - 1.0)
-    scale = right_angle / max(math.hypot(x, y, z), 1e-300)
-    w, h = float(camera.width_px), float(camera.height_px)
-    corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+    x, y, z = turn_between(quaternion_from_matrix(truth).tolist(), q.tolist())
+    turn, corners = matrix_from_quaternion(q) @ truth.T, camera.corner_directions
     moved = np.linalg.norm(corners @ turn.T - corners, axis=1).max() * camera.focal_length_px
-    return float(moved), arcsec * scale * math.hypot(x, y), arcsec * scale * abs(z)
+    return float(moved), ARCSEC * math.hypot(x, y), ARCSEC * abs(z)

@@ -168,13 +168,7 @@ class Sweep:
 
 
 def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:
-    """Read the values that a user gives to quantities.
-
-    Examples
-    --------
-    >>> sweep_values(noise_px="0,0.5,1", k1=None)
-    {'noise_px': (0.0, 0.5, 1.0)}
-    """
+    """Read the values that a user gives to quantities."""
     values = {}
     for name, text in texts.items():
         if text is None:

@@ -33,12 +33,10 @@ from starcat.exchange.columns import (
     check_names,
     column_error,
     field_facts,
-    is_list,
-    is_number,
     plain_schema,
     unit_text,
 )
-from starcat.exchange.text import list_items, plain_values
+from starcat.exchange.text import cells_of
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -72,19 +70,16 @@ class NumpyColumn:
         """Whether the values are texts."""
         return self.values.dtype == np.object_
 
-    def lists(self) -> list[NDArray[Any]]:
+    def lists(self) -> NDArray[np.object_]:
         """Return the items of each row of a ragged column."""
-        if self.offsets is None:
-            raise ValueError(f"{self.name}: its rows are no lists")
-        return np.split(self.values, self.offsets[1:-1]) if len(self.is_null) else []
+        rows = np.empty(len(self.is_null), dtype=np.object_)
+        if self.offsets is not None and len(rows):
+            rows[:] = np.split(self.values, self.offsets[1:-1])
+        return rows
 
 
 def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
-    """Return the columns of a table as numpy arrays.
-
-    With `signed`, integers are of the types that FITS and VOTable have: bytes without a sign, and
-    16, 32 and 64 bits with one.
-    """
+    """Return the columns of a table as numpy arrays, their integers as `cells_of` gives them."""
     table = table.cast(plain_schema(table.schema))
     return [
         _numpy_column(field, table[field.name].combine_chunks(), signed=signed)
@@ -93,25 +88,21 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
 
 
 def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyColumn:
-    is_null = values.is_null().to_numpy(zero_copy_only=False)
-    offsets = None
-    if is_list(values.type) and is_number(values.type.value_type):
-        offsets, values = list_items(field.name, values)
-    plain = plain_values(field.name, values, signed=signed)
-    return NumpyColumn(field.name, _to_numpy(plain), is_null, offsets, field_facts(field))
+    cells = cells_of(field.name, values, signed=signed)
+    is_null = np.zeros(len(values), np.bool_) if cells.is_null is None else cells.is_null
+    found = _to_numpy(cells.values)
+    return NumpyColumn(field.name, found, is_null, cells.offsets, field_facts(field))
 
 
-def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
-    """Write a table as a FITS file with one binary table; return its rows."""
+def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
+    """Write a table as a FITS file with one binary table."""
     from astropy.io import fits
 
-    columns, rows = _arrays(batches, "fits")
+    columns = _arrays(batches, "fits")
     _check_fits_names(columns)
     heap = sum(column.values.nbytes for column in columns if column.offsets is not None)
     descriptor = "P" if heap <= _HEAP_LIMIT_BYTES else "Q"
-    table = fits.BinTableHDU.from_columns(
-        [_fits_column(column, descriptor) for column in columns], nrows=rows
-    )
+    table = fits.BinTableHDU.from_columns([_fits_column(one, descriptor) for one in columns])
     named = {"EXTNAME": label.table, "ARTIFACT": label.artifact, "VERSION": label.version}
     for key, text in named.items():
         if text:
@@ -122,11 +113,9 @@ def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
             if column.facts.get(fact):
                 table.header[f"{key}{number}"] = _header_text(column.facts[fact])
     fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
-    return rows
 
 
 def _header_text(text: str) -> str:
-    """Return a text as a header may have it: printable ASCII."""
     return "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)
 
 
@@ -160,8 +149,7 @@ def _fits_column(column: NumpyColumn, descriptor: str) -> Any:
         array = _ascii(column)
         code = f"{max(1, array.dtype.itemsize)}A"
     elif column.offsets is not None:
-        array = np.empty(len(column.is_null), dtype=np.object_)
-        array[:] = column.lists()
+        array = column.lists()
         code = f"{descriptor}{_CODES[column.values.dtype.str[1:]]}()"
     else:
         array, null = _with_null(column)
@@ -173,12 +161,10 @@ def _fits_column(column: NumpyColumn, descriptor: str) -> Any:
 def _ascii(column: NumpyColumn) -> NDArray[np.bytes_]:
     for text in column.values:
         if not text.isascii() or "\0" in text:
-            raise column_error(
-                column.name,
-                f": text is ASCII in FITS, and {text!r} is not; leave the "
-                "column out, or export to votable",
-                text,
+            told = (
+                f": text is ASCII in FITS, and {text!r} is not; leave the column out, or export to"
             )
+            raise column_error(column.name, f"{told} votable", text)
     return column.values.astype(np.bytes_) if len(column.values) else np.empty(0, "S1")
 
 
@@ -198,14 +184,13 @@ def _with_null(column: NumpyColumn) -> tuple[NDArray[Any], int | None]:
     return np.where(column.is_null, values.dtype.type(null), values), null
 
 
-def write_ecsv(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
-    """Write a table as ECSV; return its rows."""
-    columns, rows = _arrays(batches, "ecsv")
+def write_ecsv(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
+    """Write a table as ECSV."""
+    columns = _arrays(batches, "ecsv")
     _check_ecsv_texts(columns)
     table = astropy_table(columns)
     table.meta |= {**({"name": label.table} if label.table else {}), **label.origin}
     table.write(path, format="ascii.ecsv", overwrite=True)
-    return rows
 
 
 def astropy_table(columns: list[NumpyColumn]) -> Table:
@@ -226,8 +211,7 @@ def _astropy_column(column: NumpyColumn) -> Any:
     if column.is_text:
         values = values.astype(np.str_)
     elif column.offsets is not None:
-        values = np.empty(len(column.is_null), dtype=np.object_)
-        values[:] = column.lists()
+        values = column.lists()
     said = {
         "unit": unit_text(column.name, facts.get("unit"), "generic"),
         "description": facts.get("description"),
@@ -248,17 +232,15 @@ def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
     for place, column in enumerate(columns):
         for text in [column.name, *(column.values if column.is_text else ())]:
             if _BREAKS.search(text) or (place == 0 and text.startswith("#")):
-                raise column_error(
-                    column.name,
-                    f": readers of ECSV would misread the text {text!r} "
-                    "there; take the character out, or choose another format",
-                    text,
+                told = (
+                    f": readers of ECSV would misread the text {text!r} there; take the character"
                 )
+                raise column_error(column.name, f"{told} out, or choose another format", text)
 
 
-def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
-    """Write a table as an npz file, which has no place for a label; return its rows."""
-    columns, rows = _arrays(batches, "npz")
+def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
+    """Write a table as an npz file, which has no place for a label."""
+    columns = _arrays(batches, "npz")
     # Not numpy.savez: it takes a column named "file" for its own argument.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for column in columns:
@@ -268,11 +250,9 @@ def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
                 _add_array(archive, f"{column.name}.offsets", column.offsets)
             if column.is_null.any():
                 _add_array(archive, f"{column.name}.is_null", column.is_null)
-    return rows
 
 
 def _to_numpy(values: pa.Array) -> NDArray[Any]:
-    """Return values with null as NaN, 0, False or an empty text."""
     if pa.types.is_string(values.type):
         return np.array(pc.fill_null(values, "").to_pylist(), dtype=np.object_)
     if pa.types.is_floating(values.type):
@@ -281,22 +261,17 @@ def _to_numpy(values: pa.Array) -> NDArray[Any]:
     return np.asarray(pc.fill_null(values, nothing).to_numpy(zero_copy_only=False))
 
 
-def _arrays(batches: pa.RecordBatchReader, file_format: str) -> tuple[list[NumpyColumn], int]:
-    table = batches.read_all()
-    columns = numpy_columns(table, signed=file_format == "fits")
-    check_names(table.column_names, file_format)
-    return columns, len(table)
+def _arrays(batches: pa.RecordBatchReader, file_format: str) -> list[NumpyColumn]:
+    columns = numpy_columns(batches.read_all(), signed=file_format == "fits")
+    check_names([column.name for column in columns], file_format)
+    return columns
 
 
 def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
     for text in column.values:
         if text.endswith("\0"):
-            raise column_error(
-                column.name,
-                f": numpy would lose the end of the text {text!r}; take the "
-                "null character out, or choose another format",
-                text,
-            )
+            told = f": numpy would lose the end of the text {text!r}; take the null character out"
+            raise column_error(column.name, f"{told}, or choose another format", text)
     return column.values.astype(np.str_)
 
 

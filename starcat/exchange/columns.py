@@ -9,12 +9,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.errors import SchemaError
 
+STEP_ROWS = 1 << 14
+STEP_BYTES = 8 << 20
+
+_LISTS = (
+    pa.ListType, pa.LargeListType, pa.FixedSizeListType, pa.ListViewType, pa.LargeListViewType
+)  # fmt: skip
 _CASTS = {
     "interval": "epoch(column) for seconds",
     "duration": "epoch(column) for seconds",
@@ -59,19 +66,32 @@ class FirstRows:
         if self.were_more:
             return
         for batch in self._batches:
-            if self._left is None:
-                yield batch
-            elif batch.num_rows <= self._left:
-                self._left -= batch.num_rows
-                yield batch
-            else:
-                self.were_more = True
-                yield batch.slice(0, self._left)
+            given = batch.slice(0, self._left)
+            self.were_more = given.num_rows < batch.num_rows
+            yield given
+            if self.were_more:
                 return
+            if self._left is not None:
+                self._left -= given.num_rows
 
     def reader(self) -> pa.RecordBatchReader:
         """Return the rows as a reader."""
         return pa.RecordBatchReader.from_batches(self._batches.schema, iter(self))
+
+
+def steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    """Yield the rows in steps whose text fits into memory, however large the batches are."""
+    for batch in batches:
+        per_row = max(1, batch.nbytes // max(1, batch.num_rows))
+        rows = min(STEP_ROWS, max(1, STEP_BYTES // per_row))
+        for start in range(0, batch.num_rows, rows):
+            yield batch.slice(start, rows)
+
+
+def begun(batches: pa.RecordBatchReader) -> pa.RecordBatchReader:
+    """Return a reader whose first batch was read."""
+    first = list(islice(batches, 1))
+    return pa.RecordBatchReader.from_batches(batches.schema, chain(first, batches))
 
 
 def column_error(name: str, told: str, found: object = None) -> SchemaError:
@@ -181,7 +201,7 @@ def _plain(kind: pa.DataType, name: str) -> pa.DataType:
         return pa.float32()
     if pa.types.is_struct(kind):
         return pa.struct([f.with_type(_plain(f.type, f"{name}.{f.name}")) for f in kind])
-    if _is_any_list(kind):
+    if isinstance(kind, _LISTS):
         item = kind.value_field
         return pa.list_(item.with_type(_plain(item.type, name)))
     for word, way_out in _CASTS.items():
@@ -193,13 +213,3 @@ def _plain(kind: pa.DataType, name: str) -> pa.DataType:
                 str(kind),
             )
     return kind
-
-
-def _is_any_list(kind: pa.DataType) -> bool:
-    return bool(
-        pa.types.is_list(kind)
-        or pa.types.is_large_list(kind)
-        or pa.types.is_fixed_size_list(kind)
-        or pa.types.is_list_view(kind)
-        or pa.types.is_large_list_view(kind)
-    )

@@ -2,33 +2,41 @@
 
 All files are written beside the folder first; only when each of them is whole do they get their
 names. Formats without room for units get ``columns.csv`` beside them, which says what the
-columns are.
+columns are. HATS catalogs are star tables by HEALPix pixel, which LSDB opens as they are: the table
+is held in memory and has no margin. Catalogs of any size are made by ``starcat ingest --to hats``,
+with the same pixels and the same files beside the partitions.
 """
 
 from __future__ import annotations
 
 import csv
 import filecmp
-import io
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
+from starcat.catalog.stars import floats_of
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
 from starcat.exchange.columns import Label, field_facts
 from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS
-from starcat.exchange.hats import MAX_ROWS, NEEDED, PROPERTIES_NAME, write_hats
 from starcat.exchange.writers import write_batches
 from starcat.storage.atomic import whole_folder
 from starcat.storage.parquet import read_parquet
+from starcat.store.metadata import Described, describe_catalog, write_slices
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
+from starcat.store.plan import partition_pixels
 
 COLUMNS_NAME = "columns.csv"
+NEEDED = ("star_id", "ra_deg", "dec_deg")  # columns of a star table that HATS asks for
+MAX_ROWS = 1_000_000
+PROPERTIES_NAME = "hats.properties"
 COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
 
 
@@ -40,10 +48,6 @@ class NamedTables:
     readers: Mapping[str, Callable[[], pa.Table]]
     artifact: str = ""  # empty where they are of none
     version: str = ""
-
-    def label(self, product: str) -> Label:
-        """Return what an exported file says of its table."""
-        return Label(product, self.artifact, self.version)
 
     def chosen(self, products: Sequence[str] | None) -> list[str]:
         """Return some names, by default all, in the order of the tables."""
@@ -141,7 +145,8 @@ def export_tables(
         for product in tables.chosen(products):
             table = tables.readers[product]()
             if file_format != "hats":
-                files.append(_write_file(table, partial, tables.label(product), file_format))
+                label = Label(product, tables.artifact, tables.version)
+                files.append(_write_file(table, partial, label, file_format))
                 columns += _described(product, table.schema)
             elif products or set(NEEDED) <= set(table.column_names):
                 name = f"{tables.name}-{product}" if product != tables.name else product
@@ -175,18 +180,45 @@ def _write_file(table: pa.Table, folder: Path, label: Label, file_format: str) -
 
 
 def _write_hats(table: pa.Table, folder: Path, name: str, max_rows: int) -> ExportedFile:
-    made = write_hats(table, folder, name, max_rows)
+    rows = write_hats(table, folder, name, max_rows)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    return ExportedFile(folder.name, folder.name, made.rows, size, made.left_out)
+    return ExportedFile(folder.name, folder.name, rows, size, len(table) - rows)
+
+
+def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROWS) -> int:
+    """Write a star table as a HATS catalog; return its rows, which are those with a position."""
+    table = _with_pixels(stars, name)
+    found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
+    partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)
+    written = write_slices(table, partitions, folder, max_rows)
+    describe_catalog(folder, Described(name, "object", written, max_rows, {}), table.schema)
+    return len(table)
+
+
+def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
+    """Return the stars that have a position, by pixel and star."""
+    missing = [column for column in NEEDED if column not in stars.column_names]
+    if missing:
+        raise ConfigError(
+            f"{name}: not a star table, it has no column {', '.join(missing)}; HATS is for star "
+            "tables, choose another format"
+        )
+    ra_deg, dec_deg = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
+    is_placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)
+    if not is_placed.any():
+        raise ConfigError(f"{name}: none of its {len(stars)} rows has a position on the sky")
+    pixels = healpix_29(ra_deg[is_placed], dec_deg[is_placed])
+    placed = stars.filter(pa.array(is_placed))
+    table = placed.add_column(0, pixel_field(), pa.array(pixels)).replace_schema_metadata(None)
+    return table.sort_by([(HEALPIX_COLUMN, "ascending"), ("star_id", "ascending")])
 
 
 def _described(product: str, schema: pa.Schema) -> list[tuple[str, ...]]:
-    described: list[tuple[str, ...]] = []
-    for field in schema:
-        facts = field_facts(field)
-        known = (facts.get("unit", ""), facts.get("description", ""))
-        described.append((product, field.name, _dtype(field.type), *known))
-    return described
+    known = [(field, field_facts(field)) for field in schema]
+    return [
+        (product, one.name, _dtype(one.type), facts.get("unit", ""), facts.get("description", ""))
+        for one, facts in known
+    ]
 
 
 def _dtype(kind: pa.DataType) -> str:
@@ -198,24 +230,23 @@ def _dtype(kind: pa.DataType) -> str:
 def _write_columns(path: Path, before: Path, columns: list[tuple[str, ...]]) -> None:
     """Write what the columns are, and keep what an earlier export said of other products."""
     known = {row[0] for row in columns}
-    kept: Iterable[tuple[str, ...]] = ()
-    if before.is_file():
-        header, *rows = _read_columns(before) or [()]
-        if header == COLUMNS_HEADER:
-            kept = [row for row in rows if row and row[0] not in known]
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([COLUMNS_HEADER, *kept, *columns])
-    path.write_text(text.getvalue(), encoding="utf-8", newline="")
+    header, *rows = _read_columns(before) or [()]
+    others = (
+        [row for row in rows if row and row[0] not in known] if header == COLUMNS_HEADER else []
+    )
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerows([COLUMNS_HEADER, *others, *columns])
 
 
 def _read_columns(path: Path) -> list[tuple[str, ...]]:
+    if not path.is_file():
+        return []
     with path.open(encoding="utf-8", errors="replace", newline="") as stream:
         return [tuple(row) for row in csv.reader(stream)]
 
 
 def _publish(partial: Path, folder: Path, *, replace: bool) -> None:
-    """Give what was written its names in the folder, if all of it may have them."""
     entries = sorted(path.name for path in partial.iterdir())
     for name in entries:
         old, new = folder / name, partial / name
@@ -226,7 +257,7 @@ def _publish(partial: Path, folder: Path, *, replace: bool) -> None:
                 f"{old} already exists and differs; choose another --output, or pass --replace",
                 path=old,
             )
-        if old.is_dir() != new.is_dir() or (old.is_dir() and not _is_hats(old)):
+        if old.is_dir() != new.is_dir() or (old.is_dir() and not (old / PROPERTIES_NAME).is_file()):
             raise OutputError(f"{old} is something else; choose another --output", path=old)
     folder.mkdir(parents=True, exist_ok=True)
     for name in entries:
@@ -234,10 +265,6 @@ def _publish(partial: Path, folder: Path, *, replace: bool) -> None:
         if old.is_dir():
             shutil.move(old, partial / f".{name}.old")
         new.replace(old)
-
-
-def _is_hats(folder: Path) -> bool:
-    return (folder / PROPERTIES_NAME).is_file()
 
 
 def _is_columns(path: Path) -> bool:

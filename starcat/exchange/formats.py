@@ -102,13 +102,7 @@ TAP_FORMATS = tuple(
 
 
 def format_of(path: str | Path) -> FileFormat:
-    """Return the format that the suffix of a file's name asks for, in any case.
-
-    Examples
-    --------
-    >>> format_of("stars.vot")
-    'votable'
-    """
+    """Return the format that the suffix of a file's name asks for, in any case."""
     suffix = Path(path).suffix.lower()
     for name in FILE_FORMATS:
         if suffix in FORMATS[name].suffixes:
@@ -121,13 +115,7 @@ def format_of(path: str | Path) -> FileFormat:
 
 
 def response_format(text: str | None) -> Format:
-    """Return the format that RESPONSEFORMAT of TAP asks for, by name or media type.
-
-    Examples
-    --------
-    >>> response_format("text/csv; header=present").name
-    'csv'
-    """
+    """Return the format that RESPONSEFORMAT of TAP asks for, by name or media type."""
     wanted = "".join((text or "votable").lower().split()).replace('"', "")
     # The plus of a media type that nobody has escaped in an address arrives as a blank.
     wanted = wanted.replace("x-votablexml", "x-votable+xml")

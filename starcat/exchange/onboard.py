@@ -73,9 +73,7 @@ def export_image(
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
         raise ConfigError(
-            f"--endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}",
-            key="endian",
-            value=endian,
+            f"--endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}", key="endian", value=endian
         )
     opened = open_artifact(artifact)
     suffix = ".c" if file_format == "c" else ".img"
@@ -132,7 +130,6 @@ def verify_image(path: Path, against: Path | None = None) -> Verification:
 
 
 def _damage(data: bytes, file: str) -> Iterator[Finding]:
-    """Yield what keeps an image from being read."""
     try:
         read_image(data)
     except OnboardImageError as error:
@@ -168,13 +165,11 @@ def _times_seen(artifact: Artifact, method: str) -> NDArray[np.int32] | None:
 
 
 def _fields(artifact: Artifact) -> FieldStars:
-    """Return the tiling of an artifact's stars, all stars of each field."""
     spec = spec_from_dict(artifact.manifest["spec"], MANIFEST_NAME)
     return tile_guide_stars(artifact.table("stars"), spec)
 
 
 def _c_files(made: MadeImage, name: str, target: Path, byte_order: ByteOrder) -> dict[Path, bytes]:
-    """Return source and header by their paths."""
     header = target.with_suffix(".h")
     source = c_source(name, made.data, byte_order, header.name)
     return {target: source.encode(), header: c_header(name, len(made.data)).encode()}

@@ -64,12 +64,7 @@ def peer_tables(peer: str, path: Path | None) -> NamedTables:
 
 
 def cedar_solve_stars(path: Path) -> pa.Table:
-    """Read the stars of a database of cedar-solve or tetra3.
-
-    References
-    ----------
-    cedar-solve 0.5.1, and the database that it ships.
-    """
+    """Return the stars of a database as cedar-solve 0.5.1 and tetra3 have them."""
     parts = _read_npz(path)
     table = _checked(parts, path)
     origin, epoch_jyear = _origin(parts.get("props_packed"))
@@ -123,52 +118,42 @@ def _checked(parts: dict[str, NDArray[Any]], path: Path) -> NDArray[np.float64]:
     if table is None:
         raise _not_a_database(path, "it has no star_table")
     if table.ndim != 2 or table.shape[1] != _COLUMNS or table.dtype.kind != "f":
-        raise _not_a_database(
-            path, f"its star_table has shape {table.shape} and dtype {table.dtype}"
-        )
+        told = f"its star_table has shape {table.shape} and dtype {table.dtype}"
+        raise _not_a_database(path, told)
     if not np.isfinite(table).all():
         raise _not_a_database(path, "its star_table has values that are not finite")
     return table.astype(np.float64)
 
 
 def _origin(props: NDArray[Any] | None) -> tuple[_Origin, float]:
-    """Return the catalog of a database and the epoch of its positions."""
     names = () if props is None else props.dtype.names or ()
-    origin = _UNKNOWN
-    if props is not None and "star_catalog" in names:
-        origin = _ORIGINS.get(str(props["star_catalog"]), _UNKNOWN)
-    epoch = np.nan
-    if props is not None and "epoch_proper_motion" in names:
-        epoch = float(props["epoch_proper_motion"])
-    return origin, origin.epoch_jyear if np.isnan(epoch) else epoch
+    known = {name: props[name] for name in names} if props is not None else {}
+    origin = _ORIGINS.get(str(known.get("star_catalog")), _UNKNOWN)
+    epoch_jyear = float(known.get("epoch_proper_motion", np.nan))
+    return origin, origin.epoch_jyear if np.isnan(epoch_jyear) else epoch_jyear
 
 
 def _identified(
     numbers: NDArray[Any] | None, count: int, origin: _Origin, path: Path
 ) -> tuple[NDArray[np.int64], pa.Array]:
-    """Return star numbers and designations."""
     if numbers is None:
         rows = np.arange(count, dtype=np.int64)
         return rows, numbered("row", rows)
     expected = (count, 3) if origin.source == "tycho1" else (count,)
     if numbers.shape != expected or numbers.dtype.kind not in "iu":
-        raise _not_a_database(
-            path, f"star_catalog_IDs has shape {numbers.shape}; {expected} goes with its stars"
-        )
-    numbers = numbers.astype(np.int64)
-    if origin.source != "tycho1":
-        return _unique(numbers, path), numbered(origin.prefix, numbers)
-    packed = numbers[:, 0] * 1_000_000 + numbers[:, 1] * 10 + numbers[:, 2]
-    texts = [pa.array(numbers[:, k]).cast(pa.string()) for k in range(3)]
-    names = pc.binary_join_element_wise(*texts, "-")
-    return _unique(packed, path), pc.binary_join_element_wise(origin.prefix, names, " ")
-
-
-def _unique(star_id: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
+        told = f"star_catalog_IDs has shape {numbers.shape}; {expected} goes with its stars"
+        raise _not_a_database(path, told)
+    star_id = numbers.astype(np.int64)
+    designation = numbered(origin.prefix, star_id) if star_id.ndim == 1 else None
+    if designation is None:
+        texts = [pa.array(column).cast(pa.string()) for column in star_id.T]
+        names = pc.binary_join_element_wise(*texts, "-")
+        designation = pc.binary_join_element_wise(origin.prefix, names, " ")
+        star_id = star_id @ np.array([1_000_000, 10, 1])
     found, times = np.unique(star_id, return_counts=True)
     if (times > 1).any():
         raise _not_a_database(path, f"star {found[times > 1][0]} is there twice")
-    return star_id
+    return star_id, designation
 
 
 def _not_a_database(path: Path, why: str) -> SourceError:

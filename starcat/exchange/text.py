@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -18,10 +19,18 @@ import pyarrow.compute as pc
 import pyarrow.csv as pcsv
 from numpy.typing import NDArray
 
+from starcat.arrays import Mask
 from starcat.errors import SchemaError
-from starcat.exchange.columns import column_error, is_list, plain_batch, plain_schema, time_texts
+from starcat.exchange.columns import (
+    column_error,
+    is_list,
+    is_number,
+    plain_batch,
+    plain_schema,
+    steps,
+    time_texts,
+)
 
-_STEP_ROWS = 1 << 14
 _BREAKS = "[\\t\\r\\n]"
 
 _WIDER = {
@@ -33,44 +42,42 @@ _WIDER = {
 """What VOTable and FITS have instead of the integers that they lack."""
 
 
-def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
     """Yield a table as CSV."""
     schema = plain_schema(batches.schema)
-    yield _csv(schema.empty_table().to_batches(), schema, header=True), 0
-    for batch in _small_batches(batches, schema):
-        yield _csv([batch], schema, header=False), batch.num_rows
+    yield _csv(schema.empty_table().to_batches(), schema, header=True)
+    for batch in _plain_steps(batches, schema):
+        yield _csv([batch], schema, header=False)
 
 
-def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
     """Yield a table as text with tabs between the cells and nothing quoted."""
     schema = plain_schema(batches.schema)
     names = pc.replace_substring_regex(pa.array(schema.names, pa.string()), _BREAKS, " ")
-    yield ("\t".join(names.to_pylist()) + "\n").encode(), 0
-    for batch in _small_batches(batches, schema):
+    yield ("\t".join(names.to_pylist()) + "\n").encode()
+    for batch in _plain_steps(batches, schema):
         cells = [_cells(column).cast(pa.string()) for column in batch.columns]
         texts = [
             pc.replace_substring_regex(text, _BREAKS, " ")
-            if pa.types.is_string(field.type)
-            or is_list(field.type)
-            or pa.types.is_struct(field.type)
+            if pa.types.is_string(field.type) or pa.types.is_nested(field.type)
             else text
             for field, text in zip(schema, cells, strict=True)
         ]
         rows = pc.binary_join_element_wise(
             *texts, "\t", null_handling="replace", null_replacement=""
         )
-        yield ("\n".join(rows.to_pylist()) + "\n").encode(), batch.num_rows
+        yield ("\n".join(rows.to_pylist()) + "\n").encode()
 
 
-def json_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+def json_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
     """Yield a table as a JSON array of objects."""
     schema = plain_schema(batches.schema)
     before = "[\n"
-    for batch in _small_batches(batches, schema):
+    for batch in _plain_steps(batches, schema):
         texts = json_texts(batch.to_struct_array())
-        yield (before + ",\n".join(texts.to_pylist())).encode(), batch.num_rows
+        yield (before + ",\n".join(texts.to_pylist())).encode()
         before = ",\n"
-    yield ("[]\n" if before == "[\n" else "\n]\n").encode(), 0
+    yield ("[]\n" if before == "[\n" else "\n]\n").encode()
 
 
 def json_texts(values: pa.Array) -> pa.Array:
@@ -92,17 +99,35 @@ def json_texts(values: pa.Array) -> pa.Array:
     return pc.fill_null(texts, "null")
 
 
-def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array]:
-    """Return where the list of each row begins and ends, and the items of all rows."""
-    offsets, items = _list_offsets(values), values.flatten()
-    if items.null_count and pa.types.is_integer(items.type):
-        raise column_error(
-            name,
-            ": a list of integers has a missing item, which only CSV, "
-            "JSON and Parquet can hold; cast the items to DOUBLE",
-            str(values.type),
-        )
-    return offsets, items
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a column in a batch of N rows, as arrays of files have them."""
+
+    values: pa.Array  # numbers, truth values or texts: one a row, or all items of the lists
+    is_null: Mask | None  # None where no row is without a value
+    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
+    offsets: NDArray[np.int64] | None
+
+
+def cells_of(name: str, values: pa.Array, *, signed: bool) -> Cells:
+    """Return the cells of a column in a batch; SchemaError where a value does not fit.
+
+    With `signed`, integers are of the types that FITS and VOTable have: bytes without a sign, and
+    16, 32 and 64 bits with one.
+    """
+    is_null = values.is_null().to_numpy(zero_copy_only=False) if values.null_count else None
+    offsets = None
+    if is_list(values.type) and is_number(values.type.value_type):
+        offsets, items = _list_offsets(values), values.flatten()
+        if items.null_count and pa.types.is_integer(items.type):
+            raise column_error(
+                name,
+                ": a list of integers has a missing item, which only CSV, "
+                "JSON and Parquet can hold; cast the items to DOUBLE",
+                str(values.type),
+            )
+        values = items
+    return Cells(plain_values(name, values, signed=signed), is_null, offsets)
 
 
 def _list_offsets(values: pa.Array) -> NDArray[np.int64]:
@@ -119,7 +144,7 @@ def plain_values(name: str, values: pa.Array, *, signed: bool) -> pa.Array:
         return _narrowed(name, values, _WIDER[kind])
     if pa.types.is_temporal(kind):
         return time_texts(values)
-    if is_list(kind) or pa.types.is_struct(kind):
+    if pa.types.is_nested(kind):
         return pc.if_else(values.is_valid(), json_texts(values), None)
     return values
 
@@ -137,11 +162,8 @@ def _narrowed(name: str, values: pa.Array, kind: pa.DataType) -> pa.Array:
         ) from error
 
 
-def _small_batches(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-    """Yield the rows in steps whose text fits into memory, however large the batches are."""
-    for batch in batches:
-        for start in range(0, batch.num_rows, _STEP_ROWS):
-            yield plain_batch(batch.slice(start, _STEP_ROWS), schema)
+def _plain_steps(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+    return (plain_batch(step, schema) for step in steps(batches))
 
 
 def _csv(batches: list[pa.RecordBatch], schema: pa.Schema, *, header: bool) -> bytes:
@@ -159,7 +181,7 @@ def _csv(batches: list[pa.RecordBatch], schema: pa.Schema, *, header: bool) -> b
 
 
 def _cells(values: pa.Array) -> pa.Array:
-    if is_list(values.type) or pa.types.is_struct(values.type):
+    if pa.types.is_nested(values.type):
         return pc.if_else(values.is_valid(), json_texts(values), None)
     return time_texts(values) if pa.types.is_temporal(values.type) else values
 

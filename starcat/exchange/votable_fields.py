@@ -12,7 +12,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.arrays import Mask
 from starcat.errors import quoted
 from starcat.exchange.columns import (
     Label,
@@ -23,7 +22,7 @@ from starcat.exchange.columns import (
     is_number,
     unit_text,
 )
-from starcat.exchange.text import list_items, plain_values
+from starcat.exchange.text import Cells, cells_of, plain_values
 from starcat.storage.parquet import ARROW_DATATYPES
 
 _NOT_XML = re.compile("[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -54,7 +53,7 @@ EPOCH_PLACE = _COOSYS.encode()
 """What the attribute with the epoch stands after; it is nowhere else in a document."""
 
 _TABLE = "starcat.table"
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
+_IDENTIFIER = re.compile(r"(?!starcat\.)[A-Za-z_][A-Za-z0-9_.-]*")
 
 
 @dataclass(frozen=True)
@@ -93,32 +92,18 @@ class VotableColumn:
         return unit_text(self.name, self.facts.get("unit"), "vounit")
 
 
-@dataclass(frozen=True)
-class Cells:
-    """The cells of a column in a batch of N rows."""
-
-    values: pa.Array  # of the column's kind: one a row, or all items of the lists
-    is_null: Mask | None  # None where no row is without a value
-    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
-    offsets: NDArray[np.int64] | None
-
-
 def votable_columns(schema: pa.Schema) -> list[VotableColumn]:
     """Return the columns of a plain schema as a VOTable has them."""
     check_names(schema.names, "votable")
     return [_votable_column(field) for field in schema]
 
 
-def cells_of(column: VotableColumn, values: pa.Array) -> Cells:
+def votable_cells(column: VotableColumn, values: pa.Array) -> Cells:
     """Return the cells of a column in a batch; SchemaError where a value does not fit."""
-    is_null = values.is_null().to_numpy(zero_copy_only=False) if values.null_count else None
-    offsets = None
-    if column.is_list:
-        offsets, values = list_items(column.name, values)
-    plain = plain_values(column.name, values, signed=True)
+    cells = cells_of(column.name, values, signed=True)
     if column.is_text:
-        _check_text(column.name, plain)
-    return Cells(plain, is_null, offsets)
+        _check_text(column.name, cells.values)
+    return cells
 
 
 def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
@@ -237,10 +222,10 @@ def info(name: str, value: str, identifier: str = "", text: str = "") -> str:
     return f"{start}>{escape(said_in_xml(text))}</INFO>\n" if text else f"{start}/>\n"
 
 
-def error_document(text: str) -> str:
+def error_document(text: str) -> bytes:
     """Return a VOTable that says why there is no answer."""
     said = info("Error", text) + _RESULTS + info("QUERY_STATUS", "ERROR", text=text)
-    return f"{_VOTABLE}{said}{_AFTER_TABLE}"
+    return f"{_VOTABLE}{said}{_AFTER_TABLE}".encode()
 
 
 def has_places(columns: Sequence[VotableColumn]) -> bool:
@@ -251,7 +236,7 @@ def has_places(columns: Sequence[VotableColumn]) -> bool:
 def _field(column: VotableColumn) -> str:
     known = {
         # An identifier helps readers that go by it; not every name can be one.
-        "ID": column.name if _may_be_identifier(column.name) else None,
+        "ID": column.name if _IDENTIFIER.fullmatch(column.name) else None,
         "name": column.name,
         "datatype": column.datatype,
         "arraysize": "*" if column.is_text or column.is_list else None,
@@ -266,10 +251,6 @@ def _field(column: VotableColumn) -> str:
         return f"   <FIELD {said}/>\n"
     told = escape(said_in_xml(description))
     return f"   <FIELD {said}>\n    <DESCRIPTION>{told}</DESCRIPTION>\n   </FIELD>\n"
-
-
-def _may_be_identifier(name: str) -> bool:
-    return bool(_IDENTIFIER.fullmatch(name)) and not name.startswith("starcat.")
 
 
 def _attribute(text: str) -> str:

@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.exchange.votable_fields import Cells, VotableColumn, is_ascii, is_constant, text_bytes
+from starcat.exchange.text import Cells
+from starcat.exchange.votable_fields import VotableColumn, is_ascii, is_constant, text_bytes
 
 _TRUE, _FALSE, _UNKNOWN = ord("T"), ord("F"), ord("?")
 _FOUR_BYTES = 0xF0
@@ -113,7 +114,6 @@ def _constant(column: VotableColumn, cells: Cells) -> Cells | None:
 
 
 def _variable(column: VotableColumn, cells: Cells) -> tuple[NDArray[np.int64], pa.Array]:
-    """Return how many items each row has, and the bytes of each row."""
     if cells.offsets is not None:
         items = _fixed(column, cells).astype(_big_endian(column))
         content = np.ascontiguousarray(items).view(np.uint8)
@@ -128,7 +128,6 @@ def _variable(column: VotableColumn, cells: Cells) -> tuple[NDArray[np.int64], p
 def _utf_16(
     offsets: NDArray[np.int64], letters: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.generic]]:
-    """Return texts in UTF-8 as units of UTF-16, big end first."""
     if is_ascii(letters):
         return offsets, letters.astype(">u2")
     # A byte that begins a letter stands for one unit, or for two; one that goes on, for none.
@@ -180,7 +179,6 @@ def _texts(column: VotableColumn, cells: Cells) -> pa.Array | str:
 
 
 def _numbers(values: pa.Array) -> pa.Array:
-    """Return numbers and truth values as text, null as null."""
     if pa.types.is_boolean(values.type):
         return pc.if_else(values, "T", "F")
     texts = values.cast(pa.string())

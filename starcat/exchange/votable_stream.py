@@ -8,9 +8,7 @@ that reading failed; without one, what fails is raised.
 from __future__ import annotations
 
 from binascii import b2a_base64
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
@@ -19,18 +17,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.errors import StarcatError
-from starcat.exchange.columns import UNLABELLED, FirstRows, Label, plain_batch, plain_schema
+from starcat.exchange.columns import UNLABELLED, FirstRows, Label, plain_batch, plain_schema, steps
 from starcat.exchange.votable_fields import (
     EPOCH_PLACE,
     VotableColumn,
-    cells_of,
     foot,
     has_places,
     head,
     info,
+    votable_cells,
     votable_columns,
 )
 from starcat.exchange.votable_rows import binary2_rows, tabledata_rows
+from starcat.threads import map_in_order
 
 Serialization = Literal["binary2", "tabledata"]
 
@@ -38,9 +37,6 @@ _EPOCH = "epoch_jyear"
 _EPOCH_ROOM = 32
 """Letters that a file leaves for the epoch, which is known when all rows are written."""
 
-_STEP_ROWS = 1 << 14
-_STEP_BYTES = 8 << 20
-_THREADS = 2
 _BASE64_BYTES = 3  # what base64 makes four letters of; only the end of a stream may be shorter
 
 
@@ -85,20 +81,17 @@ def votable_chunks(
     yield foot(serialization, last).encode()
 
 
-def write_votable(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
-    """Write a table as a VOTable file with rows as text; return its rows."""
+def write_votable(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
+    """Write a table as a VOTable file with rows as text."""
     schema = plain_schema(batches.schema)
     columns = votable_columns(schema)
     with_epoch = _has_epoch(schema, columns)
     epochs: set[float] = set()
-    count = 0
 
     def watched() -> Iterator[pa.RecordBatch]:
-        nonlocal count, epochs
         for batch in batches:
-            count += batch.num_rows
             if with_epoch and len(epochs) < 2:
-                epochs |= _epochs_of([batch])
+                epochs.update(_epochs_of([batch]))
             yield batch
 
     top = head(columns, "tabledata", label, {}, " " * _EPOCH_ROOM if with_epoch else "").encode()
@@ -110,7 +103,6 @@ def write_votable(batches: pa.RecordBatchReader, path: Path, label: Label) -> in
         if with_epoch:
             stream.seek(top.index(EPOCH_PLACE) + len(EPOCH_PLACE))
             stream.write(_epoch_attribute(epochs).encode())
-    return count
 
 
 def _row_chunks(
@@ -119,18 +111,16 @@ def _row_chunks(
     columns: Sequence[VotableColumn],
     serialization: Serialization,
 ) -> Iterator[bytes]:
-    """Yield what stands between the head and the foot of a VOTable.
-
-    What goes wrong with reading the batches is raised after the rows before it were given.
-    """
     rows = binary2_rows if serialization == "binary2" else tabledata_rows
 
     def encode(batch: pa.RecordBatch) -> bytes:
         plain = plain_batch(batch, schema)
-        cells = [cells_of(column, values) for column, values in zip(columns, plain, strict=True)]
+        cells = [
+            votable_cells(column, values) for column, values in zip(columns, plain, strict=True)
+        ]
         return rows(columns, cells, plain.num_rows) if columns else b""
 
-    texts = _in_order(encode, _steps(batches))
+    texts = map_in_order(encode, steps(batches))
     if serialization == "tabledata":
         yield from texts
         return
@@ -169,36 +159,3 @@ def _epoch_attribute(epochs: set[float]) -> str:
         return ""
     [epoch] = epochs
     return f' epoch="J{str(epoch).removesuffix(".0")}"'
-
-
-def _steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows in steps whose text fits into memory, however large the batches are."""
-    for batch in batches:
-        per_row = max(1, batch.nbytes // max(1, batch.num_rows))
-        rows = min(_STEP_ROWS, max(1, _STEP_BYTES // per_row))
-        for start in range(0, batch.num_rows, rows):
-            yield batch.slice(start, rows)
-
-
-def _in_order(
-    encode: Callable[[pa.RecordBatch], bytes], steps: Iterator[pa.RecordBatch]
-) -> Iterator[bytes]:
-    """Yield what some threads make of the steps, in the order of the steps."""
-    failure = None
-    with ThreadPoolExecutor(_THREADS) as pool:
-        waiting: deque[Future[bytes]] = deque()
-        while True:
-            try:
-                step = next(steps, None)
-            except Exception as error:
-                failure = error
-                step = None
-            if step is None:
-                break
-            waiting.append(pool.submit(encode, step))
-            if len(waiting) > _THREADS:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    if failure is not None:
-        raise failure

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Collection, Iterator
-from itertools import chain
 from pathlib import Path
 from typing import IO
 
@@ -23,6 +22,7 @@ from starcat.exchange.columns import (
     UNLABELLED,
     FirstRows,
     Label,
+    begun,
     is_list,
     plain_batch,
     plain_schema,
@@ -39,7 +39,7 @@ from starcat.storage.parquet import (
 )
 
 _CHUNK_BYTES = 1 << 18
-_TEXTS: dict[str, Callable[[pa.RecordBatchReader], Iterator[tuple[bytes, int]]]] = {
+_TEXTS: dict[str, Callable[[pa.RecordBatchReader], Iterator[bytes]]] = {
     "csv": csv_chunks,
     "tsv": tsv_chunks,
     "json": json_chunks,
@@ -55,24 +55,27 @@ def write_batches(
     a column to that the format cannot hold; the label is for VOTable, FITS and ECSV.
     """
     _check(file_format, FILE_FORMATS)
-    failures: list[Exception] = []
-    watched = pa.RecordBatchReader.from_batches(batches.schema, _watched(batches, failures))
+    watched = _Watched(batches)
     try:
         with whole_file(target) as partial:
             if file_format in _FILES:
-                return _FILES[file_format](watched, partial, label)
-            with partial.open("wb") as stream:
-                return _write_text(watched, stream.write, file_format)
+                _FILES[file_format](watched.reader, partial, label)
+            else:
+                with partial.open("wb") as stream:
+                    stream.writelines(_TEXTS[file_format](watched.reader))
     except OutputError:
-        if failures:  # DuckDB's errors come as those of files do, but it was no writing that failed
-            raise failures[0] from None
+        if watched.failure:  # DuckDB's errors come as those of files do, but no writing failed
+            raise watched.failure from None
         raise
+    return watched.rows
 
 
 def write_text_batches(batches: pa.RecordBatchReader, stream: IO[str], file_format: str) -> int:
     """Write a table as text, for instance to the standard output; return its rows."""
     _check(file_format, TEXT_FORMATS)
-    return _write_text(batches, lambda text: stream.write(text.decode()), file_format)
+    watched = _Watched(batches)
+    stream.writelines(text.decode() for text in _TEXTS[file_format](watched.reader))
+    return watched.rows
 
 
 def result_chunks(
@@ -93,38 +96,34 @@ def result_chunks(
         serialization: Serialization = "tabledata" if form.name == "votable/td" else "binary2"
         chunks = votable_chunks(batches, serialization=serialization, label=label, maxrec=maxrec)
     else:
-        rows = _begun(FirstRows(batches, maxrec).reader())
+        rows = begun(FirstRows(batches, maxrec).reader())
         if form.name in _TEXTS:
-            chunks = (text for text, _ in _TEXTS[form.name](rows))
+            chunks = _TEXTS[form.name](rows)
         else:
             chunks = _through_file(rows, form.name, scratch, label)
     return _primed(next(chunks), chunks)
 
 
-def _write_text(
-    batches: pa.RecordBatchReader, write: Callable[[bytes], object], file_format: str
-) -> int:
-    rows = 0
-    for text, more in _TEXTS[file_format](batches):
-        write(text)
-        rows += more
-    return rows
+class _Watched:
+    """Batches on their way to a file: how many rows there were, and what failed in reading them."""
 
+    def __init__(self, batches: pa.RecordBatchReader) -> None:
+        self._batches = batches
+        self.rows = 0
+        self.failure: Exception | None = None
 
-def _watched(batches: pa.RecordBatchReader, failures: list[Exception]) -> Iterator[pa.RecordBatch]:
-    """Yield the batches, and remember what goes wrong with reading them."""
-    try:
-        yield from batches
-    except Exception as error:
-        failures.append(error)
-        raise
+    @property
+    def reader(self) -> pa.RecordBatchReader:
+        return pa.RecordBatchReader.from_batches(self._batches.schema, self._watched())
 
-
-def _begun(batches: pa.RecordBatchReader) -> pa.RecordBatchReader:
-    """Return a reader whose first batch was read."""
-    first = next(iter(batches), None)
-    begun = [] if first is None else [first]
-    return pa.RecordBatchReader.from_batches(batches.schema, chain(begun, batches))
+    def _watched(self) -> Iterator[pa.RecordBatch]:
+        try:
+            for batch in self._batches:
+                self.rows += batch.num_rows
+                yield batch
+        except Exception as error:
+            self.failure = error
+            raise
 
 
 def _primed(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
@@ -135,7 +134,6 @@ def _primed(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
 def _through_file(
     batches: pa.RecordBatchReader, file_format: str, scratch: Path, label: Label
 ) -> Iterator[bytes]:
-    """Write a file, and yield what is in it."""
     with tempfile.TemporaryDirectory(dir=scratch, prefix="result-") as folder:
         path = Path(folder) / f"table{FORMATS[file_format].suffix}"
         write_batches(batches, path, file_format, label)
@@ -152,13 +150,12 @@ def _check(file_format: str, choices: Collection[str]) -> None:
         )
 
 
-def _write_parquet(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
-    """Write a table as a Parquet file, which has no place for a label; return its rows."""
+def _write_parquet(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
+    """Write a table as a Parquet file, which has no place for a label."""
     schema = plain_schema(batches.schema)
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floating = [field.name for field in schema if pa.types.is_floating(field.type)]
     longest: dict[str, str] = {}
-    rows = 0
     with pq.ParquetWriter(
         path,
         schema,
@@ -169,11 +166,9 @@ def _write_parquet(batches: pa.RecordBatchReader, path: Path, label: Label) -> i
     ) as writer:
         for table in _row_groups(batches, schema):
             writer.write_table(table, row_group_size=ROW_GROUP_ROWS)
-            rows += table.num_rows
             for name in texts:
                 longest[name] = max(longest.get(name, ""), _longest(table[name]), key=len)
         writer.add_key_value_metadata(_footer(schema, longest))
-    return rows
 
 
 def _row_groups(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.Table]:
@@ -205,7 +200,7 @@ def _footer(schema: pa.Schema, longest: dict[str, str]) -> dict[str, str]:
     return {**astropy_metadata(table), **votable_metadata(table)}
 
 
-_FILES: dict[str, Callable[[pa.RecordBatchReader, Path, Label], int]] = {
+_FILES: dict[str, Callable[[pa.RecordBatchReader, Path, Label], None]] = {
     "parquet": _write_parquet,
     "votable": write_votable,
     "fits": write_fits,

@@ -8,7 +8,7 @@ of a centred camera is at (width/2, height/2). ``camera_file`` reads and writes 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 
@@ -127,13 +127,7 @@ class Camera:
 
     def with_focal_length(self, focal_length_px: float) -> Camera:
         """Return the same camera with another focal length; ConfigError if the image then folds."""
-        return Camera(
-            self.width_px,
-            self.height_px,
-            focal_length_px,
-            principal_point_px=self.principal_point_px,
-            distortion=self.distortion,
-        )
+        return replace(self, focal_length_px=focal_length_px)
 
     @property
     def in_words(self) -> str:

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import ConfigError, OutputError, reason
+from starcat.errors import ConfigError
+from starcat.storage.atomic import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,11 +55,7 @@ def figure_bytes(figure: Figure, suffix: str, dpi: int = _DPI) -> bytes:
 
 def write_figure(figure: Figure, path: Path, dpi: int = _DPI) -> None:
     """Write a drawing as its name says, PNG or SVG."""
-    content = figure_bytes(figure, path.suffix, dpi)
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+    write_file(path, figure_bytes(figure, path.suffix, dpi))
 
 
 def check_kind(path: Path | None, what: str = "plot") -> None:

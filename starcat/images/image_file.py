@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, OutputError, reason
+from starcat.errors import ConfigError, reason
 from starcat.matcher.result import MatchResult
+from starcat.storage.atomic import write_file
 from starcat.version import install_command
 
 if TYPE_CHECKING:
-    from astropy.io.fits import Header
+    from astropy.io.fits import Header, PrimaryHDU
 
 Grey = NDArray[np.float32] | Array
 
@@ -68,15 +69,7 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
-    if data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            raise ConfigError(f"{path}: damaged gzip file ({error})") from error
+    data = _unpacked(path)
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
     if kind is None:
         raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
@@ -84,7 +77,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
         if kind == "FITS":
             values, upside_down = _read_fits(data, path, plane)
         else:
-            values, upside_down = _read_picture(data)
+            with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
+                values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -94,6 +88,19 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     if values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2):
         return np.ascontiguousarray(values, dtype=np.float32)
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _unpacked(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise ConfigError(f"{path}: damaged gzip file ({error})") from error
 
 
 def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any], bool]:
@@ -108,12 +115,16 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
             chosen = _part_of_fits(shapes, plane)
             _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
             values = np.asarray(parts[chosen].data)
-            order = str(parts[chosen].header.get("ROWORDER", "")).strip().upper()
+            bottom_up = _is_bottom_up(parts[chosen].header)
     planes = values.reshape(-1, *values.shape[-2:])
     if plane is not None:
-        return planes[plane], order == "BOTTOM-UP"
+        return planes[plane], bottom_up
     grey = planes[0] if len(planes) == 1 else np.tensordot(_LUMINANCE, planes, axes=1)
-    return grey, order == "BOTTOM-UP"
+    return grey, bottom_up
+
+
+def _is_bottom_up(header: Header) -> bool:
+    return str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP"
 
 
 def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
@@ -142,12 +153,6 @@ def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
         f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
         for number, shape in enumerate(shapes)
     )
-
-
-def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about tags beside the image, and about its size
-        return _grey_of_picture(data), False
 
 
 def _grey_of_picture(data: bytes) -> NDArray[Any]:
@@ -210,11 +215,7 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
         raise ValueError(f"image of shape {image.shape}; expected two dimensions")
     buffer = io.BytesIO()
     if kind == "FITS":
-        from astropy.io import fits
-
-        part = fits.PrimaryHDU(image)
-        part.header["ROWORDER"] = ("TOP-DOWN", "the first row is the top one")
-        part.writeto(buffer)
+        _fits_of(image).writeto(buffer)
     else:
         from PIL import Image
 
@@ -223,14 +224,7 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
             raise ValueError(f"image of {image.dtype}; {kind} takes {' and '.join(taken)}")
         options = {"quality": quality} if kind == "JPEG" else {}
         Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind, **options)
-    _write_bytes(path, buffer)
-
-
-def _write_bytes(path: Path, buffer: io.BytesIO) -> None:
-    try:
-        path.write_bytes(buffer.getvalue())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+    write_file(path, buffer.getvalue())
 
 
 def without_dark(image: NDArray[Any], dark: NDArray[Any]) -> NDArray[Any]:
@@ -276,26 +270,22 @@ def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
 
 
 def write_wcs(
-    path: Path,
-    source: Path,
-    image: NDArray[Any],
-    result: MatchResult,
-    *,
-    flip: bool | None = None,
+    path: Path, source: Path, image: NDArray[Any], result: MatchResult, *, flip: bool | None = None
 ) -> None:
     """Write a FITS copy of a picture with the world coordinates of its answer."""
     from astropy.utils.exceptions import AstropyWarning
 
-    data = source.read_bytes()
-    data = gzip.decompress(data) if data.startswith(b"\x1f\x8b") else data
+    data = _unpacked(source)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
         if data.startswith(b"SIMPLE  ="):
             _copy_fits(data, result, flip, buffer)
         else:
-            _new_fits(image, result, buffer)
-    _write_bytes(path, buffer)
+            part = _fits_of(image)
+            _add_wcs(part.header, result, bottom_up=False)
+            part.writeto(buffer)
+    write_file(path, buffer.getvalue())
 
 
 def _copy_fits(data: bytes, result: MatchResult, flip: bool | None, buffer: io.BytesIO) -> None:
@@ -306,21 +296,19 @@ def _copy_fits(data: bytes, result: MatchResult, flip: bool | None, buffer: io.B
         part = next(
             part for part in parts if part.is_image and len(part.shape) >= 2 and min(part.shape) > 0
         )
-        order = str(part.header.get("ROWORDER", "")).strip().upper()
-        bottom_up = order == "BOTTOM-UP" if flip is None else flip
+        bottom_up = _is_bottom_up(part.header) if flip is None else flip
         for key in [key for key in part.header if _OF_A_WCS.fullmatch(key)]:
             del part.header[key]
         _add_wcs(part.header, result, bottom_up)
         parts.writeto(buffer, output_verify="silentfix+ignore")
 
 
-def _new_fits(image: NDArray[Any], result: MatchResult, buffer: io.BytesIO) -> None:
+def _fits_of(image: NDArray[Any]) -> PrimaryHDU:
     from astropy.io import fits
 
     part = fits.PrimaryHDU(np.ascontiguousarray(image))
     part.header["ROWORDER"] = ("TOP-DOWN", "the first row is the top one")
-    _add_wcs(part.header, result, bottom_up=False)
-    part.writeto(buffer)
+    return part
 
 
 def _add_wcs(header: Header, result: MatchResult, bottom_up: bool) -> None:

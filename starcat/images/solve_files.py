@@ -231,7 +231,6 @@ class FileAnswers:
     local: LocalInputs
 
     def __iter__(self) -> Iterator[FrameAnswer]:
-        """Identify the frames one after the other."""
         identify, is_image = self._identify(), self.measured.image is not None
         for given in self.measured.frames:
             turned = self.options.flip and not is_image

@@ -21,15 +21,9 @@ from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import Database, ProductArrays, damaged
 from starcat.matcher.numpy_engine import answer_of, proposals
-from starcat.matcher.observation import (
-    WIDEST_FOV_ERROR,
-    Candidates,
-    Frame,
-    Observation,
-    observe,
-)
+from starcat.matcher.observation import WIDEST_FOV_ERROR, Candidates, Frame, Observation, observe
 from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
@@ -68,10 +62,8 @@ class Level:
     # Tangent of half the field of view: the geometric mean of those across width and height, so
     # that it does not depend on which of the two is longer.
     half_width: float
-    # Its stars, and triangles with the rows of these.
-    database: Database
-    # Rows of its stars in the artifact; shape (N,).
-    rows: NDArray[np.int64]
+    database: Database  # its stars, and triangles with the rows of these
+    rows: NDArray[np.int64]  # rows of its stars in the artifact; shape (N,)
 
     def focal_length_px(self, camera: Camera) -> float:
         """Return the focal length with which a detector has the level's field of view."""
@@ -79,11 +71,7 @@ class Level:
 
 
 def levels(database: Database) -> tuple[Level, ...]:
-    """Return the levels of a database, made once."""
-    return database.cached(_levels)
-
-
-def _levels(database: Database) -> tuple[Level, ...]:
+    """Return the levels of a database."""
     for name in ("levels", "triangles"):
         if name not in database.products:
             raise ProductError(
@@ -93,7 +81,7 @@ def _levels(database: Database) -> tuple[Level, ...]:
             )
     camera, product = database.camera, database.products["levels"]
     if not len(product["level"]):
-        raise _damaged("there are none")
+        raise damaged("levels", "level", "is empty")
     own = Level(
         0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px,
         database,
@@ -107,7 +95,7 @@ def _level(database: Database, product: ProductArrays, row: int) -> Level:
     lists = [_list(product, name, row) for name in "ijk"]
     is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
     if not is_sound or not all(np.isin(one, stars).all() for one in lists):
-        raise _damaged(f"the triangles of level {row + 1} are not of its stars")
+        raise damaged("levels", f"level {row + 1}", "has triangles that are not of its stars")
     place = np.searchsorted(stars, np.stack(lists))
     half = [math.tan(math.radians(0.5 * product[f"fov_{axis}_deg"][row])) for axis in "xy"]
     part = replace(
@@ -119,13 +107,6 @@ def _level(database: Database, product: ProductArrays, row: int) -> Level:
         products={"triangles": _triangles(place, database.directions[stars])},
     )
     return Level(math.sqrt(half[0] * half[1]), part, stars)
-
-
-def _damaged(what: str) -> ProductError:
-    return ProductError(
-        f"levels: {what}; the database is damaged. Build the artifact again, or fetch it again",
-        product="levels",
-    )
 
 
 def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
@@ -144,10 +125,7 @@ def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> P
     area = triangle_area(a, b, c)
     radius = np.divide(a * b * c, 4.0 * area, out=np.full(len(a), np.inf), where=area > 0.0)
     columns: dict[str, NDArray[Any]] = dict(zip("ijk", corners, strict=True))
-    columns |= {
-        "area_rad2": area.astype(np.float32),
-        "circumradius_rad": radius.astype(np.float32),
-    }
+    columns |= {"area_rad2": area.astype(np.float32), "circumradius_rad": radius.astype(np.float32)}
     return ProductArrays(columns)
 
 
@@ -155,9 +133,7 @@ def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> P
 class Part:
     """A part of a range of focal lengths, and the level that serves it."""
 
-    # Stars and triangles.
     level: Level
-    # Ends, pixels.
     low_px: float
     high_px: float
 
@@ -232,12 +208,9 @@ def identify_blind(
     which these are does not depend on where in the frame they lie, so that the bound holds for
     them as for a frame that has no others.
     """
-    if database.image is not None:
-        raise ConfigError(
-            "an onboard image serves one field of view; open the artifact that it is of", key="fov"
-        )
+    database.check_has_products("an onboard image serves one field of view", key="fov")
     check_scale_free(settings)
-    parts = parts_of_range(levels(database), frame.camera, fov_deg)
+    parts = parts_of_range(database.cached(levels), frame.camera, fov_deg)
     budget = Budget(settings.max_steps, settings.time_limit_s)
     certain = certainty(settings) / len(parts)
     searches = [_begun(part, settings, frame, budget, certain) for part in parts]
@@ -258,7 +231,6 @@ def identify_blind(
 
 
 def _begun(part: Part, settings: Settings, frame: Frame, budget: Budget, certain: float) -> _Search:
-    """Return the search of one part before its first candidate."""
     eye = Camera(frame.camera.width_px, frame.camera.height_px, part.focal_length_px)
     error = min(part.fov_error, WIDEST_FOV_ERROR)
     whole = used = observe(replace(frame, camera=eye), settings, fov_error=error, budget=budget)

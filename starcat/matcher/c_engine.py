@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -90,11 +90,6 @@ def library_version() -> str | None:
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
 
 
-def most_stars() -> int:
-    """Return the number of stars in or next to a frame that the C library has room for."""
-    return int(_onboard.lib.STARCAT_MAX_STARS)
-
-
 Explain = Callable[[Frame], "Refusal | None"]
 
 
@@ -110,20 +105,13 @@ class BatchResult(Sequence[MatchResult]):
     star_index: NDArray[np.int32]
     frames: Sequence[Frame]
     database: Database
-    # Noise of a centroid, where it was stated.
-    noise_px: float | None = None
+    noise_px: float | None = None  # noise of a centroid, where it was stated
     # Searches a frame again and says why it gets no answer, which the library does not.
     explain: Explain | None = None
-    # Where the library looked for the stars.
-    origin: Origin = "lost_in_space"
+    origin: Origin = "lost_in_space"  # where the library looked for the stars
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self.records)
-
-    def __iter__(self) -> Iterator[MatchResult]:
-        """Return the answers one after the other."""
-        return (self[n] for n in range(len(self)))
 
     @property
     def is_whole(self) -> bool:
@@ -151,7 +139,6 @@ class BatchResult(Sequence[MatchResult]):
     @overload
     def __getitem__(self, frame: slice) -> list[MatchResult]: ...
     def __getitem__(self, frame: int | slice) -> MatchResult | list[MatchResult]:
-        """Return the answer to one frame, or those to some."""
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
@@ -314,7 +301,6 @@ def _memory() -> tuple[Any, Any]:
 
 @lru_cache(maxsize=16)
 def _camera(camera: Camera) -> Any:
-    """Return a camera as the library has it."""
     lens = camera.distortion
     return _onboard.ffi.new(
         "starcat_camera *",
@@ -351,14 +337,11 @@ def c_engine(database: Database, method: str, always: bool = True) -> CEngine | 
         return None
     if database.image is not None and database.image.method != method:
         return None
-    if not always and database.image is None and _count(database, method) > MOST_FEATURES:
-        return None
+    if not always and database.image is None:
+        product, (column, *_) = FEATURES[method]
+        if len(database.products[product][column]) > MOST_FEATURES:
+            return None
     return database.cached(_made, METHODS.index(method))
-
-
-def _count(database: Database, method: str) -> int:
-    product, columns = FEATURES[method]
-    return len(database.products[product][columns[0]])
 
 
 def _made(database: Database, method_number: int) -> CEngine | None:
@@ -382,7 +365,7 @@ def _made(database: Database, method_number: int) -> CEngine | None:
         made = make_image(contents)
     except ConfigError:  # larger than an image can say
         return None
-    if made.most_near > most_stars():
+    if made.most_near > _onboard.lib.STARCAT_MAX_STARS:
         return None
     exact = np.ascontiguousarray(database.directions[made.star_rows])
     return CEngine(database, made.data, made.star_rows, exact)

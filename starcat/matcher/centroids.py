@@ -31,10 +31,8 @@ _LIGHT = ("flux", "sum")
 class MeasuredFrame:
     """The centroids of one frame, as a file has them."""
 
-    # Name of the frame; that of the file where the frame has none of its own.
-    name: str
-    # Pixels, in the order of the file; shape (N, 2).
-    centroids_px: Array
+    name: str  # name of the frame; that of the file where the frame has none of its own
+    centroids_px: Array  # pixels, in the order of the file; shape (N, 2)
     # Magnitudes, NaN where a centroid has none; None where the file has none. Those of light are
     # -2.5 log10 of it, their zero point unknown; shape (N,).
     mag: Array | None = None

@@ -71,14 +71,8 @@ def false_match_probability(
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
-    Examples
-    --------
-    >>> camera = Camera(1024, 1024, 4871.0)
-    >>> rays = camera.directions_from_pixels(np.array([[9.0, 9], [900, 99], [500, 900], [99, 800]]))
-    >>> exact = false_match_probability(1e-6, rays, 4, 4, camera)
-    >>> loose = false_match_probability(100.0, rays, 4, 40, camera)
-    >>> exact < 1e-20 < loose
-    True
+    ``square_px`` is the sum of the squared residuals, ``body`` the directions of the centroids that
+    agree; with ``log_scales``, the logarithm of a range of focal lengths, that was fitted too.
     """
     n, stars = len(body), max(len(body), stars_in_frame)
     sums = _sums(body)
@@ -146,7 +140,6 @@ def _log_expected(
     camera: Camera,
     unknowns: int = 3,
 ) -> float:
-    """Return the logarithm of the expected number of agreements of n centroids."""
     left = 2 * n - unknowns
     root = camera.focal_length_px**unknowns * math.sqrt(max(information, 1e-300))
     attitudes = math.log(_ALL_ATTITUDES * root)
@@ -180,13 +173,7 @@ def _log_share(
 
 
 def log_assignments(n: int, n_centroids: int, stars: int) -> float:
-    """Return the logarithm of the number of assignments of n centroids to n stars.
-
-    Examples
-    --------
-    >>> round(math.exp(log_assignments(2, 3, 4)), 9)
-    36.0
-    """
+    """Return the logarithm of the number of assignments of n centroids to n stars."""
     return (
         math.lgamma(n_centroids + 1) - math.lgamma(n + 1) - math.lgamma(n_centroids - n + 1)
     ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))
@@ -208,11 +195,6 @@ def log_compatible_assignments(most: int, compatible: Mask) -> Array:
     (0 where c_i is). If all are compatible, this is the number of `log_assignments`.
 
     Bregman 1973, "Some properties of nonnegative matrices and their permanents".
-
-    Examples
-    --------
-    >>> log_compatible_assignments(2, np.eye(2, dtype=bool)).round(9).tolist()
-    [0.0, 0.693147181, 0.0]
     """
     count, stars = compatible.shape
     bounds = [np.array([log_assignments(n, count, stars) for n in range(most + 1)])]

@@ -22,8 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
-from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError, StarcatError
+from starcat.errors import (
+    ArtifactMissing,
+    ConfigError,
+    ProductError,
+    SchemaVersionError,
+    StarcatError,
+)
 from starcat.geometry.camera import Camera
+from starcat.geometry.kvector import KVector
 from starcat.onboard.reading import OnboardImage, read_image
 from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.product_table import (
@@ -52,20 +59,21 @@ class ProductArrays:
     numbers: Numbers = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return an array by its name."""
         return self.arrays[name]
+
+    def kvector(self, column: str) -> KVector:
+        """Return the index of the column that the rows ascend by."""
+        line = self.numbers["kvector_intercept"], self.numbers["kvector_slope"]
+        return KVector(self.arrays[column], self.arrays["kvector_counts"], *line)
 
 
 @dataclass(frozen=True)
 class Database:
     """What a matcher needs of an artifact."""
 
-    # ``<name>-<version>``
-    name: str
-    # The camera that the database was built for.
-    camera: Camera
-    # Epoch of the directions.
-    epoch_jyear: float
+    name: str  # ``<name>-<version>``
+    camera: Camera  # that it was built for
+    epoch_jyear: float  # of the directions
     star_id: NDArray[np.int64]
     directions: Directions
     mag: Array
@@ -76,9 +84,13 @@ class Database:
     _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
-        """Return name, stars and products in one line."""
         opened = ", ".join(self.products) or "no product"
         return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
+
+    def check_has_products(self, why: str, **fact: Any) -> None:
+        """Check that this is no onboard image, which has none."""
+        if self.image is not None:
+            raise ConfigError(f"{why}; open the artifact that it is of", **fact)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: all but what can be made again there."""
@@ -229,7 +241,6 @@ def _product(
 
 
 def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
-    """Return a dataset of `own_dataset` as a view of the mapped file."""
     count = dataset.shape[0]
     offset = dataset.id.get_offset() if count else 0
     return np.frombuffer(mapped, dataset.dtype, count, offset)
@@ -254,10 +265,10 @@ def check_product(
     rows = len(arrays[layout.columns[0]])
     for attribute in (*layout.numbers, *(("kvector_intercept", "kvector_slope") * layout.kvector)):
         if not math.isfinite(numbers[attribute]) or abs(numbers[attribute]) > LARGEST:
-            raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
+            raise damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
     for attribute in layout.numbers:
         if numbers[attribute] < SMALLEST:
-            raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
+            raise damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
     for column in layout.texts:
         checks.shape(column, "S", rows)
     for column in layout.wholes:
@@ -280,7 +291,7 @@ def check_product(
     if layout.kvector:
         checks.counts("kvector_counts", rows)
         if numbers["kvector_slope"] < 0.0:
-            raise _damaged(name, "attribute kvector_slope", "is negative")
+            raise damaged(name, "attribute kvector_slope", "is negative")
     if name == "stars":
         checks.directions()
 
@@ -296,9 +307,9 @@ class _Checks:
     def shape(self, name: str, kinds: str, length: float) -> None:
         array = self.arrays[name]
         if array.dtype.kind not in kinds:
-            raise _damaged(self.product, name, f"holds {array.dtype}")
+            raise damaged(self.product, name, f"holds {array.dtype}")
         if len(array) != length:
-            raise _damaged(self.product, name, f"has {len(array)} entries; expected {length:g}")
+            raise damaged(self.product, name, f"has {len(array)} entries; expected {length:g}")
 
     def reals(self, name: str, length: int) -> None:
         self.shape(name, "f", length)
@@ -308,17 +319,15 @@ class _Checks:
             array = array[~np.isnan(array)]
         # NaN is neither above nor below anything.
         if len(array) and not (array.min() >= low and array.max() <= high):
-            raise _damaged(self.product, name, f"holds numbers outside {low:g} to {high:g}, or NaN")
+            raise damaged(self.product, name, f"holds numbers outside {low:g} to {high:g}, or NaN")
 
     def below(self, name: str, limit: float) -> None:
         """Check that all entries lie in [0, limit)."""
         array = self.arrays[name]
         self.shape(name, "iu", len(array))
         if len(array) and not (array.min() >= 0 and array.max() < limit):
-            raise _damaged(
-                self.product,
-                name,
-                f"refers to {array.min()} to {array.max()}; there are {limit:g}",
+            raise damaged(
+                self.product, name, f"refers to {array.min()} to {array.max()}; there are {limit:g}"
             )
 
     def offsets(self, name: str, entries: float, end: int) -> None:
@@ -326,7 +335,7 @@ class _Checks:
         self.shape(name, "iu", entries + 1)
         array = self.arrays[name]
         if array[0] != 0 or array[-1] != end or np.any(array[1:] < array[:-1]):
-            raise _damaged(self.product, name, f"does not ascend from 0 to {end}")
+            raise damaged(self.product, name, f"does not ascend from 0 to {end}")
 
     def counts(self, name: str, rows: int) -> None:
         """Check that counts of rows ascend, and that none is above the number of rows."""
@@ -334,17 +343,18 @@ class _Checks:
         array = self.arrays[name]
         ends = rows == 0 or (array[0] >= 0 and array[-1] <= rows)
         if not ends or np.any(array[1:] < array[:-1]):
-            raise _damaged(self.product, name, f"does not ascend within 0 to {rows}")
+            raise damaged(self.product, name, f"does not ascend within 0 to {rows}")
 
     def directions(self) -> None:
         squares = sum(self.arrays[axis] ** 2 for axis in ("x", "y", "z"))
         off = np.abs(squares - 1.0)
         if len(off) and not off.max() < 1e-9:
             row = int(np.argmax(~(off < 1e-9)))
-            raise _damaged(self.product, "x, y, z", f"is no unit vector in row {row}")
+            raise damaged(self.product, "x, y, z", f"is no unit vector in row {row}")
 
 
-def _damaged(product: str, what: str, found: str) -> ProductError:
+def damaged(product: str, what: str, found: str) -> ProductError:
+    """Return the error of a database that no build wrote as it is."""
     return ProductError(
         f"{product}/{what} {found}; the database is damaged. Build the artifact again, or fetch "
         "it again",

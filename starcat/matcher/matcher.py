@@ -61,7 +61,6 @@ class Matcher(Settings, _WithDatabase):
     """
 
     def __post_init__(self) -> None:
-        """Check what was stated, and that the engine serves it."""
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
             text = "engine 'numpy' needs an artifact; an onboard image has no products"
@@ -70,7 +69,6 @@ class Matcher(Settings, _WithDatabase):
             raise ConfigError(f"engine 'c': {self._without_c()}", key="engine", value="c")
 
     def __repr__(self) -> str:
-        """Return database, method and limits in one line."""
         return (
             f"<Matcher {self.method} on {self.database.name}: {len(self.database.mag):,} stars, "
             f"tolerance {self.tolerance_px:g} px, chance {self.max_false_match_probability:g}>"
@@ -237,7 +235,6 @@ class Matcher(Settings, _WithDatabase):
 
     @cached_property
     def _settings(self) -> Settings:
-        """The settings without the database."""
         return Settings(**{field.name: getattr(self, field.name) for field in fields(Settings)})
 
     @property
@@ -270,10 +267,10 @@ class Matcher(Settings, _WithDatabase):
         if engine is not None and all(engine.accepts(len(frame)) for frame in frames):
             explain = None if self.database.image else partial(self._explain, prior)
             answers = engine.identify(frames, self._settings, prior, threads, explain)
-            if answers.is_whole and prior is None:
-                return answers
             if answers.is_whole and prior is not None:
                 return [prior.checked(answers[0], frames[0].camera, self.tolerance_px)]
+            if answers.is_whole:
+                return answers
         return [self._timed(frame, partial(solve, prior=prior)) for frame in frames]
 
     def _explain(self, prior: Prior | None, frame: Frame) -> Refusal | None:
@@ -298,9 +295,8 @@ class Matcher(Settings, _WithDatabase):
         )
 
     def _checked_fov_error(self, fov_error: float) -> float:
-        if self.database.image is not None:
-            text = "an onboard image needs the focal length; open the artifact that it is of"
-            raise ConfigError(text, key="fov_error", value=fov_error)
+        why = "an onboard image needs the focal length"
+        self.database.check_has_products(why, key="fov_error", value=fov_error)
         check_scale_free(self)
         if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
             text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"

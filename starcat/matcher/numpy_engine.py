@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import islice
 
-from starcat.errors import ConfigError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
@@ -26,11 +25,10 @@ def solve(
     prior: Prior | None = None,
 ) -> MatchResult:
     """Identify the stars of a frame, with a prior near it."""
-    if database.image is not None:
-        raise ConfigError(
-            f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
-            "an onboard image holds nothing for numpy; open the artifact that it is of"
-        )
+    database.check_has_products(
+        f"a frame of {len(frame)} centroids and this camera are beyond the C library, and an "
+        "onboard image holds nothing for numpy"
+    )
     observation = observe(
         frame,
         settings,
@@ -53,7 +51,6 @@ def proposals(observation: Observation, database: Database) -> Iterator[Candidat
 def _search(
     observation: Observation, database: Database, prior: Prior | None, best: BestOf
 ) -> Limit | None:
-    """Work out agreements until one is certain, and return the limit that ended the search."""
     whole_sky = proposals(observation, database)
     try:
         if prior is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -31,7 +30,6 @@ class Frame:
     camera: Camera
 
     def __len__(self) -> int:
-        """Return the number of centroids."""
         return len(self.centroids_px)
 
 
@@ -48,23 +46,6 @@ def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | No
 
 
 @dataclass(frozen=True)
-class FocalRange:
-    """Focal lengths that a frame may have, over the one that was given: 0 < low <= 1 <= high."""
-
-    low: float = 1.0
-    high: float = 1.0
-
-    @property
-    def log_width(self) -> float:
-        """Logarithm of the longest over the shortest."""
-        return math.log(self.high / self.low)
-
-    def clip(self, factors: Array | float) -> Array:
-        """Return factors, those outside of the range moved to its nearer end."""
-        return np.minimum(np.maximum(factors, self.low), self.high)
-
-
-@dataclass(frozen=True)
 class Observation:
     """The usable centroids of a frame.
 
@@ -72,22 +53,17 @@ class Observation:
     first, so that nothing depends on the order in which they were given.
     """
 
-    # Row of each centroid in the frame as it was given.
-    rows: Rows
+    rows: Rows  # row of each centroid in the frame as it was given
     centroids_px: Pixels
-    # Directions in the camera frame.
-    body: Directions
-    # NaN for a centroid without one; None where none is known.
-    mag: Array | None
+    body: Directions  # directions in the camera frame
+    mag: Array | None  # NaN for a centroid without one; None where none is known
     camera: Camera
     settings: Settings
     dropped: Dropped = ()
-    # Largest relative error of the focal length, 0 where it is known.
-    fov_error: float = 0.0
+    fov_error: float = 0.0  # largest relative error of the focal length, 0 where it is known
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
     def __len__(self) -> int:
-        """Return the number of usable centroids."""
         return len(self.rows)
 
     @property
@@ -109,10 +85,10 @@ class Observation:
         """
         return 1.5 * self.tolerance_rad
 
-    @cached_property
-    def focal_range(self) -> FocalRange:
-        """Focal lengths that are allowed, whether the error is a part of the given or the true."""
-        return FocalRange(1.0 - self.fov_error, 1.0 / (1.0 - self.fov_error))
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        """Shortest and longest focal length over the given one; the error is of it or the true."""
+        return 1.0 - self.fov_error, 1.0 / (1.0 - self.fov_error)
 
     @cached_property
     def separation_rad(self) -> Array:
@@ -204,14 +180,7 @@ MAG_DEVIATIONS = 3.5
 
 
 def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
-    """Return which centroids may be which stars by their magnitudes.
-
-    Examples
-    --------
-    >>> compatible_pairs(np.array([3.0, np.nan]), np.array([3.5, 5.0, np.nan]), 0.2)
-    array([[ True, False,  True],
-           [ True,  True,  True]])
-    """
+    """Return which centroids may be which stars by their magnitudes."""
     return np.asarray(~(np.abs(mag[:, None] - star_mag) > MAG_DEVIATIONS * noise_mag))
 
 
@@ -219,15 +188,11 @@ def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
 class Candidates:
     """Correspondences of m >= 2 centroids and stars, one a row, the most promising first."""
 
-    # Rows of the observation, shape (K, m).
-    centroids: NDArray[np.integer[Any]]
-    # Rows of the database's stars, in the same order.
-    stars: NDArray[np.integer[Any]]
+    centroids: NDArray[np.integer[Any]]  # rows of the observation, shape (K, m)
+    stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order
 
     def __len__(self) -> int:
-        """Return the number of correspondences."""
         return len(self.stars)
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> Candidates:
-        """Return some of the correspondences."""
         return Candidates(self.centroids[rows], self.stars[rows])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,9 +55,9 @@ class Prior:
         slack_rad = turn_of_noise_rad(camera, tolerance_px)
         if math.hypot(*turn_between(prior_q, found_q)) <= self.error_rad + slack_rad:
             return answer
-        refused = no_match(len(answer.star_index), answer.dropped, Refusal("prior"))
-        facts = {name: getattr(answer, name) for name in ("time_s", "frame", "database")}
-        return replace(refused, origin="tracking", noise_px=answer.noise_px, **facts)
+        names = ("origin", "time_s", "frame", "database", "noise_px")
+        facts = {name: getattr(answer, name) for name in names}
+        return no_match(len(answer.star_index), answer.dropped, Refusal("prior"), **facts)
 
 
 def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | None:
@@ -105,16 +105,25 @@ def search_near(
     reach_rad += observation.fov_error / (1.0 - observation.fov_error) * camera.radius_rad
     near = stars_in_cap(database, matrix[2], min(math.pi, camera.radius_rad + reach_rad))
     predicted = observation.body @ matrix
-    found = whole_sky
-    if not observation.fov_error and len(near) <= MOST_STARS:
+    if observation.fov_error or len(near) > MOST_STARS:
+        found = _as_predicted(whole_sky, database, predicted, reach_rad)
+    else:
         found = anchored_pairs(observation, database, predicted, near, reach_rad)
     for candidates in found:
-        stars = database.directions[candidates.stars]
-        along = np.einsum("kni,kni->kn", predicted[candidates.centroids], stars)
-        is_near = (along >= math.cos(min(math.pi, reach_rad))).all(axis=1)
-        verify(candidates[is_near], observation, database, best, in_order=False)
+        verify(candidates, observation, database, best, in_order=False)
         if best.is_certain:
             return
+
+
+def _as_predicted(
+    whole_sky: Iterator[Candidates], database: Database, predicted: Directions, reach_rad: float
+) -> Iterator[Candidates]:
+    """Yield the candidates with all stars up to ``reach_rad`` from their predicted directions."""
+    least = math.cos(min(math.pi, reach_rad))
+    for candidates in whole_sky:
+        stars = database.directions[candidates.stars]
+        along = np.einsum("kni,kni->kn", predicted[candidates.centroids], stars)
+        yield candidates[(along >= least).all(axis=1)]
 
 
 def anchored_pairs(
@@ -126,10 +135,11 @@ def anchored_pairs(
 ) -> Iterator[Candidates]:
     """Propose what two centroids are, as the C library does, a batch for each two.
 
-    The anchor may be any star up to ``reach_rad`` from its predicted direction, the nearest first;
-    the other centroid is the star nearest to where it then has to be, of those as far from the
-    anchor's. It is the centroid farthest from the anchor, which determines the attitude best; as
-    that may be a false spot, the next one in order serves too.
+    The anchor may be any star up to ``reach_rad`` from its predicted direction, the nearest first.
+    The other centroid is the star nearest to where it then has to be, of those up to as far from
+    its own predicted direction and as far from the anchor's star as the two centroids are. It is
+    the centroid farthest from the anchor, which determines the attitude best; as that may be a
+    false spot, the next one in order serves too.
     """
     stars, count = database.directions[near], len(observation)
     cosine = predicted @ stars.T
@@ -140,14 +150,18 @@ def anchored_pairs(
     for anchor in range(min(count, MOST_ANCHORS)):
         first = np.flatnonzero(cosine[anchor] >= least)
         first = first[np.argsort(-cosine[anchor, first], kind="stable")]
-        apart_rad, between = observation.separation_rad[anchor], stars[first] @ stars.T
+        apart_rad = observation.separation_rad[anchor]
         for other in dict.fromkeys((int(apart_rad.argmax()), (anchor + 1) % count)):
             observation.budget.spend(LOOKUP)
+            reached = np.flatnonzero(cosine[other] >= least)
+            if not len(reached):
+                continue
             low = math.cos(min(math.pi, float(apart_rad[other]) + tolerance_rad))
             high = math.cos(max(0.0, float(apart_rad[other]) - tolerance_rad))
             shift = predicted[other] - predicted[anchor]
-            place, along = stars[first] + shift, between + stars @ shift
-            along[(between < low) | (between > high)] = -math.inf
+            place, between = stars[first] + shift, stars[first] @ stars[reached].T
+            along = between + stars[reached] @ shift
+            np.copyto(along, -math.inf, where=(between < low) | (between > high))
             second = along.argmax(axis=1)
             # A wrong attitude turns the two against each other by no more than their distance.
             slack_rad = 2.0 * (
@@ -156,7 +170,7 @@ def anchored_pairs(
             least_along = 0.5 * (np.einsum("ij,ij->i", place, place) + 1.0 - slack_rad**2)
             fits = np.flatnonzero(along[np.arange(len(first)), second] >= least_along)
             if len(fits):
-                pairs = near[np.column_stack([first[fits], second[fits]])]
+                pairs = near[np.column_stack([first[fits], reached[second[fits]]])]
                 yield Candidates(np.full(pairs.shape, [anchor, other]), pairs)
 
 

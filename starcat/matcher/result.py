@@ -122,7 +122,6 @@ class Refusal:
         return HINTS[self.reason]
 
     def __repr__(self) -> str:
-        """Return the reason in one line."""
         return f"<Refusal {self.reason}: {self.message}>"
 
 
@@ -156,8 +155,7 @@ class MatchResult:
 
     status: Status
     star_index: NDArray[np.int32]
-    # Attitude, ``body = matrix @ icrs``; NaN unless identified.
-    matrix: Matrix
+    matrix: Matrix  # attitude, ``body = matrix @ icrs``; NaN unless identified
     residual_arcsec: float
     false_match_probability: float
     dropped: Dropped = ()
@@ -328,7 +326,6 @@ class MatchResult:
         return content
 
     def __repr__(self) -> str:
-        """Return the answer in one line."""
         if not self.ok:
             # What is not known yet is not searched for, as that may take long.
             known = vars(self).get("refusal", self.why)

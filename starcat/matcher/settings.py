@@ -146,7 +146,6 @@ class Settings:
     time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
-        """Check what was stated, and find the tolerance where it was not given."""
         for name in ("noise_px", "noise_mag"):
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), 0.0)
@@ -219,8 +218,7 @@ class Budget:
 
     max_steps: float = math.inf
     time_limit_s: float = math.inf
-    # Steps that were taken.
-    steps: int = 0
+    steps: int = 0  # steps that were taken
     _start_s: float = field(default_factory=time.perf_counter, repr=False)
 
     def spend(self, steps: int) -> None:

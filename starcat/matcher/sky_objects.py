@@ -61,8 +61,6 @@ def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
 def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
     """Return the world coordinates of a picture.
 
-    Notes
-    -----
     The reference pixel is the principal point, where the projection touches the sky. Pixel
     (0, 0) of the camera is the outer corner of the first pixel, whose centre is (1, 1) in FITS:
     0.5 is added. With rows that count from the bottom, y becomes the height minus y.
@@ -131,7 +129,6 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
 
 
 def _astropy(module: str) -> Any:
-    """Return a module of astropy."""
     try:
         return import_module(f"astropy.{module}")
     except ImportError as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,14 +43,10 @@ def _zones(database: Database) -> Zones:
 class StarCells:
     """Stars by the cells of a cubic grid that they lie in or near."""
 
-    # Unit vectors of the stars; shape (N, 3).
-    directions: Array
-    # Side of a cell, in units of the sphere's radius.
-    side: float
-    # A star is listed in every cell that it is this near to.
-    margin: float
-    # Cells with stars, ascending; shape (C,).
-    keys: NDArray[np.int64]
+    directions: Array  # unit vectors of the stars; shape (N, 3)
+    side: float  # side of a cell, in units of the sphere's radius
+    margin: float  # a star is listed in every cell that it is this near to
+    keys: NDArray[np.int64]  # cells with stars, ascending; shape (C,)
     # The stars of cell c are ``rows[offsets[c]:offsets[c + 1]]``; shape (C + 1,).
     offsets: NDArray[np.int64]
     rows: NDArray[np.int64]
@@ -61,11 +58,8 @@ class StarCells:
         key = _keys(directions, self.side)
         cell = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
         there = np.flatnonzero(self.keys[cell] == key)
-        start = self.offsets[cell[there]]
-        count = self.offsets[cell[there] + 1] - start
-        query = np.repeat(there, count)
-        first = np.repeat(start - np.cumsum(count) + count, count)
-        star = self.rows[np.arange(len(query)) + first]
+        run, row = rows_between(self.offsets[cell[there]], self.offsets[cell[there] + 1])
+        query, star = there[run], self.rows[row]
         offset = directions[query] - self.directions[star]
         near = np.einsum("ij,ij->i", offset, offset) <= reach_rad * reach_rad
         found = np.zeros(len(directions), dtype=bool)
@@ -101,3 +95,12 @@ def _keys(directions: Array, side: float) -> NDArray[np.int64]:
     across = int(2.0 / side) + 3
     x, y, z = np.floor((directions + 1.0) / side).astype(np.int64).T + 1
     return np.asarray((x * across + y) * across + z)
+
+
+def rows_between(
+    start: NDArray[np.integer[Any]], stop: NDArray[np.integer[Any]]
+) -> tuple[Rows, Rows]:
+    """Return run and row of each entry of several runs of rows, given their starts and stops."""
+    count = stop - start
+    run = np.repeat(np.arange(len(count)), count)
+    return run, np.arange(len(run)) + np.repeat(start - np.cumsum(count) + count, count)

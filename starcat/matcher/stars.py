@@ -67,22 +67,15 @@ class MatchedStars:
     difference_mag: Array
 
     def __len__(self) -> int:
-        """Return the number of stars."""
         return len(self.spot)
 
     def __repr__(self) -> str:
-        """Return the number of stars and the first ones in one line."""
         names = ", ".join(self.star[:3]) + (", ..." if len(self) > 3 else "")
         return f"<MatchedStars: {len(self)}{': ' if self.star else ''}{names}>"
 
 
-def _no_stars() -> MatchedStars:
-    none = np.empty(0)
-    rows = np.empty(0, dtype=np.int64)
-    return MatchedStars(rows, rows, rows.astype(np.int32), (), *(10 * (none,)))
-
-
-NO_STARS = _no_stars()
+_NO_ROWS = np.empty(0, dtype=np.int64)
+NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(10 * (np.empty(0),)))
 """The stars of a frame that was not identified."""
 
 

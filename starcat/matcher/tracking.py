@@ -70,7 +70,6 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the largest turn."""
         if not 0.0 < self.max_turn_deg <= WIDEST_PRIOR_DEG:
             raise ConfigError(
                 f"max_turn_deg is {self.max_turn_deg}; expected above 0, at most "
@@ -185,7 +184,6 @@ class Tracker:
         return expected, min(self.max_turn_deg, error_deg)
 
     def _learnt(self, before: _Motion, q: Quaternion, now: float, camera: Camera) -> _Motion:
-        """Return what an answer near the prediction says of the motion."""
         step = now - before.time
         x, y, z = (part * step / before.step for part in before.turn)
         x, y, z = turn_between(after_turn(before.q_body_from_icrs, (x, y, z)), q)

@@ -71,8 +71,7 @@ class Agreement:
     # Attitude refined on all matched stars, and the camera with the focal length that goes with
     # it.
     pose: Pose
-    # Row of each centroid's star, -1 where none; shape (N,).
-    star_index: NDArray[np.int32]
+    star_index: NDArray[np.int32]  # row of each centroid's star, -1 where none; shape (N,)
     # Root mean square separation of the matched centroids from their stars; NaN where fewer than
     # `MIN_STARS` match.
     residual_rad: float
@@ -80,8 +79,7 @@ class Agreement:
     chance: float
     # Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
     share: float = 1.0
-    # Why it is no answer, however unlikely chance is.
-    withheld: Withheld = None
+    withheld: Withheld = None  # why it is no answer, however unlikely chance is
 
     @property
     def false_match_probability(self) -> float:
@@ -110,10 +108,8 @@ class Agreement:
 class BestOf:
     """The best of the agreements that a search has come to."""
 
-    # A false-match probability as low as this ends the search.
-    certain: float
-    # The agreement that chance explains least.
-    found: Agreement | None = None
+    certain: float  # a false-match probability as low as this ends the search
+    found: Agreement | None = None  # the agreement that chance explains least
 
     @property
     def is_certain(self) -> bool:
@@ -254,7 +250,6 @@ def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
 def _with_rival(
     found: Agreement, rival: int, centroid: int, observation: Observation, database: Database
 ) -> Agreement:
-    """Return the agreement in which a centroid's star is that of its rival."""
     index = found.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
@@ -267,16 +262,12 @@ class _Fit:
     """A pose, the stars around its field and which of them the centroids are."""
 
     pose: Pose
-    # Rows of the stars around the field, and their directions.
-    near: Rows
+    near: Rows  # the stars around the field
     icrs: Directions
     compatible: Mask | None
-    # Where the pose puts those stars.
-    predicted_px: Pixels
-    # Of each centroid a row of ``near``, -1 where none.
-    star: Rows
-    # Centroids with a star.
-    matched: Rows
+    predicted_px: Pixels  # where the pose puts those stars
+    star: Rows  # of each centroid a row of ``near``, -1 where none
+    matched: Rows  # centroids with a star
     square_px: Array
 
 
@@ -308,7 +299,6 @@ def _refine(
 
 
 def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
-    """Return the agreement of a fit, and whether it is withheld."""
     pose, matched, star = refined.pose, refined.matched, refined.star[refined.matched]
     index = np.empty(len(observation), dtype=np.int32)
     index.fill(-1)
@@ -328,7 +318,7 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
         pose.camera,
         noise_px=observation.settings.noise_px,
         compatible=None if refined.compatible is None else refined.compatible[:, within],
-        log_scales=observation.focal_range.log_width if observation.fov_error else 0.0,
+        log_scales=-2.0 * math.log1p(-observation.fov_error),
     )
     share = 1.0
     if chance < 1.0 and len(matched) < len(within):
@@ -346,17 +336,13 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
-    """Return which stars some centroid of the frame could agree with."""
     camera, reach_px = observation.camera, REACH * observation.tolerance_px
     near = np.abs(predicted_px - camera.middle_px) <= camera.middle_px + reach_px
     return (near[:, 0] & near[:, 1]).nonzero()[0]
 
 
 def _mutually_nearest(
-    predicted_px: Array,
-    observation: Observation,
-    reach_px: float,
-    compatible: Mask | None,
+    predicted_px: Array, observation: Observation, reach_px: float, compatible: Mask | None
 ) -> tuple[Rows, Array]:
     """Return the star of each centroid, -1 where it has none, and the squared distances.
 

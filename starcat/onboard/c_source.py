@@ -17,13 +17,7 @@ _WORDS_A_LINE = 4
 
 
 def c_symbol(name: str) -> str:
-    """Return the name of the array.
-
-    Examples
-    --------
-    >>> c_symbol("sao-12deg-1.0.0")
-    'starcat_sao_12deg_1_0_0'
-    """
+    """Return the name of the array: that of the artifact, with ``_`` for what C does not allow."""
     return "starcat_" + re.sub("[^0-9a-z]", "_", name.lower())
 
 

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
-from starcat.onboard.image import Contents, quantised
-from starcat.onboard.layout import MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN
+from starcat.onboard.image import Contents, feature_values, quantised
+from starcat.onboard.layout import FEATURES, MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN
 from starcat.onboard.reading import OnboardImage
 
 VALUE_TOLERANCE = 1e-12
@@ -28,9 +27,9 @@ MAX_PRODUCTS = 20_000_000
 
 def value_problems(image: OnboardImage) -> Iterator[str]:
     """Yield where values, K-vector, circumradii and longest side are not those of the stars."""
-    values, radii, longest = _values(image)
+    values, radii, sides = feature_values(image.directions, image.features)
     if (np.diff(values) < -VALUE_TOLERANCE).any():
-        yield f"section {_features(image)}: not by ascending value"
+        yield f"section {FEATURES[image.method][0]}: not by ascending value"
         return
     if not _fits_line(image, values):
         yield "section kvector: not the numbers of values below its line"
@@ -42,6 +41,7 @@ def value_problems(image: OnboardImage) -> Iterator[str]:
         if len(far):
             found, wanted = stored[far[0]], expected[far[0]]
             yield f"section radii: row {far[0]} is {found:.0f}; expected {wanted:.1f}"
+    longest = float(sides.max(initial=0.0))
     if longest > image.header["longest_rad"] + VALUE_TOLERANCE:
         yield f"longest_rad is {image.header['longest_rad']:.9g}; a side has {longest:.9g} rad"
 
@@ -103,13 +103,12 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
     yield from _star_problems(image, contents, row)
     features = np.sort(row[image.features], axis=1)
     if not _in_rows(features, np.sort(contents.features, axis=1), len(order)).all():
-        yield f"section {_features(image)}: not all of them are in the artifact"
+        yield f"section {FEATURES[image.method][0]}: not all of them are in the artifact"
 
 
 def _star_problems(
     image: OnboardImage, contents: Contents, row: NDArray[np.int64]
 ) -> Iterator[str]:
-    """Yield where directions or magnitudes of stars differ by more than their quantum."""
     moved = (image.sections["directions"] != quantised(contents.directions[row])).any(axis=1)
     if moved.any():
         worst = separation(image.directions[moved], contents.directions[row][moved]).max()
@@ -131,20 +130,3 @@ def _in_rows(found: NDArray[np.int64], known: NDArray[np.int64], count: int) -> 
         return np.isin(found @ scale, known @ scale)
     _, group = np.unique(np.concatenate([known, found]), axis=0, return_inverse=True)
     return np.isin(group.ravel()[len(known) :], group.ravel()[: len(known)])
-
-
-def _features(image: OnboardImage) -> str:
-    return "triangles" if image.method == "triangle" else "pairs"
-
-
-def _values(image: OnboardImage) -> tuple[Array, Array, float]:
-    """Return values and circumradii of the features, and the longest side."""
-    u = image.directions[image.features]
-    if image.method == "pyramid":
-        apart = separation(u[:, 0], u[:, 1])
-        return apart, np.empty(0), float(apart.max(initial=0.0))
-    sides = np.stack([separation(u[:, a], u[:, b]) for a, b in ((1, 2), (0, 2), (0, 1))])
-    area = triangle_area(*sides)
-    radii = np.full(len(area), np.inf)
-    np.divide(sides.prod(axis=0), 4.0 * area, out=radii, where=area > 0.0)
-    return area, radii, float(sides.max(initial=0.0))

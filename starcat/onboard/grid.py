@@ -41,8 +41,7 @@ _FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(rang
 class Grid:
     """Numbers of bands and of the sectors of each."""
 
-    # 1 or more.
-    bands: int
+    bands: int  # 1 or more
     sectors: int
 
     @property
@@ -57,11 +56,6 @@ class Grid:
         band = np.minimum(np.maximum(band, 0.0), self.bands - 1)
         sector = np.minimum(sector, self.sectors - 1)
         return np.asarray(band * self.sectors + sector).astype(np.int64)
-
-    def offsets(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the row of the first star of each cell."""
-        first = np.searchsorted(cells, np.arange(self.n_cells + 1), side="left")
-        return np.asarray(first, dtype=np.int64)
 
 
 def quarter_turns(u: Array) -> Array:
@@ -92,8 +86,6 @@ def grid_for(n_stars: int, radius_rad: float) -> Grid:
 def most_near(u: Array, radius_rad: float) -> int:
     """Return an upper bound of the stars within a radius of any direction.
 
-    Notes
-    -----
     The sphere is divided into cells, squares on the faces of a cube. No circle about a direction
     of a cell holds more stars than the circle about its centre that is wider by what the cell
     reaches from there. Cells that may hold more than is known of others are divided further.
@@ -117,12 +109,7 @@ def most_near(u: Array, radius_rad: float) -> int:
 
 
 def _most_in(
-    face: Array,
-    squares: Array,
-    half: float,
-    near: Array,
-    radius_rad: float,
-    most: int,
+    face: Array, squares: Array, half: float, near: Array, radius_rad: float, most: int
 ) -> int:
     """Return an upper bound for the directions of one cell, or that of the others if larger."""
     inner = _cosines(np.array(radius_rad))

@@ -18,31 +18,9 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
+from starcat.onboard import layout
 from starcat.onboard.grid import grid_for, most_near
-from starcat.onboard.layout import (
-    BLOCK_BYTES,
-    DIRECTION_SCALE,
-    HEADER,
-    HEADER_BYTES,
-    MAG_SCALE,
-    MAG_UNKNOWN,
-    MAGIC,
-    MAX_BYTES,
-    METHOD_NUMBERS,
-    METHODS,
-    NAME_BYTES,
-    ORDER_WORD,
-    RADIUS_RANGE,
-    RADIUS_STEPS,
-    RADIUS_UNKNOWN,
-    SECTION,
-    STARS_OF_FEATURE,
-    VERSION,
-    ByteOrder,
-    Sizes,
-    check_blocks,
-    in_order,
-)
+from starcat.onboard.layout import ByteOrder, Sizes, check_blocks, in_order
 
 Rows = NDArray[np.integer[Any]]
 
@@ -57,38 +35,25 @@ SMALLEST_MARGIN = 1e-12
 class Contents:
     """What an image is made of."""
 
-    # ``<name>-<version>`` of the artifact.
-    name: str
-    # Epoch of the directions, Julian year.
-    epoch_jyear: float
-    # Size of the detector and focal length are used.
-    camera: Camera
-    # Permanent star numbers; shape (N,).
-    star_id: NDArray[np.int64]
-    # ICRS unit vectors; shape (N, 3).
-    directions: Array
-    # Magnitudes; NaN where unknown; shape (N,).
-    mag: Array
-    # What the features are.
+    name: str  # ``<name>-<version>`` of the artifact
+    epoch_jyear: float  # epoch of the directions, Julian year
+    camera: Camera  # size of the detector and focal length are used
+    star_id: NDArray[np.int64]  # permanent star numbers; shape (N,)
+    directions: Array  # ICRS unit vectors; shape (N, 3)
+    mag: Array  # magnitudes; NaN where unknown; shape (N,)
     method: str
-    # Rows of the stars of each triangle or pair, in any order.
-    features: Rows
-    # 32 bytes; zeros where there is no manifest.
-    manifest_sha256: bytes = bytes(32)
+    features: Rows  # rows of the stars of each triangle or pair, in any order
+    manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros where there is no manifest
 
 
 @dataclass(frozen=True)
 class MadeImage:
     """An image and where its stars are from."""
 
-    # The image.
     data: bytes
-    # The row in the contents of each star of the image; shape (N,).
-    star_rows: NDArray[np.int64]
-    # Triangles or pairs of the image.
-    n_features: int
-    # Upper bound of the stars in the camera's circle.
-    most_near: int
+    star_rows: NDArray[np.int64]  # the row in the contents of each star of the image; shape (N,)
+    n_features: int  # triangles or pairs of the image
+    most_near: int  # upper bound of the stars in the camera's circle
 
 
 def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImage:
@@ -96,7 +61,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     check_method(contents.method)
     _check_name(contents.name)
     directions = quantised(contents.directions)
-    u = directions / DIRECTION_SCALE
+    u = directions / layout.DIRECTION_SCALE
     grid = grid_for(len(u), contents.camera.radius_rad)
     cells = grid.cells(u)
     star_rows = np.lexsort((contents.star_id, cells))
@@ -105,14 +70,15 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     u = u[star_rows]
     found = _sorted_features(place[contents.features], u, contents)
     sizes = Sizes(contents.method, len(u), len(found.rows), grid.n_cells)
-    if sizes.total_bytes > MAX_BYTES:
+    if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
             f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
-            f"{MAX_BYTES:,} can be said in it. Build a smaller artifact, or pass --max-bytes",
+            f"{layout.MAX_BYTES:,} can be said in it. Build a smaller artifact, or pass "
+            "--max-bytes",
             key="max_bytes",
         )
     kvector, intercept, slope = _kvector(found.values, sizes.n_kvector)
-    quantum_rad = RADIUS_RANGE * contents.camera.diagonal_rad / RADIUS_STEPS
+    quantum_rad = layout.RADIUS_RANGE * contents.camera.diagonal_rad / layout.RADIUS_STEPS
     near = most_near(u, contents.camera.radius_rad)
     facts = {
         "grid_bands": grid.bands,
@@ -127,7 +93,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
         "directions": directions[star_rows],
         "magnitudes": _stored_mag(contents.mag[star_rows]),
         "star_ids": contents.star_id[star_rows],
-        "grid": grid.offsets(cells[star_rows]),
+        "grid": np.searchsorted(cells[star_rows], np.arange(grid.n_cells + 1), side="left"),
         "kvector": kvector,
         "triangles": found.rows,
         "radii": _stored_radii(found.radii, quantum_rad),
@@ -139,9 +105,9 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
 
 def check_method(method: str) -> None:
     """Check that there are onboard images for a method."""
-    if method not in METHODS:
+    if method not in layout.METHODS:
         raise ConfigError(
-            f"method {method!r} has no onboard image; choose one of {', '.join(METHODS)}",
+            f"method {method!r} has no onboard image; choose one of {', '.join(layout.METHODS)}",
             key="method",
             value=method,
         )
@@ -149,10 +115,10 @@ def check_method(method: str) -> None:
 
 def _check_name(name: str) -> None:
     size = len(name.encode())
-    if size > NAME_BYTES:
+    if size > layout.NAME_BYTES:
         raise ConfigError(
-            f"{name}: has {size} bytes; an onboard image has room for names of {NAME_BYTES}. Build "
-            "the artifact under a shorter name",
+            f"{name}: has {size} bytes; an onboard image has room for names of "
+            f"{layout.NAME_BYTES}. Build the artifact under a shorter name",
             key="name",
             value=name,
         )
@@ -160,7 +126,7 @@ def _check_name(name: str) -> None:
 
 def quantised(directions: Array) -> NDArray[np.int64]:
     """Return directions as the image holds them."""
-    return np.rint(np.clip(directions, -1.0, 1.0) * DIRECTION_SCALE).astype(np.int64)
+    return np.rint(np.clip(directions, -1.0, 1.0) * layout.DIRECTION_SCALE).astype(np.int64)
 
 
 def longest_pair_rad(camera: Camera) -> float:
@@ -181,23 +147,31 @@ class _Features:
 
 def _sorted_features(rows: Rows, u: Array, contents: Contents) -> _Features:
     """Return the features by their values, and by rows where these are equal."""
-    rows = _ascending(rows.reshape(-1, STARS_OF_FEATURE[contents.method]))
+    _, columns = layout.FEATURES[contents.method]
+    rows = _ascending(rows.reshape(-1, len(columns)))
+    values, radii, longest = feature_values(u, rows)
     if contents.method == "pyramid":
-        values = longest = separation(u[rows[:, 0]], u[rows[:, 1]])
-        radii = np.empty(0)
-        kept = values <= longest_pair_rad(contents.camera)
-        rows, values, longest = rows[kept], values[kept], longest[kept]
-    else:
-        v = [u[rows[:, n]] for n in range(3)]
-        a, b, c = separation(v[1], v[2]), separation(v[0], v[2]), separation(v[0], v[1])
-        values, longest = triangle_area(a, b, c), np.maximum(np.maximum(a, b), c)
-        radii = np.full(len(values), np.inf)
-        np.divide(a * b * c, 4.0 * values, out=radii, where=values > 0.0)
+        is_short = values <= longest_pair_rad(contents.camera)
+        rows, values, longest = rows[is_short], values[is_short], longest[is_short]
     order = np.argsort(values)
     if bool(np.any(np.diff(values[order]) == 0.0)):
         order = np.lexsort((*rows.T[::-1], values))
     radii = radii[order] if len(radii) else radii
     return _Features(rows[order], values[order], radii, float(longest.max(initial=0.0)))
+
+
+def feature_values(u: Array, rows: Rows) -> tuple[Array, Array, Array]:
+    """Return value and longest side of each feature, and between them circumradii of triangles."""
+    corners = [u[column] for column in rows.T]
+    if len(corners) == 2:
+        apart = separation(*corners)
+        return apart, np.empty(0), apart
+    v, w, x = corners
+    a, b, c = separation(w, x), separation(v, x), separation(v, w)
+    area = triangle_area(a, b, c)
+    radii = np.full(len(area), np.inf)
+    np.divide(a * b * c, 4.0 * area, out=radii, where=area > 0.0)
+    return area, radii, np.maximum(np.maximum(a, b), c)
 
 
 def _ascending(rows: Rows) -> Rows:
@@ -209,7 +183,6 @@ def _ascending(rows: Rows) -> Rows:
 
 
 def _kvector(values: Array, n_kvector: int) -> tuple[NDArray[np.int64], float, float]:
-    """Return the entries of the K-vector, and intercept and slope of its line."""
     first, last = (float(values[0]), float(values[-1])) if len(values) else (0.0, 0.0)
     margin = max(LINE_MARGIN * last, SMALLEST_MARGIN)
     intercept = first - margin
@@ -220,14 +193,14 @@ def _kvector(values: Array, n_kvector: int) -> tuple[NDArray[np.int64], float, f
 
 def _stored_mag(mag: Array) -> NDArray[np.int64]:
     known = np.isfinite(mag)
-    steps = np.rint(np.where(known, mag, 0.0) * MAG_SCALE)
-    largest = -MAG_UNKNOWN - 1
-    return np.where(known, np.clip(steps, -largest, largest), MAG_UNKNOWN).astype(np.int64)
+    steps = np.rint(np.where(known, mag, 0.0) * layout.MAG_SCALE)
+    largest = -layout.MAG_UNKNOWN - 1
+    return np.where(known, np.clip(steps, -largest, largest), layout.MAG_UNKNOWN).astype(np.int64)
 
 
 def _stored_radii(radii: Array, quantum_rad: float) -> NDArray[np.int64]:
     steps = np.rint(radii / quantum_rad)
-    return np.where(steps <= RADIUS_STEPS, steps, RADIUS_UNKNOWN).astype(np.int64)
+    return np.where(steps <= layout.RADIUS_STEPS, steps, layout.RADIUS_UNKNOWN).astype(np.int64)
 
 
 def _data(
@@ -237,18 +210,17 @@ def _data(
     sections: Mapping[str, NDArray[Any]],
     byte_order: ByteOrder,
 ) -> bytes:
-    """Return header, section table and sections, filled to whole blocks."""
     data, table = bytearray(sizes.data_bytes), sizes.table()
-    header = np.zeros(1, dtype=in_order(HEADER, byte_order))
+    header = np.zeros(1, dtype=in_order(layout.HEADER, byte_order))
     known = {
-        "magic": MAGIC,
-        "byte_order": ORDER_WORD,
-        "version_major": VERSION[0],
-        "version_minor": VERSION[1],
-        "header_bytes": HEADER_BYTES,
+        "magic": layout.MAGIC,
+        "byte_order": layout.ORDER_WORD,
+        "version_major": layout.VERSION[0],
+        "version_minor": layout.VERSION[1],
+        "header_bytes": layout.HEADER_BYTES,
         "total_bytes": sizes.total_bytes,
         "data_bytes": sizes.data_bytes,
-        "method": METHOD_NUMBERS[sizes.method],
+        "method": layout.METHOD_NUMBERS[sizes.method],
         "n_stars": sizes.n_stars,
         "n_features": sizes.n_features,
         "n_kvector": sizes.n_kvector,
@@ -258,14 +230,14 @@ def _data(
         "height_px": contents.camera.height_px,
         "focal_length_px": contents.camera.focal_length_px,
         "epoch_jyear": contents.epoch_jyear,
-        "block_bytes": BLOCK_BYTES,
+        "block_bytes": layout.BLOCK_BYTES,
         "manifest_sha256": np.void(contents.manifest_sha256),
         "name": contents.name.encode(),
         **facts,
     }
     for name, value in known.items():
         header[name] = value
-    head = header.tobytes() + table.astype(in_order(SECTION, byte_order)).tobytes()
+    head = header.tobytes() + table.astype(in_order(layout.SECTION, byte_order)).tobytes()
     data[: len(head)] = head
     for (name, dtype, shape), entry in zip(sizes.sections(), table, strict=False):
         stored = sections[name].reshape(shape).astype(in_order(dtype, byte_order))

@@ -44,21 +44,10 @@ FEATURES = {"triangle": ("triangles", ("i", "j", "k")), "pyramid": ("pairs", ("i
 """For each method of an image, the product that its features are from, and the columns of rows."""
 
 METHODS = tuple(FEATURES)
-METHOD_NUMBERS = {"triangle": 1, "pyramid": 2}
-STARS_OF_FEATURE = {"triangle": 3, "pyramid": 2}
-
-KINDS = {
-    "directions": 1,
-    "magnitudes": 2,
-    "star_ids": 3,
-    "grid": 4,
-    "kvector": 5,
-    "triangles": 6,
-    "radii": 7,
-    "pairs": 8,
-}
+METHOD_NUMBERS = {method: number for number, method in enumerate(METHODS, start=1)}
 
 _COMMON = ("directions", "magnitudes", "star_ids", "grid", "kvector")
+KINDS = {name: n for n, name in enumerate((*_COMMON, "triangles", "radii", "pairs"), start=1)}
 SECTIONS = {"triangle": (*_COMMON, "triangles", "radii"), "pyramid": (*_COMMON, "pairs")}
 """The sections of an image by method, in order."""
 
@@ -101,11 +90,9 @@ SECTION = np.dtype([("kind", "u4"), ("offset", "u4"), ("bytes", "u4"), ("element
 class Sizes:
     """What the size of an image depends on."""
 
-    # What the features are.
     method: str
-    # Stars, triangles or pairs, and cells of the grid.
     n_stars: int
-    n_features: int
+    n_features: int  # triangles or pairs
     n_cells: int
 
     @property
@@ -156,24 +143,12 @@ class Sizes:
 
 
 def check_bytes(data_bytes: int) -> int:
-    """Return the size of the check blocks.
-
-    Examples
-    --------
-    >>> check_bytes(1023 * 4096)
-    8192
-    """
+    """Return the size of the check blocks."""
     return rounded_up(data_bytes // BLOCK_BYTES, CRCS_PER_BLOCK) // CRCS_PER_BLOCK * BLOCK_BYTES
 
 
 def rounded_up(value: int, step: int) -> int:
-    """Return the next multiple.
-
-    Examples
-    --------
-    >>> rounded_up(65, 64)
-    128
-    """
+    """Return the next multiple."""
     return -(-value // step) * step
 
 
@@ -200,13 +175,7 @@ def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
 
 
 def data_blocks(size_bytes: int) -> int:
-    """Return how many of an image's blocks are data.
-
-    Examples
-    --------
-    >>> [data_blocks(4096 * blocks) for blocks in (2, 1023, 1025)]
-    [1, 1022, 1023]
-    """
+    """Return how many of an image's blocks are data."""
     blocks = size_bytes // BLOCK_BYTES
     return blocks - -(-blocks // (CRCS_PER_BLOCK + 1))
 
@@ -217,15 +186,7 @@ def has_check_blocks(image: bytes) -> bool:
 
 
 def scrub(image: bytes) -> list[int]:
-    """Return the damaged blocks of an image.
-
-    Examples
-    --------
-    >>> sound = bytes(8192)
-    >>> sound += check_blocks(sound, "little")
-    >>> scrub(sound), scrub(sound[:5000] + b"x" + sound[5001:])
-    ([], [1])
-    """
+    """Return the damaged blocks of an image."""
     if not image or len(image) % BLOCK_BYTES:
         return [len(image) // BLOCK_BYTES]
     n_data = data_blocks(len(image))

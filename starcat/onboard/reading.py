@@ -17,30 +17,9 @@ from numpy.typing import NDArray
 
 from starcat.errors import ArtifactMissing, OnboardImageError, SchemaVersionError, quoted, reason
 from starcat.geometry.camera import LARGEST_PX, Camera
+from starcat.onboard import layout
 from starcat.onboard.grid import MAX_CELLS, Grid
-from starcat.onboard.layout import (
-    BLOCK_BYTES,
-    BYTE_ORDERS,
-    DIRECTION_SCALE,
-    HEADER,
-    HEADER_BYTES,
-    KINDS,
-    MAG_SCALE,
-    MAG_UNKNOWN,
-    MAGIC,
-    MAX_SECTIONS,
-    METHOD_NUMBERS,
-    ORDER_WORD,
-    SECTION,
-    SECTION_ALIGNMENT,
-    VERSION,
-    ByteOrder,
-    Sizes,
-    check_bytes,
-    has_check_blocks,
-    in_order,
-    scrub,
-)
+from starcat.onboard.layout import ByteOrder, Sizes, check_bytes, has_check_blocks, in_order, scrub
 
 MAX_NAMED = 5
 """Damaged blocks that a message names."""
@@ -52,25 +31,16 @@ ADVICE = "export it again with 'starcat export'"
 class OnboardImage:
     """An onboard image."""
 
-    # All of it.
     data: bytes
-    # That of the target.
     byte_order: ByteOrder
-    # ``<name>-<version>`` of the artifact.
-    name: str
-    # SHA-256 of the artifact's manifest.json, hexadecimal.
-    manifest_sha256: str
-    # What the features are.
+    name: str  # ``<name>-<version>`` of the artifact
+    manifest_sha256: str  # SHA-256 of the artifact's manifest.json, hexadecimal
     method: str
-    # The camera that it was built for.
-    camera: Camera
-    # The numbers of the header by name.
-    header: Mapping[str, int | float]
-    # The sections by name, in the byte order of the image.
-    sections: Mapping[str, NDArray[Any]]
+    camera: Camera  # the camera that it was built for
+    header: Mapping[str, int | float]  # the numbers of the header by name
+    sections: Mapping[str, NDArray[Any]]  # the sections by name, in the byte order of the image
 
     def __repr__(self) -> str:
-        """Return name, method and size in one line."""
         return f"<OnboardImage {self.name}: {self.method}, {len(self.data):,} bytes>"
 
     @property
@@ -86,19 +56,18 @@ class OnboardImage:
     @property
     def directions(self) -> NDArray[np.float64]:
         """ICRS directions, shape (N, 3), each component rounded to 2^-31."""
-        return np.asarray(self.sections["directions"] / DIRECTION_SCALE)
+        return np.asarray(self.sections["directions"] / layout.DIRECTION_SCALE)
 
     @property
     def mag(self) -> NDArray[np.float64]:
         """Magnitudes, shape (N,), NaN where unknown."""
         steps = self.sections["magnitudes"].astype(np.int64)
-        return np.where(steps == MAG_UNKNOWN, np.nan, steps / MAG_SCALE)
+        return np.where(steps == layout.MAG_UNKNOWN, np.nan, steps / layout.MAG_SCALE)
 
     @property
     def features(self) -> NDArray[np.int64]:
         """Rows of the stars of each triangle or pair, shape (M, 3) or (M, 2)."""
-        name = "triangles" if self.method == "triangle" else "pairs"
-        return self.sections[name].astype(np.int64)
+        return self.sections[layout.FEATURES[self.method][0]].astype(np.int64)
 
     def as_dict(self) -> dict[str, Any]:
         """Return name, numbers and sizes as plain values, for JSON."""
@@ -120,7 +89,7 @@ def is_image(path: Path) -> bool:
     """Return whether a file begins as an onboard image does."""
     try:
         with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
+            return file.read(len(layout.MAGIC)) == layout.MAGIC
     except OSError:  # a folder, or no such file: others say so
         return False
 
@@ -136,14 +105,16 @@ def read_image(source: bytes | Path) -> OnboardImage:
     _check_version(header, where)
     for problem in header_problems(header, len(data)):
         raise _damaged(where, problem, path)
-    table = np.frombuffer(data, in_order(SECTION, byte_order), MAX_SECTIONS, HEADER.itemsize)
+    table = np.frombuffer(
+        data, in_order(layout.SECTION, byte_order), layout.MAX_SECTIONS, layout.HEADER.itemsize
+    )
     sizes = sizes_of(header)
     for problem in section_problems(table, sizes, int(header["data_bytes"])):
         raise _damaged(where, problem, path)
     sections = _sections(data, table, sizes, byte_order)
     for problem in content_problems(header, sections):
         raise _damaged(where, problem, path)
-    raw = np.frombuffer(data, HEADER, 1)[0]
+    raw = np.frombuffer(data, layout.HEADER, 1)[0]
     size_px = int(header["width_px"]), int(header["height_px"])
     return OnboardImage(
         data=data,
@@ -177,37 +148,38 @@ def _damaged(where: str, problem: str, path: Path | None) -> OnboardImageError:
 
 def _check_magic(data: bytes, where: str, path: Path | None) -> None:
     """Refuse what is no image; one whose check blocks are whole is a damaged image."""
-    if data[: len(MAGIC)] != MAGIC and not (data and has_check_blocks(data)):
+    if data[: len(layout.MAGIC)] != layout.MAGIC and not (data and has_check_blocks(data)):
         raise OnboardImageError(
             f"{where}: not an onboard image: begins with {quoted(data[:8])}; expected "
-            f"{quoted(MAGIC)}. Give a file that 'starcat export --to onboard' wrote",
+            f"{quoted(layout.MAGIC)}. Give a file that 'starcat export --to onboard' wrote",
             path=path,
         )
-    if len(data) < HEADER_BYTES:
-        problem = f"cut short: {len(data)} bytes; its header alone has {HEADER_BYTES}"
+    if len(data) < layout.HEADER_BYTES:
+        problem = f"cut short: {len(data)} bytes; its header alone has {layout.HEADER_BYTES}"
         raise _damaged(where, problem, path)
 
 
 def _header(data: bytes) -> tuple[dict[str, int | float], ByteOrder]:
     """Return the numbers of the header, in the byte order in which its mark reads right."""
-    marks = {int.from_bytes(data[8:12], order): order for order in BYTE_ORDERS}
-    byte_order = marks.get(ORDER_WORD, "little")
-    raw = np.frombuffer(data, in_order(HEADER, byte_order), 1)[0]
-    names = [name for name in HEADER.names or () if HEADER[name].kind in "uf"]
+    marks = {int.from_bytes(data[8:12], order): order for order in layout.BYTE_ORDERS}
+    byte_order = marks.get(layout.ORDER_WORD, "little")
+    raw = np.frombuffer(data, in_order(layout.HEADER, byte_order), 1)[0]
+    names = [name for name in layout.HEADER.names or () if layout.HEADER[name].kind in "uf"]
     return {name: raw[name].item() for name in names}, byte_order
 
 
 def _check_blocks(
     data: bytes, header: Mapping[str, int | float], where: str, path: Path | None
 ) -> None:
-    """Refuse an image of which a part is missing, or a block damaged."""
     total = header["total_bytes"]
-    if len(data) % BLOCK_BYTES or (len(data) != total and not has_check_blocks(data)):
+    if len(data) % layout.BLOCK_BYTES or (len(data) != total and not has_check_blocks(data)):
         raise _damaged(where, f"{len(data):,} bytes; its header says {total:,}", path)
     bad = scrub(data)
     if bad:
         named = ", ".join(map(str, bad[:MAX_NAMED])) + (", ..." if len(bad) > MAX_NAMED else "")
-        many = f"{len(bad)} of {len(data) // BLOCK_BYTES} blocks of {BLOCK_BYTES} bytes"
+        many = (
+            f"{len(bad)} of {len(data) // layout.BLOCK_BYTES} blocks of {layout.BLOCK_BYTES} bytes"
+        )
         raise OnboardImageError(
             f"{where}: damaged in {many}: {named}; {ADVICE}", path=path, bad_blocks=bad
         )
@@ -215,24 +187,23 @@ def _check_blocks(
 
 def _check_version(header: Mapping[str, int | float], where: str) -> None:
     found = f"{header['version_major']}.{header['version_minor']}"
-    if header["version_major"] != VERSION[0]:
+    if header["version_major"] != layout.VERSION[0]:
         raise SchemaVersionError(
-            f"{where}: format {found}; this starcat reads {VERSION[0]}.x. Export it again, or "
-            "install the starcat that wrote it",
+            f"{where}: format {found}; this starcat reads {layout.VERSION[0]}.x. Export it again, "
+            "or install the starcat that wrote it",
             product="onboard",
             found=found,
-            expected=f"{VERSION[0]}.x",
+            expected=f"{layout.VERSION[0]}.x",
         )
 
 
 def _sections(
     data: bytes, table: NDArray[Any], sizes: Sizes, byte_order: ByteOrder
 ) -> dict[str, NDArray[Any]]:
-    """Return the sections as arrays, after `section_problems` has found none."""
     offsets = {int(entry["kind"]): int(entry["offset"]) for entry in table}
     return {
         name: np.frombuffer(
-            data, in_order(dtype, byte_order), math.prod(shape), offsets[KINDS[name]]
+            data, in_order(dtype, byte_order), math.prod(shape), offsets[layout.KINDS[name]]
         ).reshape(shape)
         for name, dtype, shape in sizes.sections()
     }
@@ -246,34 +217,32 @@ UNIT_TOLERANCE = 1e-8
 
 def sizes_of(header: Numbers) -> Sizes:
     """Return what the size of an image depends on, after `header_problems` has found none."""
-    methods = {number: name for name, number in METHOD_NUMBERS.items()}
+    method = layout.METHODS[int(header["method"]) - 1]
     cells = int(header["grid_bands"]) * int(header["grid_sectors"])
-    return Sizes(
-        methods[int(header["method"])], int(header["n_stars"]), int(header["n_features"]), cells
-    )
+    return Sizes(method, int(header["n_stars"]), int(header["n_features"]), cells)
 
 
 def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
     """Yield what is wrong with a header by itself."""
-    for name in HEADER.names or ():
-        if HEADER[name].kind == "f" and not math.isfinite(header[name]):
+    for name in layout.HEADER.names or ():
+        if layout.HEADER[name].kind == "f" and not math.isfinite(header[name]):
             yield f"{name} is {header[name]}; expected a finite number"
     data, total = int(header["data_bytes"]), int(header["total_bytes"])
     expected = {
-        "header_bytes": (HEADER_BYTES,),
-        "block_bytes": (BLOCK_BYTES,),
+        "header_bytes": (layout.HEADER_BYTES,),
+        "block_bytes": (layout.BLOCK_BYTES,),
         "total_bytes": (size_bytes,),
-        "method": tuple(METHOD_NUMBERS.values()),
+        "method": tuple(layout.METHOD_NUMBERS.values()),
         "index_bytes": (2 if header["n_stars"] <= 1 << 16 else 4,),
         "n_kvector": (header["n_features"] // 4 + 2,),
     }
     for name, choices in expected.items():
         if header[name] not in choices:
             yield f"{name} is {header[name]}; expected {' or '.join(map(str, choices))}"
-    if data % BLOCK_BYTES or data < HEADER_BYTES or data + check_bytes(data) != total:
+    if data % layout.BLOCK_BYTES or data < layout.HEADER_BYTES or data + check_bytes(data) != total:
         yield f"data_bytes is {data}; it does not fit total_bytes {total}"
     ranges = {
-        "n_sections": (1, MAX_SECTIONS),
+        "n_sections": (1, layout.MAX_SECTIONS),
         "width_px": (1, LARGEST_PX),
         "height_px": (1, LARGEST_PX),
         "grid_bands": (1, MAX_CELLS),
@@ -284,7 +253,7 @@ def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
         if not least <= header[name] <= most:
             yield f"{name} is {header[name]}; expected {least} to {most}"
     positive = ["focal_length_px", "kvector_slope"]
-    if header["method"] == METHOD_NUMBERS["triangle"]:
+    if header["method"] == layout.METHOD_NUMBERS["triangle"]:
         positive.append("radius_quantum_rad")
     for name in positive:
         if not header[name] > 0.0:
@@ -296,12 +265,12 @@ def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
 
 def section_problems(table: NDArray[Any], sizes: Sizes, data_bytes: int) -> Iterator[str]:
     """Yield what is wrong with the places of the sections."""
-    kinds, end = table["kind"].tolist(), HEADER_BYTES
+    kinds, end = table["kind"].tolist(), layout.HEADER_BYTES
     for name, dtype, shape in sizes.sections():
-        if kinds.count(KINDS[name]) != 1:
-            yield f"section {name}: there {kinds.count(KINDS[name])} times; expected once"
+        if kinds.count(layout.KINDS[name]) != 1:
+            yield f"section {name}: there {kinds.count(layout.KINDS[name])} times; expected once"
             return
-        entry = table[kinds.index(KINDS[name])]
+        entry = table[kinds.index(layout.KINDS[name])]
         element = np.dtype(dtype).itemsize * math.prod(shape[1:])
         if (entry["element_bytes"], entry["bytes"]) != (element, element * shape[0]):
             yield (
@@ -314,10 +283,10 @@ def section_problems(table: NDArray[Any], sizes: Sizes, data_bytes: int) -> Iter
         if entry["kind"]
     )
     for offset, size, kind in entries:
-        if offset % SECTION_ALIGNMENT or offset < end or offset + size > data_bytes:
+        if offset % layout.SECTION_ALIGNMENT or offset < end or offset + size > data_bytes:
             yield (
                 f"section of kind {kind}: at {offset} with {size} bytes; expected a multiple of "
-                f"{SECTION_ALIGNMENT} from {end} on that ends by {data_bytes}"
+                f"{layout.SECTION_ALIGNMENT} from {end} on that ends by {data_bytes}"
             )
         end = max(end, offset + size)
 
@@ -335,7 +304,7 @@ def content_problems(header: Numbers, sections: Mapping[str, NDArray[Any]]) -> I
             yield f"section {name}: row {int(rows.max())} of {n_stars} stars"
         elif (rows[:, 1:] <= rows[:, :-1]).any():
             yield f"section {name}: rows that do not ascend within one of the {name}"
-    u = sections["directions"] / DIRECTION_SCALE
+    u = sections["directions"] / layout.DIRECTION_SCALE
     if (np.abs(np.einsum("ij,ij->i", u, u) - 1.0) > UNIT_TOLERANCE).any():
         yield "section directions: not all of length 1"
         return

@@ -7,6 +7,7 @@ that thins a build (`selection.max_stars_per_field`), and features with their st
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -32,16 +33,21 @@ LEAST_STARS = 4
 class Shrunk:
     """Contents that fit, and what it took."""
 
-    # What is left.
     contents: Contents
-    # Of the artifact, and left.
-    stars_before: int
-    stars: int
-    # Of the image without a limit, and left.
-    features_before: int
-    features: int
+    stars_before: int  # of the artifact
+    features_before: int  # of the image without a limit
     # The stars left are among so many brightest of a field; None where all are left.
-    stars_per_field: int | None = None
+    stars_per_field: int | None
+
+    @property
+    def stars(self) -> int:
+        """Stars that are left."""
+        return len(self.contents.star_id)
+
+    @property
+    def features(self) -> int:
+        """Triangles or pairs that are left."""
+        return len(self.contents.features)
 
 
 def shrink(
@@ -51,26 +57,20 @@ def shrink(
     max_bytes: int | None,
 ) -> Shrunk:
     """Leave out as little as makes an image fit."""
-    kept, weight = _by_use(contents, times_seen)
-    n_stars, n_features = len(contents.star_id), len(kept.features)
-    if max_bytes is None:
-        return Shrunk(kept, n_stars, n_stars, n_features, n_features)
-    smallest = _sizes(kept, _least(weight, kept.method)).total_bytes
-    if smallest <= max_bytes:
-        fewer = _fewer_features(kept, max_bytes)
-        return Shrunk(fewer, n_stars, n_stars, n_features, len(fewer.features))
-    for most, thinner, left in _thinned(kept, weight, fields()):
-        size = _sizes(thinner, _least(left, kept.method)).total_bytes
-        smallest = min(smallest, size)
-        if size <= max_bytes:
-            fewer = _fewer_features(thinner, max_bytes)
-            left_over = (n_features, len(fewer.features))
-            return Shrunk(fewer, n_stars, len(fewer.star_id), *left_over, most)
+    limit = math.inf if max_bytes is None else max_bytes
+    whole, weight = _by_use(contents, times_seen)
+    sizes = []
+    for most, thinner, left in _thinned(whole, weight, fields):
+        sizes.append(_sizes(thinner, _least(left, contents.method)).total_bytes)
+        if sizes[-1] <= limit:
+            fewer = _fewer_features(thinner, limit)
+            return Shrunk(fewer, len(contents.star_id), len(whole.features), most)
+    smallest = min(sizes)
     raise OnboardSizeError(
-        f"{contents.name}: {max_bytes:,} bytes are too few for an onboard image for the method "
+        f"{contents.name}: {limit:,} bytes are too few for an onboard image for the method "
         f"{contents.method}; the smallest that is of use has {smallest:,} bytes. Raise "
         "--max-bytes, choose another --method, or build an artifact with fewer stars",
-        max_bytes=max_bytes,
+        max_bytes=int(limit),
         smallest_bytes=smallest,
     )
 
@@ -92,19 +92,20 @@ def _by_use(
 
 
 def _least(weight: NDArray[np.float64], method: str) -> int:
-    """Return how many features have to be left."""
     use = np.cumsum(weight)
     return int(np.searchsorted(use, LEAST_SHARE[method] * use[-1])) + 1 if len(use) else 0
 
 
 def _thinned(
-    contents: Contents, weight: NDArray[np.float64], fields: FieldStars
-) -> Iterator[tuple[int, Contents, NDArray[np.float64]]]:
-    """Yield what is left with ever fewer stars a field."""
+    contents: Contents, weight: NDArray[np.float64], fields: Callable[[], FieldStars]
+) -> Iterator[tuple[int | None, Contents, NDArray[np.float64]]]:
+    """Yield the contents, then what is left with ever fewer stars a field."""
+    yield None, contents, weight
+    stars = fields()
     before = len(contents.star_id)
-    for most in range(int(fields.count.max(initial=0)) - 1, LEAST_STARS - 1, -1):
+    for most in range(int(stars.count.max(initial=0)) - 1, LEAST_STARS - 1, -1):
         is_left = np.zeros(len(contents.star_id), dtype=bool)
-        is_left[fields.brightest(most)[1]] = True
+        is_left[stars.brightest(most)[1]] = True
         if np.count_nonzero(is_left) == before:
             continue
         before = int(np.count_nonzero(is_left))
@@ -126,8 +127,7 @@ def _sizes(contents: Contents, n_features: int) -> Sizes:
     return Sizes(contents.method, n_stars, n_features, n_cells)
 
 
-def _fewer_features(contents: Contents, max_bytes: int) -> Contents:
-    """Return the contents with as many features as fit."""
+def _fewer_features(contents: Contents, max_bytes: float) -> Contents:
     counts = range(len(contents.features) + 1)
     fitting = bisect_right(counts, max_bytes, key=lambda n: _sizes(contents, n).total_bytes) - 1
     return replace(contents, features=contents.features[:fitting])

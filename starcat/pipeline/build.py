@@ -30,7 +30,7 @@ from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
 from starcat.pipeline.guide_stars import select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
-from starcat.pipeline.motions import join_motions, motion_notes, motion_product, motion_sources
+from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
 from starcat.pipeline.recipes import (
     RECIPES,
     ProductInputs,
@@ -41,10 +41,10 @@ from starcat.pipeline.recipes import (
 from starcat.pipeline.report_data import (
     BuildResults,
     FilterCoverage,
+    all_source_facts,
     coverage_report,
     filter_coverages,
     report_content,
-    source_facts,
 )
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
@@ -140,7 +140,7 @@ def _make(
     stars, joined = join_all(catalog.stars, amplitudes)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
-    moved = motion_product(motions, selected.guide_stars)
+    moved = motions_of(catalog.stars, motions.table, selected.guide_stars)
     check_cost(estimate_cost(catalog, selected, fields, spec, moved))
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
@@ -153,7 +153,7 @@ def _make(
     rates = run_self_test(partial, spec, progress)
     clock.lap("self-test")
     progress("report", 0, None)
-    star_source, *others = source_facts(catalog, selected, amplitudes, joined)
+    star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
     sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
     results = BuildResults(spec, sources, products, facts, fields, filters, rates)

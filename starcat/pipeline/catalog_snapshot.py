@@ -32,8 +32,7 @@ class CatalogSnapshot:
     stars: pa.Table  # star table (schema ``stars``) with motions and amplitudes joined, by star_id
     motions: pa.Table | None  # where the motions are from (schema ``motions``), a row a star
     rejected: Mapping[str, int]  # records that reading rejected, by reason
-    rejected_rows: int  # those of them that the product ``rejected`` lists
-    rejected_bytes: float  # bytes that one of them takes in its file
+    rejected_bytes: int  # about what those take that the product ``rejected`` lists
     held_bytes: int  # memory that the tables of the catalog take
     records: int  # records in all files of the star catalog
     notes: tuple[str, ...]  # what a user should know of the inputs
@@ -65,10 +64,7 @@ class CatalogSnapshot:
 
 
 def read_snapshot(
-    spec: BuildSpec,
-    inputs: Inputs,
-    workers: int = 2,
-    progress: Progress = no_progress,
+    spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> CatalogSnapshot:
     """Read the catalogs of a spec, as its build does."""
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
@@ -79,8 +75,7 @@ def read_snapshot(
         stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
-        len(catalog.rejected),
-        _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS)),
+        round(len(catalog.rejected) * _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS))),
         catalog.stars.nbytes + catalog.rejected.nbytes,
         catalog.rows_read,
         catalog.notes,

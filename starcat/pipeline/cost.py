@@ -32,9 +32,7 @@ from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
 from starcat.storage.product_table import indices_of
 from starcat.storage.schema import product_schema
 
-GIB = 2**30
-
-MB = 1e6
+GIB, MB = 2**30, 1e6
 
 
 @dataclass(frozen=True)
@@ -74,9 +72,7 @@ BASE_BYTES = 320.0e6
 CATALOG_FACTOR = 2.0
 """Bytes in memory over those of the star table."""
 
-FRAME_SECONDS = 0.002
-BASE_SECONDS = 3.0
-
+FRAME_SECONDS, BASE_SECONDS = 0.002, 3.0
 
 ROW_GROUP_BYTES = 350.0
 """What each row group but the first adds to the end of a Parquet file."""
@@ -102,10 +98,8 @@ COUNTERPART = 75.0
 DATASET_BYTES = 835.0
 """A dataset of the database, beside its values: its name, place and attributes."""
 
-REPORT_BYTES, REPORT_BYTES_PER_FIELD = 640e3, 39.0
-"""The report with its page and pictures, and what each field adds to its list and its map."""
-
-MANIFEST_BYTES = 9.5e3
+REPORT_BYTES, REPORT_BYTES_PER_FIELD = 649.5e3, 39.0
+"""The report with its page and pictures and the manifest, and what each field adds to them."""
 
 PART_ROWS, PARTS = 8192, 3
 """Of a larger table than these make, some parts are written."""
@@ -172,7 +166,7 @@ def whole_cost(
     extents, levels = count_products(inputs), None
     if spec.products.levels.enabled:
         levels = count_levels(inputs.directions, floats_of(stars, "mag"), spec)
-    cost = _cost(inputs, extents, levels, base_bytes)
+    cost = product_cost(inputs, base_bytes, extents, levels)
     boresights = boresight_product(fields, spec.boresights.brightest).table
     longest = pc.max(pc.binary_length(stars["designation"])).as_py() or 1
     listed = pc.sum(pc.list_value_length(boresights["brightest"])).as_py() or 0
@@ -185,25 +179,21 @@ def whole_cost(
     wanted = spec.products.crossmatch
     if wanted.enabled:
         rows["crossmatch"] = len(stars) * len(wanted.catalogs)
-        tables["crossmatch"] = counterparts_bytes(rows["crossmatch"])
+        tables["crossmatch"] = round(_empty_file("crossmatch") + COUNTERPART * rows["crossmatch"])
     files = {f"{name}.parquet": count for name, count in tables.items()}
     files["database.h5"] = database_bytes(stored, levels, len(stars), spec, longest)
-    files["report"] = other_bytes(len(boresights))
+    files["report"] = round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * len(boresights))
     return replace(cost, rows=rows, files=files)
 
 
-def product_cost(inputs: ProductInputs, base_bytes: float) -> Cost:
-    """Estimate what products that are made from guide stars alone will cost."""
-    return _cost(inputs, count_products(inputs), None, base_bytes)
-
-
-def _cost(
+def product_cost(
     inputs: ProductInputs,
-    extents: Mapping[str, Extent],
-    levels: LevelExtent | None,
     base_bytes: float,
+    extents: Mapping[str, Extent] | None = None,
+    levels: LevelExtent | None = None,
 ) -> Cost:
-    """Return what products of known size cost in memory and time."""
+    """Estimate what products cost in memory and time; without extents they are counted."""
+    extents = count_products(inputs) if extents is None else extents
     spec, fields = inputs.spec, inputs.fields
     rows = {name: extent.rows for name, extent in extents.items()}
     work = {name: extent.reached for name, extent in extents.items()}
@@ -352,27 +342,13 @@ def _index_bytes(name: str, extent: Extent, stars: int, spec: BuildSpec) -> floa
     if name in ("pairs", "triangles"):
         return 4.0 * extent.rows
     if name == "neighbours":
-        return 8.0 * stars + 8.0 * _bins(spec) + 4.0 * extent.rows
+        wanted = spec.products.neighbours
+        radius_deg = wanted.radius_deg or spec.camera.half_field_deg
+        rings = np.ceil(radius_deg / wanted.separation_bin_deg)
+        bins = float(np.ceil(360.0 / wanted.angle_bin_deg) * rings)
+        return 8.0 * stars + 8.0 * bins + 4.0 * extent.rows
     if name == "grid":
         return 8.0 * spec.products.grid.cells_per_side**2 + 4.0 * extent.values
     if name == "radial":
         return 8.0 * spec.products.radial.rings + 4.0 * extent.values
     return {"hausdorff_angular": 8.0, "hausdorff_l2": 16.0}.get(name, 0.0) * stars
-
-
-def _bins(spec: BuildSpec) -> float:
-    wanted = spec.products.neighbours
-    radius_deg = wanted.radius_deg or spec.camera.half_field_deg
-    return float(
-        np.ceil(360.0 / wanted.angle_bin_deg) * np.ceil(radius_deg / wanted.separation_bin_deg)
-    )
-
-
-def counterparts_bytes(rows: float) -> int:
-    """Return about how large the file of counterparts will be."""
-    return round(_empty_file("crossmatch") + COUNTERPART * rows)
-
-
-def other_bytes(fields: int) -> int:
-    """Return about how large the report and the manifest of a build will be."""
-    return round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields + MANIFEST_BYTES)

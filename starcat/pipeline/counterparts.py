@@ -7,13 +7,12 @@ a time; only rows that some star may be stay in memory.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.artifact.manifest import SourceFacts
@@ -29,7 +28,7 @@ from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
-from starcat.errors import ParseError, SchemaError, SourceMissing, reason
+from starcat.errors import ParseError, SchemaError, SourceMissing
 from starcat.pipeline.match_summary import Summary, differences_of, summary_of, tally_of
 from starcat.products.crossmatch import candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
@@ -38,6 +37,7 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
+from starcat.store.layout import check_has_columns, parquet_file
 from starcat.store.reading import read_catalog
 
 
@@ -92,8 +92,6 @@ def _median(values: NDArray[np.float64]) -> float | None:
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
     """Return guide stars, followed by the rejected stars that may be their counterparts' own.
 
-    Notes
-    -----
     A component of a double star that is no guide star still is the better match of its own
     entry elsewhere. Stars that were merged into a guide star are part of it.
     """
@@ -124,35 +122,46 @@ def match_catalogs(
     sources: list[SourceFacts] = []
     notes: list[str] = []
     for name in wanted.catalogs:
-        read = read_catalog(
-            name,
-            locate(name, inputs),
-            read_limit_mag=wanted.read_limit_mag,
-            neighbours=False,
-            workers=workers,
-            progress=progress,
+        facts, told, table = match_source(
+            name, "crossmatch", both, wanted, inputs, workers, progress
         )
-        progress("product crossmatch", 0, None)
-        table, _ = match_tables(both, read.stars, wanted)
         tables.append(table.filter(pc.less(table["star"], count)))
-        sources.append(_source_facts(read, counterparts_of(tables[-1], name)))
-        notes += read.notes
-        del read  # a whole catalog: two of them need not fit into memory
+        sources.append(replace(facts, joined=counterparts_of(tables[-1], name)))
+        notes += told
     product = Product("crossmatch", _in_order(tables), in_database=False)
     return Counterparts((product,), tuple(sources), tuple(notes))
 
 
-def _source_facts(read: Ingested, joined: int) -> SourceFacts:
-    """Return what the manifest says of a catalog of counterparts."""
-    return SourceFacts(
-        read.source,
-        "crossmatch",
-        read.files,
-        read.rows_read,
-        len(read.stars),
-        read.rejected_by_reason,
-        joined,
+def match_source(
+    name: str,
+    role: str,
+    stars: pa.Table,
+    wanted: Crossmatch,
+    inputs: Mapping[str, Sequence[Path]],
+    workers: int,
+    progress: Progress,
+) -> tuple[SourceFacts, tuple[str, ...], pa.Table]:
+    """Read a catalog and find the counterparts of stars in it.
+
+    Returns facts and notes of the catalog, and the candidates; the catalog itself does not stay,
+    as two of them need not fit into memory.
+    """
+    read = read_catalog(
+        name,
+        locate(name, inputs),
+        read_limit_mag=wanted.read_limit_mag,
+        neighbours=False,
+        workers=workers,
+        progress=progress,
     )
+    progress("motions" if role == "motions" else f"product {role}", 0, None)
+    return source_facts(read, role), read.notes, match_tables(stars, read.stars, wanted)[0]
+
+
+def source_facts(read: Ingested, role: str) -> SourceFacts:
+    """Return what the manifest says of a catalog of which all stars are used."""
+    rejected = read.rejected_by_reason
+    return SourceFacts(read.source, role, read.files, read.rows_read, len(read.stars), rejected)
 
 
 def _in_order(tables: Sequence[pa.Table]) -> pa.Table:
@@ -186,23 +195,11 @@ def schema_with_own_names() -> pa.Schema:
 def read_star_table(path: Path) -> pa.Table:
     """Read the columns of a star table that a cross-identification needs."""
     hint = "give a star table, as 'starcat ingest' writes it"
-    try:
-        with pq.ParquetFile(path) as file:
-            lacking = [name for name in NEEDED if name not in file.schema_arrow.names]
-            if lacking:
-                raise SchemaError(
-                    f"{path}: no column {', '.join(lacking)}; {hint}",
-                    product="stars",
-                    field=lacking[0],
-                    found=file.schema_arrow.names,
-                    expected=NEEDED,
-                )
-            table = file.read(list(NEEDED))
-    except FileNotFoundError:
-        raise SourceMissing(f"{path}: no such file; {hint}", path=path) from None
-    except (OSError, pa.ArrowException) as error:
-        why = reason(error) if isinstance(error, OSError) else str(error)
-        raise ParseError(f"{path}: cannot be read as Parquet ({why}); {hint}", path=path) from error
+    if not path.exists():
+        raise SourceMissing(f"{path}: no such file; {hint}", path=path)
+    with parquet_file(path, ParseError, hint) as file:
+        check_has_columns(path, file.schema_arrow.names, NEEDED, hint)
+        table = file.read(list(NEEDED))
     check_star_columns(table, path)
     return table
 

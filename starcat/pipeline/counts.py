@@ -46,7 +46,7 @@ def count_products(inputs: ProductInputs) -> dict[str, Extent]:
     """Count the rows of the products that are made from guide stars alone."""
     spec, stars = inputs.spec, len(inputs.directions)
     wanted = [name for name in RECIPES if getattr(spec.products, name).enabled]
-    reach = {name: _reach_rad(name, inputs) for name in wanted if name != "triangles"}
+    reach = {name: inputs.reach_rad(name) for name in wanted if name != "triangles"}
     inner = {name: _inner_rad(name, spec) for name in reach}
     near = _neighbours_within(inputs.directions, {*reach.values(), *inner.values()})
     found: dict[str, Extent] = {}
@@ -96,16 +96,6 @@ def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:
         stars, triangles = stars + len(level.rows), triangles + distinct
         records += all_of_them
     return LevelExtent(len(fields), stars, triangles, records)
-
-
-def _reach_rad(name: str, inputs: ProductInputs) -> float:
-    """Return how far apart two stars of a row of a product may be."""
-    wanted = getattr(inputs.spec.products, name)
-    if name == "pairs":
-        if wanted.max_separation_deg is None:
-            return inputs.spec.camera.camera().diagonal_rad
-        return float(np.radians(wanted.max_separation_deg))
-    return inputs.radius_rad(wanted.radius_deg, 4.0 / 3.0 if name == "hausdorff_angular" else 1.0)
 
 
 def _inner_rad(name: str, spec: BuildSpec) -> float:

@@ -6,14 +6,13 @@ long is reading the catalogs; it depends on a few keys of the spec only, and its
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
 import pyarrow as pa
 
-from starcat.artifact.writer import Product
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
 from starcat.catalog.stars import floats_of, reject_rows, sort_rows
@@ -85,10 +84,7 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
     for counts in (
         read.rejected,
         count_by_reason(selected.rejected),
-        {
-            Reason.no_magnitude.name: blank,
-            Reason.too_faint.name: len(mag) - len(bright) - blank,
-        },
+        {Reason.no_magnitude.name: blank, Reason.too_faint.name: len(mag) - len(bright) - blank},
     ):
         for name, count in counts.items():
             found[name] += count
@@ -148,6 +144,14 @@ class Estimate:
         """Size of the artifact."""
         return sum(self.cost.files.values())
 
+    @property
+    def files(self) -> list[tuple[str, int | None, int]]:
+        """Name, rows of a product, and bytes of each file."""
+        cost, rejected = self.cost, sum(self.rejected.values())
+        own = {"stars": cost.stars, "boresights": cost.fields, "rejected": rejected}
+        rows = {f"{product}.parquet": count for product, count in {**cost.rows, **own}.items()}
+        return [(name, rows.get(name), size) for name, size in cost.files.items()]
+
 
 def estimate(
     read: CatalogSnapshot, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
@@ -160,7 +164,7 @@ def estimate(
         spec,
         _rejected_bytes(read, choice, spec),
         base_memory(read.held_bytes),
-        _motion_product(read, guide_stars),
+        motions_of(read.stars, read.motions, guide_stars),
     )
     refusals = []
     for check in (
@@ -197,13 +201,7 @@ def _rejected_bytes(read: CatalogSnapshot, choice: Choice, spec: BuildSpec) -> i
     some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
     listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
     size = table_bytes(listed, len(seen) + len(faint))
-    return size + round(read.rejected_rows * read.rejected_bytes)
-
-
-def _motion_product(read: CatalogSnapshot, guide_stars: pa.Table) -> Sequence[Product]:
-    if read.motions is None:
-        return ()
-    return (motions_of(read.stars, read.motions, guide_stars),)
+    return size + read.rejected_bytes
 
 
 def _gap(spec: BuildSpec) -> TilingGap | None:
@@ -221,10 +219,7 @@ def _widest_gap(boresights: int) -> TilingGap:
 
 
 def estimate_spec(
-    spec: BuildSpec,
-    inputs: Inputs,
-    workers: int = 2,
-    progress: Progress = no_progress,
+    spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> Estimate:
     """Read the catalogs of a spec and estimate what it will give."""
     read = read_snapshot(spec, inputs, workers, progress)

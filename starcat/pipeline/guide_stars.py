@@ -50,8 +50,6 @@ def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
 def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> NDArray[np.int64]:
     """Return the rows of stars that are among the brightest of some field, ascending.
 
-    Notes
-    -----
     The brightest stars of the sky fill most fields. Only those that are not full are looked at
     with fainter ones, so that deep catalogs take hardly longer than bright ones.
     """

@@ -26,9 +26,8 @@ from starcat.pipeline.counterparts import with_own_names
 from starcat.pipeline.match_summary import Tally, differences_of, tally_of, write_numbers
 from starcat.pipeline.star_rows import opened, rows_of_partition, rows_of_region
 from starcat.products.crossmatch import candidate_pairs, judged
-from starcat.products.match_figures import Figures, MatchModel, MovingStars, Pairs, is_sure
+from starcat.products.match_figures import Census, Figures, MatchModel, MovingStars, Pairs, is_sure
 from starcat.products.match_odds import ROUNDS
-from starcat.products.star_counts import Census
 from starcat.storage.atomic import whole_file
 from starcat.store.pixels import (
     HEALPIX_COLUMN,
@@ -40,14 +39,8 @@ from starcat.store.pixels import (
 )
 
 PLACED = (
-    "star_id",
-    "ra_deg",
-    "dec_deg",
-    "epoch_jyear",
-    "pm_ra_cosdec_mas_yr",
-    "pm_dec_mas_yr",
-    "mag",
-)
+    "star_id", "ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag",
+)  # fmt: skip
 """Columns that place a star and tell how bright it is."""
 
 PIECE_LOAD = 1 << 19
@@ -106,14 +99,6 @@ class Job:
     figures: Figures | None = None  # what is known of both catalogs, once it is
 
 
-@dataclass(frozen=True)
-class Piece:
-    """A piece of the sky and its place in the order of all."""
-
-    number: int
-    pixel: Pixel
-
-
 def hop_of(a: Extent, b: Extent, radius_rad: float) -> float:
     """Return how far the positions of a star and a candidate may be apart."""
     years = max(a.last_jyear - b.first_jyear, b.last_jyear - a.first_jyear, 0.0)
@@ -127,7 +112,7 @@ def pieces_of(
     b: Sequence[tuple[Pixel, int]],
     job: Job,
     piece_load: int = PIECE_LOAD,
-) -> list[Piece]:
+) -> list[Pixel]:
     """Divide the sky into pieces that one worker at a time can hold."""
     finest = border_order(job.hop_rad)
     share = np.pi * job.radius_rad**2 / (4.0 * np.pi / 12.0)
@@ -145,8 +130,7 @@ def pieces_of(
         else:
             children = range(4 * pixel.number, 4 * pixel.number + 4)
             waiting += [(Pixel(pixel.order + 1, child), of_a, of_b) for child in children]
-    chosen.sort(key=lambda pixel: pixel.first)
-    return [Piece(number, pixel) for number, pixel in enumerate(chosen)]
+    return sorted(chosen, key=lambda pixel: pixel.first)
 
 
 def _overlapping(parts: Sequence[tuple[Pixel, int]], pixel: Pixel) -> list[tuple[Pixel, int]]:
@@ -168,14 +152,14 @@ def extent_of_partition(job: Job, place: tuple[Path, int]) -> Extent:
     return total
 
 
-def numbers_path(job: Job, kind: str, piece: Piece) -> Path:
+def numbers_path(job: Job, kind: str, piece: Pixel) -> Path:
     """Return the file of some numbers of a piece."""
-    return job.scratch / f"{kind}-{piece.number}.f8"
+    return job.scratch / f"{kind}-{piece.order}-{piece.number}.f8"
 
 
-def rows_path(job: Job, piece: Piece) -> Path:
+def rows_path(job: Job, piece: Pixel) -> Path:
     """Return the file of the rows of a piece."""
-    return job.scratch / f"rows-{piece.number}.parquet"
+    return job.scratch / f"rows-{piece.order}-{piece.number}.parquet"
 
 
 MOST_RINGS = 2 * ROUNDS + 8
@@ -184,26 +168,10 @@ all that its probabilities depend on."""
 
 
 @dataclass(frozen=True)
-class Counted:
-    """The stars of a piece, and those of them that have candidates."""
-
-    stars: int
-    with_candidates: int
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What was found of the stars of a piece: a tally, and the longest text of each column."""
-
-    tally: Tally
-    longest: dict[str, int]
-
-
-@dataclass(frozen=True)
 class _Local:
     """Stars of a piece and of the rings around it, their candidates, and all pairs of these."""
 
-    piece: Piece
+    piece: Pixel
     rings: int
     star_rows: pa.Table
     other_rows: pa.Table
@@ -220,7 +188,7 @@ class _Local:
     @cached_property
     def is_own(self) -> Mask:
         """Which stars are of the piece itself."""
-        first, end = self.piece.pixel.first, self.piece.pixel.end
+        first, end = self.piece.first, self.piece.end
         return (self.pixels >= first) & (self.pixels < end)
 
     def linked(self) -> tuple[Mask, bool]:
@@ -242,9 +210,9 @@ class _Local:
         return kept, bool(farthest < self.rings)
 
 
-def _local(job: Job, piece: Piece, rings: int, columns: Sequence[str]) -> _Local:
+def _local(job: Job, piece: Pixel, rings: int, columns: Sequence[str]) -> _Local:
     """Read a piece and so many rings around it, and find all pairs there."""
-    region = region_around(piece.pixel, job.hop_rad, rings)
+    region = region_around(piece, job.hop_rad, rings)
     own = (*PLACED, "designation") if "designation" in columns else PLACED
     star_rows = rows_of_region(opened(job.a, job.scratch), region, own)
     other_rows = rows_of_region(opened(job.b, job.scratch), region, columns)
@@ -256,8 +224,11 @@ def _local(job: Job, piece: Piece, rings: int, columns: Sequence[str]) -> _Local
     return _Local(piece, rings, star_rows, other_rows, stars, others, pairs, levels, other_levels)
 
 
-def measure_piece(job: Job, piece: Piece) -> Counted:
-    """Find the sure pairs of a piece, whose separations and magnitudes go to the scratch folder."""
+def measure_piece(job: Job, piece: Pixel) -> tuple[int, int]:
+    """Find the sure pairs of a piece, whose separations and magnitudes go to the scratch folder.
+
+    Returns the number of its stars, and of those that have candidates.
+    """
     here = _local(job, piece, 2, PLACED)
     i, j = here.pairs.star, here.pairs.counterpart
     own = here.is_own[i]
@@ -266,15 +237,18 @@ def measure_piece(job: Job, piece: Piece) -> Counted:
     known = delta[~np.isnan(delta)]
     write_numbers(here.pairs.separation_rad[sure], numbers_path(job, "sure", piece))
     write_numbers(known, numbers_path(job, "sure-delta", piece))
-    return Counted(int(here.is_own.sum()), len(np.unique(i[own])))
+    return int(here.is_own.sum()), len(np.unique(i[own]))
 
 
-def judge_piece(job: Job, piece: Piece) -> Judged:
-    """Judge the candidates of the stars of a piece; they go to the scratch folder."""
+def judge_piece(job: Job, piece: Pixel) -> tuple[Tally, dict[str, int]]:
+    """Judge the candidates of the stars of a piece; they go to the scratch folder.
+
+    Returns a tally of them, and the length of the longest text of each column.
+    """
     if job.figures is None:
         raise ValueError("figures are missing; both catalogs have to be measured first")
     # Clusters mostly end within three rings, which cost nothing where these are narrow.
-    rings = 4 if border_order(job.hop_rad) >= min(piece.pixel.order + 4, MAX_ORDER) else 2
+    rings = 4 if border_order(job.hop_rad) >= min(piece.order + 4, MAX_ORDER) else 2
     here = _local(job, piece, rings, NEEDED)
     kept, is_whole = here.linked()
     while not is_whole and rings < MOST_RINGS:
@@ -294,7 +268,7 @@ def judge_piece(job: Job, piece: Piece) -> Judged:
     write_numbers(differences[1], numbers_path(job, "matched-delta", piece))
     with whole_file(rows_path(job, piece)) as partial:
         pq.write_table(table, partial, compression="zstd")
-    return Judged(tally, _longest(table))
+    return tally, _longest(table)
 
 
 def _longest(table: pa.Table) -> dict[str, int]:

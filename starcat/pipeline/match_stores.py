@@ -7,28 +7,22 @@ in order of ``star_id``, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from operator import add
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcat.errors import OutputError, ProductError
-from starcat.pipeline.counterparts import (
-    model_from_spec,
-    read_star_table,
-    schema_with_own_names,
-)
+from starcat.pipeline.counterparts import model_from_spec, read_star_table, schema_with_own_names
 from starcat.pipeline.match_pieces import (
     PIECE_LOAD,
     Extent,
     Job,
-    Judged,
-    Piece,
     extent_of_partition,
     hop_of,
     judge_piece,
@@ -46,21 +40,14 @@ from starcat.storage.atomic import whole_file, whole_folder
 from starcat.storage.parquet import write_parts
 from starcat.store.cluster import cluster, run_tasks
 from starcat.store.layout import is_store, open_store
+from starcat.store.pixels import Pixel
 
 _SMALL_BYTES = 32 << 20
 """Catalogs that are done before processes would have started."""
 
 
-class RunTasks(Protocol):
-    """What calls a function with each of some items, wherever that is."""
-
-    def __call__(
-        self,
-        function: Callable[[Any], Any],
-        items: Sequence[Any],
-        report: Callable[[int, Any], None] | None = None,
-    ) -> list[Any]:
-        """Return the results in the order of the items."""
+RunTasks = Callable[..., list[Any]]
+"""Calls a function with each of some items, as `starcat.store.cluster.run_tasks` does."""
 
 
 def run_here(
@@ -125,11 +112,13 @@ def match_stores(
         measured = tasks.measured(job, pieces, of_a.census.stars)
         figures = figures_of(of_a.census, of_b.census, measured, radius_rad, job.model)
         job = replace(job, figures=figures)
-        results: list[Judged] = tasks("crossmatch verdicts", judge_piece, job, pieces)
+        results = tasks("crossmatch verdicts", judge_piece, job, pieces)
         with whole_file(output) as unfinished:
-            write_parts(_rows(job, pieces), _example(results), unfinished)
+            write_parts(
+                _rows(job, pieces), _example([longest for _, longest in results]), unfinished
+            )
         return summary_of(
-            reduce(add, (result.tally for result in results), Tally.of_none()),
+            reduce(add, (tally for tally, _ in results), Tally.of_none()),
             (of_a.census.stars, of_b.census.stars),
             wanted.radius_arcsec,
             figures,
@@ -176,10 +165,10 @@ class _Tasks:
         ]
         return reduce(add, extents, Extent.of_none()), parts
 
-    def measured(self, job: Job, pieces: Sequence[Piece], stars: int) -> Measured:
+    def measured(self, job: Job, pieces: Sequence[Pixel], stars: int) -> Measured:
         """Return what all pairs say of the two catalogs."""
         counted = self("crossmatch pairs", measure_piece, job, pieces)
-        found = sum(each.stars for each in counted)
+        found = sum(stars for stars, _ in counted)
         if found != stars:
             raise ProductError(
                 f"{job.a}: had {stars:,} stars when they were counted and {found:,} when they were "
@@ -188,7 +177,7 @@ class _Tasks:
             )
         sure, angle = median_of([numbers_path(job, "sure", piece) for piece in pieces])
         known, delta = median_of([numbers_path(job, "sure-delta", piece) for piece in pieces])
-        with_candidates = sum(each.with_candidates for each in counted)
+        with_candidates = sum(count for _, count in counted)
         return Measured(
             with_candidates,
             sure,
@@ -198,7 +187,7 @@ class _Tasks:
         )
 
 
-def _rows(job: Job, pieces: Sequence[Piece]) -> Iterator[pa.Table]:
+def _rows(job: Job, pieces: Sequence[Pixel]) -> Iterator[pa.Table]:
     for piece in pieces:
         path = rows_path(job, piece)
         with pq.ParquetFile(path) as file:
@@ -206,12 +195,12 @@ def _rows(job: Job, pieces: Sequence[Piece]) -> Iterator[pa.Table]:
         path.unlink()
 
 
-def _example(results: Sequence[Judged]) -> pa.Table:
+def _example(results: Sequence[Mapping[str, int]]) -> pa.Table:
     """Return a row with texts as long as the longest of each column."""
     schema = schema_with_own_names()
     schema = schema.remove(schema.get_field_index("star"))
     longest = {
-        field.name: max((result.longest[field.name] for result in results), default=0)
+        field.name: max((result[field.name] for result in results), default=0)
         for field in schema
         if pa.types.is_string(field.type)
     }

@@ -8,6 +8,7 @@ the build.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +24,6 @@ from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, unmoved_stars
 from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.source_files import locate
 from starcat.catalog.stars import (
     add_nearest_neighbours,
     directions_of,
@@ -33,21 +33,15 @@ from starcat.catalog.stars import (
 )
 from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import separation
-from starcat.pipeline.counterparts import match_tables
+from starcat.pipeline.counterparts import match_source
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.schema import product_schema
-from starcat.store.reading import read_catalog
 
 OF_ENTRY = (
-    "catalog",
-    "counterpart_id",
-    "designation",
-    "separation_arcsec",
-    "delta_mag",
-    "n_candidates",
+    "catalog", "counterpart_id", "designation", "separation_arcsec", "delta_mag", "n_candidates",
     "probability",
-)
+)  # fmt: skip
 """Columns of the crossmatch product that the product ``motions`` has too."""
 
 
@@ -78,44 +72,33 @@ def join_motions(
     sources: list[SourceFacts] = []
     told: list[str] = []
     for name in spec.catalog.motions:
-        read = read_catalog(
-            name,
-            locate(name, inputs),
-            read_limit_mag=wanted.read_limit_mag,
-            neighbours=False,
-            workers=workers,
-            progress=progress,
+        facts, notes, matches = match_source(
+            name, "motions", stars, wanted, inputs, workers, progress
         )
-        progress("motions", 0, None)
-        matches, _ = match_tables(stars, read.stars, wanted)
         found.note(matches)
-        sources.append(_source_facts(read))
-        told += read.notes
-        del read  # a whole catalog: two of them need not fit into memory
+        sources.append(facts)
+        told += notes
     moved = _with_motions(stars, found, spec.epoch_jyear)
     table = found.table(stars, moved)
     # What reading said of stars that stay behind is no longer so.
     stale = unmoved_stars(catalog.source, stars, spec.epoch_jyear)
-    notes = (*(note for note in catalog.notes if note not in stale), *told)
+    told = [*(note for note in catalog.notes if note not in stale), *told]
     moved = add_nearest_neighbours(moved, workers)
-    return JoinedMotions(replace(catalog, stars=moved, notes=notes), table, tuple(sources))
+    return JoinedMotions(replace(catalog, stars=moved, notes=tuple(told)), table, tuple(sources))
 
 
-def motion_product(joined: JoinedMotions, guide_stars: pa.Table) -> tuple[Product, ...]:
-    """Return where the motions of guide stars are from, as a product."""
-    if joined.table is None:
+def motions_of(
+    stars: pa.Table, motions: pa.Table | None, guide_stars: pa.Table
+) -> tuple[Product, ...]:
+    """Return the rows of guide stars in a table of the motions of all stars, as a product."""
+    if motions is None:
         return ()
-    return (motions_of(joined.catalog.stars, joined.table, guide_stars),)
-
-
-def motions_of(stars: pa.Table, motions: pa.Table, guide_stars: pa.Table) -> Product:
-    """Return the rows of guide stars in a table of motions."""
     number = stars["star_id"].to_numpy()
     rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
     table = motions.take(pa.array(rows)).combine_chunks()
     own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
     table = table.set_column(0, table.schema.field(0), own)
-    return Product("motions", table, in_database=False)
+    return (Product("motions", table, in_database=False),)
 
 
 def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[SourceFacts]:
@@ -135,22 +118,19 @@ def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[S
 
 def motion_notes(spec: BuildSpec, products: Sequence[Product]) -> tuple[str, ...]:
     """Return a note where guide stars stay at the epoch of their catalog."""
-    for product in products:
-        if product.name != "motions":
-            continue
-        counts = {
-            entry["values"]: entry["counts"]
-            for entry in pc.value_counts(product.table["outcome"]).to_pylist()
-            if entry["values"] not in (JOINED, OWN_MOTION)
-        }
-        if counts:
-            reasons = ", ".join(f"{name} {counts[name]:,}" for name in sorted(counts))
-            return (
-                f"{spec.catalog.source}: {sum(counts.values()):,} of {len(product.table):,} guide "
-                f"stars have no motion in {', '.join(spec.catalog.motions)} and are not moved to "
-                f"J{spec.epoch_jyear:g} ({reasons}); the product motions lists them",
-            )
-    return ()
+    outcomes = [p.table["outcome"].to_pylist() for p in products if p.name == "motions"]
+    if not outcomes:
+        return ()
+    counts = Counter(outcomes[0])
+    unmoved = sorted(counts.keys() - {JOINED, OWN_MOTION})
+    if not unmoved:
+        return ()
+    reasons = ", ".join(f"{name} {counts[name]:,}" for name in unmoved)
+    return (
+        f"{spec.catalog.source}: {sum(counts[name] for name in unmoved):,} of {counts.total():,} "
+        f"guide stars have no motion in {', '.join(spec.catalog.motions)} and are not moved to "
+        f"J{spec.epoch_jyear:g} ({reasons}); the product motions lists them",
+    )
 
 
 @dataclass
@@ -239,10 +219,3 @@ def _with_motions(stars: pa.Table, found: _Found, epoch_jyear: float) -> pa.Tabl
         columns[name] = before.copy()
         columns[name][rows] = values
     return with_columns(stars, columns)
-
-
-def _source_facts(read: Ingested) -> SourceFacts:
-    """Return what the manifest says of a catalog of motions, but for what came of it."""
-    return SourceFacts(
-        read.source, "motions", read.files, read.rows_read, len(read.stars), read.rejected_by_reason
-    )

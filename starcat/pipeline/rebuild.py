@@ -46,10 +46,7 @@ class Rebuilt:
 
 
 def rebuild(
-    artifact: Path,
-    inputs: Inputs,
-    output: Path | None = None,
-    progress: Progress = no_progress,
+    artifact: Path, inputs: Inputs, output: Path | None = None, progress: Progress = no_progress
 ) -> Rebuilt:
     """Build an artifact again from its manifest, and compare every file."""
     old = open_artifact(artifact)

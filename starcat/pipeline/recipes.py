@@ -40,19 +40,22 @@ class ProductInputs:
     fields: FieldStars  # the tiling of the sphere and the stars in each field
     spec: BuildSpec  # which products, and their parameters
 
-    def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
-        """Return a product's radius."""
-        if radius_deg is not None:
-            return float(np.radians(radius_deg))
+    def reach_rad(self, product: str) -> float:
+        """Return how far apart two stars of a row of a product may be."""
+        wanted = getattr(self.spec.products, product)
+        if product == "pairs" and wanted.max_separation_deg is None:
+            return self.spec.camera.camera().diagonal_rad
+        reach_deg = wanted.max_separation_deg if product == "pairs" else wanted.radius_deg
+        if reach_deg is not None:
+            return float(np.radians(reach_deg))
+        # S5: 4/3 of the field's radius.
+        factor = 4.0 / 3.0 if product == "hausdorff_angular" else 1.0
         return factor * float(np.radians(self.spec.camera.half_field_deg))
 
 
 def _pairs(inputs: ProductInputs) -> Any:
-    wanted = inputs.spec.products.pairs
-    most = inputs.spec.camera.camera().diagonal_rad
-    if wanted.max_separation_deg is not None:
-        most = float(np.radians(wanted.max_separation_deg))
-    return find_pairs(inputs.directions, float(np.radians(wanted.min_separation_deg)), most)
+    least = float(np.radians(inputs.spec.products.pairs.min_separation_deg))
+    return find_pairs(inputs.directions, least, inputs.reach_rad("pairs"))
 
 
 def _triangles(inputs: ProductInputs) -> Any:
@@ -63,36 +66,32 @@ def _neighbours(inputs: ProductInputs) -> Any:
     wanted = inputs.spec.products.neighbours
     return find_neighbours(
         inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
+        inputs.reach_rad("neighbours"),
         angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
         separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
     )
 
 
 def _hausdorff_angular(inputs: ProductInputs) -> Any:
-    radius_deg = inputs.spec.products.hausdorff_angular.radius_deg
-    # S5: 4/3 of the field's radius.
-    return angular_reference_sets(inputs.directions, inputs.radius_rad(radius_deg, 4.0 / 3.0))
+    return angular_reference_sets(inputs.directions, inputs.reach_rad("hausdorff_angular"))
 
 
 def _hausdorff_l2(inputs: ProductInputs) -> Any:
-    radius_deg = inputs.spec.products.hausdorff_l2.radius_deg
-    return planar_reference_sets(inputs.directions, inputs.radius_rad(radius_deg))
+    return planar_reference_sets(inputs.directions, inputs.reach_rad("hausdorff_l2"))
 
 
 def _grid(inputs: ProductInputs) -> Any:
     wanted = inputs.spec.products.grid
     return grid_patterns(
         inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
+        inputs.reach_rad("grid"),
         buffer_rad=float(np.radians(wanted.buffer_deg)),
         cells_per_side=wanted.cells_per_side,
     )
 
 
 def _radial(inputs: ProductInputs) -> Any:
-    wanted = inputs.spec.products.radial
-    radius = inputs.radius_rad(wanted.radius_deg)
+    wanted, radius = inputs.spec.products.radial, inputs.reach_rad("radial")
     return radial_patterns(inputs.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
 
 
@@ -149,19 +148,13 @@ def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
 
 def boresight_product(fields: FieldStars, brightest: int) -> Product:
     """Return the boresights as a product."""
-    ra_deg, dec_deg = radec_from_directions(fields.boresights)
-    rows = np.arange(len(ra_deg), dtype=np.int32)
-    x, y, z = np.ascontiguousarray(fields.boresights.T)
     result = SimpleNamespace(
-        boresight=rows,
-        ra_deg=ra_deg,
-        dec_deg=dec_deg,
-        x=x,
-        y=y,
-        z=z,
+        boresight=np.arange(len(fields.count), dtype=np.int32),
         star_count=fields.count.astype(np.int32),
         brightest=Ragged(*fields.brightest(brightest)),
     )
+    result.ra_deg, result.dec_deg = radec_from_directions(fields.boresights)
+    result.x, result.y, result.z = np.ascontiguousarray(fields.boresights.T)
     return Product("boresights", table_from_result(result, product_schema("boresights")), Index())
 
 

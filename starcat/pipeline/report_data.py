@@ -8,14 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcat.artifact.manifest import (
-    DATABASE_NAME,
-    ProductFacts,
-    SourceFacts,
-    software_versions,
-)
+from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
@@ -23,6 +17,7 @@ from starcat.catalog.selection import Selected, Step
 from starcat.catalog.stars import floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
+from starcat.pipeline.counterparts import source_facts
 from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
@@ -43,37 +38,23 @@ class FilterCoverage:
     share_below_4: float  # share of the fields with fewer than 4 stars
 
 
-def _counts(step: Step, spec: BuildSpec) -> NDArray[np.int64]:
-    return tile_sphere(
-        spec.boresights.count,
-        step.directions,
-        np.zeros(len(step.directions)),
-        field_size(spec),
-        spec.boresights.field,
-    ).count
-
-
-def _filter_coverage(step: Step, count: NDArray[np.int64]) -> FilterCoverage:
-    return FilterCoverage(
-        step.name,
-        len(step.directions),
-        float(np.median(count)),
-        int(count.min()),
-        round(float((count < MIN_GUIDE_STARS).mean()), 9),
-    )
-
-
 def filter_coverages(
     steps: Sequence[Step], fields: FieldStars, spec: BuildSpec
 ) -> tuple[FilterCoverage, ...]:
     """Count what each filter leaves in the fields of the tiling."""
-    found: dict[int, FilterCoverage] = {}
+    counts = {len(steps[-1].directions): fields.count}
+    found = []
     for step in steps:
         stars = len(step.directions)
-        if stars not in found:
-            count = fields.count if stars == len(steps[-1].directions) else _counts(step, spec)
-            found[stars] = _filter_coverage(step, count)
-    return tuple(replace(found[len(step.directions)], step=step.name) for step in steps)
+        if stars not in counts:
+            wanted, mag = spec.boresights, np.zeros(stars)
+            tiled = tile_sphere(wanted.count, step.directions, mag, field_size(spec), wanted.field)
+            counts[stars] = tiled.count
+        count = counts[stars]
+        share_below_4 = round(float((count < MIN_GUIDE_STARS).mean()), 9)
+        median = float(np.median(count))
+        found.append(FilterCoverage(step.name, stars, median, int(count.min()), share_below_4))
+    return tuple(found)
 
 
 def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
@@ -82,40 +63,33 @@ def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
     return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
 
 
-def source_facts(
+def all_source_facts(
     catalog: Ingested,
     selected: Selected,
     amplitudes: Sequence[AmplitudeTable],
     joined: Mapping[str, int],
 ) -> list[SourceFacts]:
     """Return what went into a build as the manifest has it."""
-    rejected = {**catalog.rejected_by_reason, **count_by_reason(selected.rejected)}
-    for reason in catalog.rejected_by_reason.keys() & count_by_reason(selected.rejected).keys():
-        rejected[reason] += catalog.rejected_by_reason[reason]
-    facts = [
-        SourceFacts(
-            catalog.source,
-            "stars",
-            catalog.files,
-            catalog.rows_read,
-            len(selected.guide_stars),
-            rejected,
-        )
-    ]
-    for table in amplitudes:
-        read = sum(file.rows for file in table.files)
-        facts.append(
+    own = source_facts(catalog, "stars")
+    # In the order in which reasons came up.
+    rejected = dict(own.rejected)
+    for reason, count in count_by_reason(selected.rejected).items():
+        rejected[reason] = rejected.get(reason, 0) + count
+    return [
+        replace(own, kept=len(selected.guide_stars), rejected=rejected),
+        *(
             SourceFacts(
                 table.source,
                 "variability",
                 table.files,
-                read,
+                sum(file.rows for file in table.files),
                 table.kept,
                 table.rejected,
                 joined[table.source],
             )
-        )
-    return facts
+            for table in amplitudes
+        ),
+    ]
 
 
 @dataclass(frozen=True)
@@ -125,7 +99,7 @@ class BuildResults:
     spec: BuildSpec
     sources: Sequence[SourceFacts]  # what went in
     products: Sequence[Product]  # what came out
-    facts: Mapping[str, ProductFacts]  # the same as the manifest has it
+    facts: Mapping[str, Mapping[str, Any]]  # the same as the manifest has it
     fields: FieldStars  # the tiling of the guide stars
     filters: Sequence[FilterCoverage]  # what each filter left
     rates: Sequence[Rates]  # rates of the self-test
@@ -135,9 +109,10 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     """Return the report of a build as JSON holds it; its files are in the folder."""
     spec, tables = results.spec, {product.name: product.table for product in results.products}
     recorded, warning = spec.recorded(), holes_warning(coverage.gap)
-    products = {name: facts.as_dict() for name, facts in results.facts.items()}
-    for facts in products.values():
-        facts["bytes"] = (folder / facts["parquet"]).stat().st_size
+    products = {
+        name: {**facts, "bytes": (folder / facts["parquet"]).stat().st_size}
+        for name, facts in results.facts.items()
+    }
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))

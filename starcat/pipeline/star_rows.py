@@ -8,7 +8,6 @@ region are not read.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,14 +18,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcat.artifact.other_catalogs import NEEDED
-from starcat.errors import ParseError, ProductError, SchemaError, reason
+from starcat.errors import ParseError, ProductError, SchemaError
 from starcat.pipeline.counterparts import check_star_columns
 from starcat.storage.schema import product_schema
 from starcat.store.layout import (
     PROPERTIES_NAMES,
     Partition,
     Store,
+    check_has_columns,
     open_store,
+    parquet_file,
     write_properties,
 )
 from starcat.store.metadata import write_pixel_list, write_slices
@@ -49,6 +50,7 @@ _ALIKE = {
     "int64": ("uint64",),
 }
 
+_DAMAGED = "the store is damaged, make or get it again"
 _HINT = "give a catalog store, as 'starcat ingest SOURCE --to hats -o DIR' writes it"
 
 
@@ -64,17 +66,9 @@ def opened(folder: Path, run: Path) -> Store:
         )
     _check_partitions(store)
     for partition in store.catalog.partitions[:1]:
-        with _parquet(partition.paths[0]) as file:
-            names = set(file.schema_arrow.names)
-        lacking = [name for name in (*NEEDED, _pixel_column(store)) if name not in names]
-        if lacking:
-            raise SchemaError(
-                f"{folder}: no column {', '.join(lacking)}; {_HINT}",
-                product="stars",
-                field=lacking[0],
-                found=sorted(names),
-                expected=NEEDED,
-            )
+        with parquet_file(partition.paths[0], ParseError, _DAMAGED) as file:
+            names = file.schema_arrow.names
+        check_has_columns(folder, names, (*NEEDED, _pixel_column(store)), _HINT)
     return store
 
 
@@ -95,7 +89,7 @@ def rows_of_partition(
     """Yield the stars of a partition, a row group at a time."""
     first, end = partition.pixel.first, partition.pixel.end
     for path in partition.paths:
-        with _parquet(path) as file:
+        with parquet_file(path, ParseError, _DAMAGED) as file:
             for group in range(file.num_row_groups):
                 table = _read(file, group, store, columns, path)
                 pixels = table[HEALPIX_COLUMN].to_numpy()
@@ -117,7 +111,7 @@ def rows_of_region(store: Store, region: Region, columns: Sequence[str]) -> pa.T
         if not _touches(bounds, partition.pixel.first, partition.pixel.end - 1):
             continue
         for path in partition.paths:
-            with _parquet(path) as file:
+            with parquet_file(path, ParseError, _DAMAGED) as file:
                 parts += _parts(file, store, region, bounds, columns, path)
     keys = [("star_id", "ascending"), (HEALPIX_COLUMN, "ascending")]
     return pa.concat_tables(parts).sort_by(keys).combine_chunks()
@@ -193,21 +187,6 @@ def _schema(columns: tuple[str, ...]) -> pa.Schema:
 
 def _pixel_column(store: Store) -> str:
     return store.catalog.properties.get("hats_col_healpix", HEALPIX_COLUMN)
-
-
-@contextmanager
-def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a file of a store; what the library says of a damaged one is said as starcat does."""
-    try:
-        with pq.ParquetFile(path) as file:
-            yield file
-    except (OSError, pa.ArrowException, KeyError) as error:
-        why = reason(error) if isinstance(error, OSError) else str(error)
-        raise ParseError(
-            f"{path}: cannot be read as Parquet ({why}); the store is damaged, make or get it "
-            "again",
-            path=path,
-        ) from error
 
 
 def store_of_file(stars: pa.Table, path: Path, folder: Path) -> None:

@@ -161,8 +161,6 @@ def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
 def boresight_count(camera: CameraSpec) -> int:
     """Return how many boresights a camera's fields want.
 
-    Notes
-    -----
     10,000 Saff-Kuijlaars points leave no direction farther than 1.50 deg from the nearest, and
     this distance shrinks with the root of their number.
     """

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation, separation
 from starcat.products.match_figures import (
+    Census,
     Figures,
     MatchModel,
     MovingStars,
@@ -26,7 +27,6 @@ from starcat.products.match_figures import (
     measure,
 )
 from starcat.products.match_odds import Odds, match_odds, runs
-from starcat.products.star_counts import Census
 
 Rows = NDArray[np.int64]
 
@@ -69,30 +69,12 @@ class Matches:
 def crossmatch(
     stars: MovingStars, counterparts: MovingStars, radius_rad: float, model: MatchModel
 ) -> Matches:
-    """Find the counterparts of stars in another catalog.
+    """Find the counterparts of stars in another catalog, in order of (star, rank).
 
-    Parameters
-    ----------
-    stars, counterparts : MovingStars
-        The two catalogs.
-    radius_rad : float
-        Largest separation of a candidate at the epoch of the comparison, itself included.
-    model : MatchModel
-        Errors of positions and magnitudes, and what the verdicts ask for.
+    The radius is the largest separation of a candidate at the epoch of the comparison, itself
+    included. Of two candidates with the same odds the nearer one, then the one with the lower
+    row, comes first.
 
-    Returns
-    -------
-    Matches
-        In order of (star, rank). Of two candidates with the same odds the nearer one, then the
-        one with the lower row, comes first.
-
-    Raises
-    ------
-    ValueError
-        If the radius is not positive.
-
-    References
-    ----------
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2: likelihood ratio and reliability.
     """
     if not radius_rad > 0.0:
@@ -142,20 +124,8 @@ def judged(
 def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: float) -> Pairs:
     """Find every pair within a radius at the epoch that the two are compared at.
 
-    Parameters
-    ----------
-    stars, counterparts : MovingStars
-        The two catalogs.
-    radius_rad : float
-        Radians, itself included.
+    In order of (star, counterpart); the radius is included.
 
-    Returns
-    -------
-    Pairs
-        In order of (star, counterpart).
-
-    Notes
-    -----
     Both are first compared at one epoch in the middle, where each query's radius is wider by
     what its proper motion can add up to the farthest epoch on the other side: Barnard's star
     needs 10 arcsec a year of it, most stars next to nothing.
@@ -163,7 +133,8 @@ def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: f
     moving = np.flatnonzero(stars.has_motion)
     still = np.flatnonzero(~stars.has_motion)
     everyone = np.arange(len(counterparts.mag))
-    parts = []
+    none, nothing = np.empty(0, np.int64), np.empty(0)
+    parts = [Pairs(none, none, nothing, nothing, nothing)]
     if len(moving) and len(everyone):
         middle, reach = _middle(counterparts.epoch_jyear)
         drift = _speed(stars, moving) * reach
@@ -178,16 +149,8 @@ def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: f
         query = counterparts.at(everyone, middle)
         for near, found in _near(query, radius_rad + drift, stars.directions[still]):
             parts.append(_trim(stars, counterparts, still[found], near, radius_rad))
-    if not parts:
-        nothing = np.empty(0)
-        return Pairs(np.empty(0, np.int64), np.empty(0, np.int64), nothing, nothing, nothing)
-    joined = Pairs(
-        np.concatenate([part.star for part in parts]),
-        np.concatenate([part.counterpart for part in parts]),
-        np.concatenate([part.separation_rad for part in parts]),
-        np.concatenate([part.epoch_jyear for part in parts]),
-        np.concatenate([part.unmoved_years for part in parts]),
-    )
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    joined = Pairs(*map(np.concatenate, columns))
     return joined.take(np.lexsort((joined.counterpart, joined.star)))
 
 

@@ -1,23 +1,35 @@
 """What the odds of a cross-identification need to know of two whole catalogs.
 
 The density on the sky, the distribution of magnitudes, the errors, and how complete a catalog is,
-from counts and medians: the same bits whether a catalog is in one piece or read in parts.
+from counts and medians: the same bits whether a catalog is in one piece or read in parts, whose
+counts add up in any order.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from starcat.arrays import Array, Mask
-from starcat.products.star_counts import Census, MagnitudeCounts
+from starcat.arrays import Array, Directions, Mask
+from starcat.geometry.sphere import saff_kuijlaars
 
 Rows = NDArray[np.int64]
 
 ARCSEC = np.pi / (180.0 * 3600.0)  # rad
+
+TILES = 3072  # number of pieces of the sky, 13 square degrees each, in which stars are counted
+
+# The density of a tile is the mean over so many tiles around it, as one tile has few stars.
+TILES_AVERAGED = 9
+
+# Step of the distribution of magnitudes, and standard deviation of the kernel that smooths it;
+# magnitudes.
+MAG_BIN, MAG_SMOOTHING = 0.1, 0.5
 
 MIN_MEASURED = 20
 """Least number of sure pairs from which anything is measured."""
@@ -60,13 +72,89 @@ class Pairs:
 
     def take(self, rows: Rows | Mask) -> Pairs:
         """Return some of the pairs."""
-        return Pairs(
-            self.star[rows],
-            self.counterpart[rows],
-            self.separation_rad[rows],
-            self.epoch_jyear[rows],
-            self.unmoved_years[rows],
-        )
+        return Pairs(*(column[rows] for column in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class MagnitudeCounts:
+    """How many stars have which magnitude."""
+
+    lowest: int  # number of the first bin; bin k begins at ``k * MAG_BIN``
+    counts: Rows  # shape (K,): stars of each bin; empty where no magnitude is known
+
+    @classmethod
+    def of(cls, mag: Array) -> MagnitudeCounts:
+        """Count magnitudes; NaN where unknown."""
+        known = mag[~np.isnan(mag)]
+        if not len(known):
+            return cls(0, np.empty(0, dtype=np.int64))
+        place = np.floor(known / MAG_BIN).astype(np.int64)
+        lowest = int(place.min())
+        return cls(lowest, np.bincount(place - lowest))
+
+    def __add__(self, other: MagnitudeCounts) -> MagnitudeCounts:
+        if not len(self.counts) or not len(other.counts):
+            return self if len(self.counts) else other
+        lowest = min(self.lowest, other.lowest)
+        end = max(each.lowest + len(each.counts) for each in (self, other))
+        counts = np.zeros(end - lowest, dtype=np.int64)
+        for each in (self, other):
+            start = each.lowest - lowest
+            counts[start : start + len(each.counts)] += each.counts
+        return MagnitudeCounts(lowest, counts)
+
+    def density(self, wanted: Array) -> Array:
+        """Return the share of the stars per magnitude, smoothed; it integrates to 1."""
+        reach = int(np.ceil(4.0 * MAG_SMOOTHING / MAG_BIN))
+        counts = np.pad(self.counts, reach).astype(np.float64)
+        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * MAG_BIN / MAG_SMOOTHING) ** 2)
+        whole = self.counts.sum() * MAG_BIN
+        density = np.convolve(counts, kernel / kernel.sum(), mode="same") / whole
+        middles = (self.lowest - reach + 0.5 + np.arange(len(density))) * MAG_BIN
+        return np.asarray(np.interp(wanted, middles, density))
+
+
+@dataclass(frozen=True)
+class Census:
+    """Counts of the stars of a catalog, or of a part of it."""
+
+    tiles: Rows  # shape (TILES,): stars in each tile of the sky
+    magnitudes: MagnitudeCounts  # stars by magnitude
+
+    @classmethod
+    def of(cls, stars: MovingStars) -> Census:
+        """Count the stars of a catalog, or of a part of it."""
+        tiles = np.bincount(tiles_of(stars.directions), minlength=TILES)
+        return cls(tiles, MagnitudeCounts.of(stars.mag))
+
+    def __add__(self, other: Census) -> Census:
+        return Census(self.tiles + other.tiles, self.magnitudes + other.magnitudes)
+
+    @property
+    def stars(self) -> int:
+        """Number of stars counted."""
+        return int(self.tiles.sum())
+
+    def density(self) -> Array:
+        """Return the number of stars per steradian around each tile, never 0.
+
+        At least one star is counted.
+        """
+        total = np.maximum(self.tiles[_tiles()[1]].sum(axis=1).astype(np.float64), 1.0)
+        return np.asarray(total / (TILES_AVERAGED * 4.0 * np.pi / TILES))
+
+
+def tiles_of(directions: Directions) -> Rows:
+    """Return the tiles of the sky that directions are in, 0 to ``TILES - 1``."""
+    return np.asarray(_tiles()[0].query(directions)[1], dtype=np.int64)
+
+
+@cache
+def _tiles() -> tuple[cKDTree, Rows]:
+    """Return a tree of the tiles' middles, and the tiles around each."""
+    middles = saff_kuijlaars(TILES)
+    tree = cKDTree(middles)
+    return tree, np.asarray(tree.query(middles, k=TILES_AVERAGED)[1], dtype=np.int64)
 
 
 @dataclass(frozen=True)

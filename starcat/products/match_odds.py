@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array
-from starcat.products.match_figures import Figures, MatchModel, MovingStars, Pairs
-from starcat.products.star_counts import tiles_of
+from starcat.products.match_figures import Figures, MatchModel, MovingStars, Pairs, tiles_of
 
 Rows = NDArray[np.int64]
 
@@ -51,13 +51,12 @@ class Odds:
 
     def take(self, order: Rows) -> Odds:
         """Return the odds in another order."""
-        return replace(
-            self,
-            log_ratio=self.log_ratio[order],
-            probability=self.probability[order],
-            any_probability=self.any_probability[order],
-            error_rad=self.error_rad[order],
-        )
+        arrays: dict[str, Any] = {
+            name: value[order]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray)
+        }
+        return replace(self, **arrays)
 
 
 def match_odds(
@@ -68,34 +67,14 @@ def match_odds(
     figures: Figures,
     model: MatchModel,
 ) -> Odds:
-    """Return how likely each candidate is the counterpart of its star.
+    """Return how likely each candidate is the counterpart of its star, one row a pair.
 
-    Parameters
-    ----------
-    stars, counterparts : MovingStars
-        The two catalogs, or parts of them.
-    pairs : Pairs
-        All candidates within the radius, by star.
-    radius_rad : float
-        The radius.
-    figures : Figures
-        What is known of the two whole catalogs.
-    model : MatchModel
-        What a star may differ by from its own counterpart.
+    The stars may be parts of the two catalogs; the pairs are all candidates, by star.
 
-    Returns
-    -------
-    Odds
-        One row a pair.
-
-    Notes
-    -----
     ``L = Q q(dm) f(r) / n(m)``: f is the density of a star's own counterpart at the separation
     r, q that of its magnitude, n the density of all others on the sky and in magnitude. Without
     magnitudes ``q / n`` is one over the density on the sky.
 
-    References
-    ----------
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2. Without magnitudes and outliers L
     is the Bayes factor of Budavari and Szalay 2008, ApJ 679, 301, for two catalogs with normal
     errors, times Q over the number of counterparts on such a sky.
@@ -155,28 +134,13 @@ def _log_colour(delta: Array, mag: Array, figures: Figures, model: MatchModel) -
 def pair_probabilities(
     star: Rows, candidate: Rows, log_ratio: Array, completeness: float, shared: float
 ) -> tuple[Array, Array]:
-    """Return the probability of each pair.
+    """Return two probabilities of each pair: of itself, and of any candidate of its star.
 
-    Parameters
-    ----------
-    star, candidate : ndarray of int64, shape (M,)
-        Rows of the two catalogs; the stars ascend.
-    log_ratio : ndarray of float64, shape (M,)
-        Natural logarithms of the likelihood ratios.
-    completeness : float
-        Q, the share of the stars that have a counterpart.
-    shared : float
-        S, the share of the counterparts that have a star.
+    Of itself: that the candidate is the star, and neither is another's. Of any: that one of the
+    star's candidates is the star, whatever other stars claim. The stars ascend; the ratios are
+    natural logarithms, shape (M,). Q is ``completeness``, the share of the stars that have a
+    counterpart, S is ``shared``, the share of the counterparts that have a star.
 
-    Returns
-    -------
-    probability : ndarray of float64, shape (M,)
-        That the candidate is the star, and neither is another's.
-    any_probability : ndarray of float64, shape (M,)
-        That one of the star's candidates is the star, whatever other stars claim.
-
-    Notes
-    -----
     A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars
     thereabouts, of which a share S are the counterparts of others and have pairs of their own.
     A pair without rivals has the probability ``w / (1 + w)``. Messages are those of the
@@ -184,8 +148,6 @@ def pair_probabilities(
     and the same from the candidates' side, averaged with those before in their logarithms, or
     they would swing to and fro.
 
-    References
-    ----------
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2, for one star. Heilmann and Lieb
     1972, Communications in Mathematical Physics 25, 190, for matchings as a model.
     """
@@ -295,10 +257,8 @@ class _Groups:
 
 
 def runs(group: Rows) -> tuple[Rows, Rows]:
-    """Return the runs of equal numbers in a sorted array.
+    """Return where the runs of equal numbers in a sorted array begin, and their lengths.
 
-    Examples
-    --------
     >>> runs(np.array([2, 2, 7]))
     (array([0, 2]), array([2, 1]))
     """

@@ -31,9 +31,7 @@ class AngularReferenceSets:
     neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
     # shape (M,): great-circle separations of the two, radians, ascending within a star
     separation_rad: Array
-    # dataset ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-    # ``star_offsets[n]:star_offsets[n + 1]``. Attribute ``radius_rad``.
-    index: Index
+    index: Index  # dataset ``star_offsets``: the `row_offsets` of the stars; ``radius_rad``
 
 
 def angular_reference_sets(directions: Directions, radius_rad: float) -> AngularReferenceSets:
@@ -86,10 +84,8 @@ class PlanarReferenceSets:
     neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
     # shape (M,): gnomonic distance over the star's smallest one, 1 or more, ascending within a star
     ratio: Array
-    # datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-    # ``star_offsets[n]:star_offsets[n + 1]``; and ``smallest_distance``, float64, shape (N,): the
-    # distance that was divided by, in units of the focal length, NaN for a star without rows.
-    # Attribute ``radius_rad``.
+    # datasets ``star_offsets`` as above, and ``smallest_distance``, float64, shape (N,): what was
+    # divided by, in units of the focal length, NaN for a star without rows; ``radius_rad``
     index: Index
 
 
@@ -140,11 +136,9 @@ class Neighbours:
     # sum over a star is 2 pi
     successive_angle_rad: Array
     separation_rad: Array  # shape (M,): great-circle separations of the two, radians
-    # datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-    # ``star_offsets[n]:star_offsets[n + 1]``; ``lookup_offsets``, int64, shape (bins + 1,) and
+    # datasets ``star_offsets`` as above; ``lookup_offsets``, int64, shape (bins + 1,) and
     # ``lookup_rows``, int32, shape (M,): the rows in bin b of `starcat.geometry.patterns.bin_of`,
-    # ascending, are ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``. Attributes
-    # ``angle_bin_rad``, ``separation_bin_rad``, ``n_angle_bins``, ``n_separation_bins``.
+    # ascending, are ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``; the bins' numbers
     index: Index
 
 

@@ -33,8 +33,7 @@ class GridPatterns:
     alignment_star: NDArray[np.int32]
     cells: Ragged  # occupied cells as `cell_of` numbers them, ascending, each once
     # datasets ``cell_offsets``, int64, shape (cells + 1,) and ``cell_rows``, int32: the rows whose
-    # pattern has cell c, ascending, are ``cell_rows[cell_offsets[c]:cell_offsets[c + 1]]``.
-    # Attributes ``radius_rad``, ``buffer_rad``, ``cells_per_side``.
+    # pattern has cell c, ascending, are ``cell_rows[cell_offsets[c]:cell_offsets[c + 1]]``
     index: Index
 
 
@@ -65,7 +64,7 @@ def grid_patterns(
     turn = angle - angle[first][row]
     distance = np.tan(sets.separation_rad[beyond])
     cell = cell_of(distance * np.cos(turn), distance * np.sin(turn), radius_rad, cells_per_side)
-    cells, lookup = _tables(row, cell, len(first), cells_per_side**2)
+    cells, lookup = _tables("cell", row, cell, len(first), cells_per_side**2)
     parameters = {
         "radius_rad": radius_rad,
         "buffer_rad": buffer_rad,
@@ -75,13 +74,14 @@ def grid_patterns(
 
 
 def _tables(
-    row: NDArray[np.int64], cell: NDArray[np.int64], rows: int, count: int
+    name: str, row: NDArray[np.int64], cell: NDArray[np.int64], rows: int, count: int
 ) -> tuple[Ragged, dict[str, NDArray[Any]]]:
+    """Return the occupied cells (or rings) of each row, and the rows of each of ``count`` cells."""
     row, cell = np.divmod(sorted_unique(row * count + cell), count)
     order = stable_order(cell, count)
     lookup: dict[str, NDArray[Any]] = {
-        "cell_offsets": row_offsets(cell[order], count),
-        "cell_rows": row[order].astype(np.int32),
+        f"{name}_offsets": row_offsets(cell[order], count),
+        f"{name}_rows": row[order].astype(np.int32),
     }
     return Ragged(row_offsets(row, rows), cell.astype(np.int32)), lookup
 
@@ -103,10 +103,7 @@ class RadialPatterns:
     rings: Ragged  # occupied rings as `ring_of` numbers them, ascending, each once
     # shape (N,): a bit per occupied sector, the smallest of the cyclic shifts; 0 without neighbours
     sector_pattern: NDArray[np.int32]
-    # datasets ``ring_offsets``, int64, shape (rings + 1,) and ``ring_rows``, int32: the rows with
-    # ring r, ascending, are ``ring_rows[ring_offsets[r]:ring_offsets[r + 1]]``. Attributes
-    # ``radius_rad``, ``rings``, ``sectors``.
-    index: Index
+    index: Index  # datasets ``ring_offsets`` and ``ring_rows``, as those of the cells
 
 
 def radial_patterns(
@@ -131,16 +128,11 @@ def radial_patterns(
     count = len(directions)
     sets = angular_reference_sets(directions, radius_rad)
     ring = ring_of(sets.separation_rad, radius_rad, rings)
-    row, ring = np.divmod(sorted_unique(sets.star * np.int64(rings) + ring), rings)
-    order = stable_order(ring, rings)
-    lookup: dict[str, NDArray[Any]] = {
-        "ring_offsets": row_offsets(ring[order], rings),
-        "ring_rows": row[order].astype(np.int32),
-    }
+    occupied_rings, lookup = _tables("ring", sets.star.astype(np.int64), ring, count, rings)
     occupied = _sectors(directions, sets, sectors)
     return RadialPatterns(
         np.arange(count, dtype=np.int32),
-        Ragged(row_offsets(row, count), ring.astype(np.int32)),
+        occupied_rings,
         cyclic_shifts(occupied, sectors).min(axis=0).astype(np.int32),
         Index(lookup, {"radius_rad": radius_rad, "rings": rings, "sectors": sectors}),
     )

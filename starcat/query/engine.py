@@ -23,17 +23,7 @@ from typing import Any
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.progress import Progress, no_progress
-from starcat.query.messages import (
-    BROKEN,
-    DONE,
-    ENDINGS,
-    PART,
-    PROGRESS,
-    REFUSED,
-    SHORT,
-    Opening,
-    Views,
-)
+from starcat.query.messages import BROKEN, DONE, ENDINGS, PART, PROGRESS, REFUSED, SHORT, Opening
 
 OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
@@ -44,7 +34,9 @@ class Allowance:
     """The time that a query may take."""
 
     total_s: float
-    left_s: float  # of them; only waiting for the answer counts
+
+    def __post_init__(self) -> None:
+        self.left_s = self.total_s  # only waiting for the answer counts
 
 
 _waiting: list[subprocess.Popen[bytes]] = []
@@ -92,17 +84,20 @@ class Engine:
 
     def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
         self._opening = Opening(scratch / "spill", memory_gb, disk_gb, os.getpid())
-        self._views: Views | None = None
+        self._opened: tuple[Any, ...] | None = None
         self._asking = threading.RLock()
         self._ending = threading.Lock()
         self._question = 0
         self._is_late = False
         self._process = self._started()
 
-    def open(self, views: Views) -> None:
-        """Make the views; from here on the process reads nothing else."""
-        self.ask("open", views)
-        self._views = views
+    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
+        """Make views and macros by SQL; from here on the process reads nothing but some files.
+
+        ``macros`` are those that stand after FROM.
+        """
+        self.ask("open", sql, files, macros)
+        self._opened = sql, files, macros
 
     def ask(
         self,
@@ -116,10 +111,9 @@ class Engine:
             if not self.is_running:
                 self.close()
                 self._process = self._started()
-                if self._views is not None:
-                    self._answered("open", (self._views,), Allowance(OPENING_S, OPENING_S))
-            time_s = allowance or Allowance(OPENING_S, OPENING_S)
-            return self._answered(name, arguments, time_s, progress)
+                if self._opened is not None:
+                    self._answered("open", self._opened, Allowance(OPENING_S))
+            return self._answered(name, arguments, allowance or Allowance(OPENING_S), progress)
 
     @property
     def is_running(self) -> bool:
@@ -155,7 +149,7 @@ class Engine:
             with self._within(allowance):
                 _write(self._process, (name, allowance.left_s, content))
                 while kind not in ENDINGS:
-                    kind, found = self._read()
+                    kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
                     if kind == PROGRESS:
                         progress("query", found, 100)
                     elif kind in (PART, DONE):
@@ -176,10 +170,6 @@ class Engine:
             )
         told = "DuckDB failed: " if kind == BROKEN else ""
         raise QueryError(f"{told}{found}")
-
-    def _read(self) -> tuple[str, Any]:
-        kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
-        return kind, found
 
     @contextmanager
     def _within(self, allowance: Allowance) -> Iterator[None]:

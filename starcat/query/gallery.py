@@ -73,13 +73,7 @@ def _as(kind: type[Literal], text: str, where: str) -> Literal:
 
 
 def guessed(text: str) -> Literal:
-    """Return the value that a text stands for where nothing declares its type.
-
-    Examples
-    --------
-    >>> guessed("7"), guessed("-1.5e3"), guessed("007"), guessed("nan"), guessed("1_000")
-    (7, -1500.0, '007', 'nan', '1_000')
-    """
+    """Return the number of a text such as ``-1.5e3``; ``007``, ``nan``, ``1_000`` stay text."""
     if _NUMBER.fullmatch(text) and not _LEADING_ZERO.match(text):
         return int(text) if _WHOLE.fullmatch(text) else float(text)
     return text
@@ -87,13 +81,7 @@ def guessed(text: str) -> Literal:
 
 @cache
 def gallery() -> dict[str, NamedQuery]:
-    """Return all named queries.
-
-    Examples
-    --------
-    >>> gallery()["densest-fields"].values[0].default
-    10
-    """
+    """Return all named queries."""
     return {path.stem: _named_query(path) for path in sorted((FOLDER / "gallery").glob("*.sql"))}
 
 
@@ -131,7 +119,7 @@ class Macro:
 
     @property
     def is_table(self) -> bool:
-        """Whether it stands after FROM."""
+        """Whether it is a table macro, used after FROM."""
         return "AS TABLE" in self.text
 
     def statement(self, schema: str, places: str) -> str:
@@ -142,13 +130,7 @@ class Macro:
 
 @cache
 def macros() -> tuple[Macro, ...]:
-    """Return all macros, in an order in which they can be made.
-
-    Examples
-    --------
-    >>> [macro.name for macro in macros() if macro.is_table]
-    ['box', 'cone', 'field']
-    """
+    """Return all macros, in an order in which they can be made."""
     names = sorted(path.stem for path in (FOLDER / "macros").glob("*.sql"))
     return tuple(_macro(name) for name in (*FIRST, *(n for n in names if n not in FIRST)))
 
@@ -164,7 +146,6 @@ def _macro(name: str) -> Macro:
 
 
 def _parts(path: Path) -> tuple[list[str], str]:
-    """Return the lines of the comments above, and the SQL."""
     lines = path.read_text(encoding="utf-8").splitlines()
     start = next(k for k, line in enumerate(lines) if not line.startswith("--"))
     return lines[:start], "\n".join(lines[start:])

@@ -30,15 +30,6 @@ class Opening:
 
 
 @dataclass(frozen=True)
-class Views:
-    """What a process sees once it is locked."""
-
-    sql: str  # makes the views and macros
-    files: tuple[str, ...]  # the only files that it may read, with their full paths
-    macros: frozenset[str]  # names of the macros that stand after FROM
-
-
-@dataclass(frozen=True)
 class Statement:
     """A query that may run."""
 

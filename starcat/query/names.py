@@ -6,8 +6,8 @@ A name that is a word of SQL ends with an underscore: ``group.parquet`` is ``gro
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from itertools import count, product
+from collections.abc import Sequence
+from itertools import chain, count, product
 from string import ascii_lowercase
 
 _WORDS = """
@@ -50,13 +50,7 @@ def identifier(text: str) -> str:
 
 
 def short_names(many: int) -> list[str]:
-    """Return the short names of several targets, in their order.
-
-    Examples
-    --------
-    >>> short_names(3), short_names(45)[-1]
-    (['a', 'b', 'c'], 'as_')
-    """
+    """Return the short names of several targets, in their order."""
     letters = ("".join(word) for size in count(1) for word in product(ascii_lowercase, repeat=size))
     return [identifier(word) for word, _ in zip(letters, range(many), strict=False)]
 
@@ -71,26 +65,14 @@ def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
     """
     found: list[str] = []
     for name in names:
-        free = (n for n in _variants(name, name in taken) if n not in found and n not in taken)
-        found.append(next(free))
+        first = f"{name}_" if name in taken else name
+        variants = chain([first], (f"{first}_{number}" for number in count(2)))
+        found.append(next(one for one in variants if one not in (*found, *taken)))
     return found
 
 
-def _variants(name: str, is_taken: bool) -> Iterator[str]:
-    name = f"{name}_" if is_taken else name
-    yield name
-    for number in count(2):
-        yield f"{name}_{number}"
-
-
 def quoted(text: str) -> str:
-    """Return a text as SQL writes it.
-
-    Examples
-    --------
-    >>> print(quoted("Barnard's star"))
-    'Barnard''s star'
-    """
+    """Return a text as SQL writes it."""
     return "'" + text.replace("'", "''") + "'"
 
 

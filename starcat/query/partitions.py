@@ -11,12 +11,11 @@ Gorski et al. 2005, ApJ 622, 759, section 4 (HEALPix).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Directions, Mask
+from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import separation
 from starcat.store.pixels import Pixel
 
@@ -28,23 +27,14 @@ _EIGHTH_OF_FACE = np.array([1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7])
 _CORNERS = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))
 
 
-@dataclass(frozen=True)
-class Extents:
-    """Circles and boxes that hold N pixels; shape (N,) where no other is said."""
-
-    centre: Directions  # of the circles
-    reach_deg: Array  # radius of the circle
-    # Sides of the box; the first is from 0 to 360, the second is larger, also than 360 where the
-    # box goes through 0.
-    ra_from_deg: Array
-    ra_to_deg: Array
-    # Lower and upper side of the box.
-    dec_from_deg: Array
-    dec_to_deg: Array
+EXTENT = ("x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to")
+"""The direction of the middle of a circle, cosine and sine of its radius and the radius, the sides
+of a box. Angles are in degrees; ``ra_from`` is from 0 to 360, ``ra_to`` is larger, also than 360
+where the box goes through 0."""
 
 
-def extents(pixels: Sequence[Pixel]) -> Extents:
-    """Return circles and boxes that hold pixels."""
+def extents(pixels: Sequence[Pixel]) -> Array:
+    """Return circles and boxes that hold N pixels, a row of `EXTENT` for each."""
     order = np.array([pixel.order for pixel in pixels], dtype=np.int64)
     number = np.array([pixel.number for pixel in pixels], dtype=np.int64)
     centre, middle, _ = _place(order, number, 0.5, 0.5)
@@ -55,14 +45,15 @@ def extents(pixels: Sequence[Pixel]) -> Extents:
     dec = np.degrees([np.arcsin(corner[:, 2]) for corner, _, _ in corners])
     first = middle + east.min(axis=0) - MARGIN_DEG
     width = np.ptp(east, axis=0) + 2 * MARGIN_DEG
-    return Extents(
-        centre,
-        np.degrees(reach) + MARGIN_DEG,
-        np.mod(first, 360.0),
-        np.mod(first, 360.0) + width,
-        dec.min(axis=0) - MARGIN_DEG,
-        dec.max(axis=0) + MARGIN_DEG,
-    )
+    ra_from = np.mod(first, 360.0)
+    reach_deg = np.degrees(reach) + MARGIN_DEG
+    angle = np.radians(reach_deg)
+    return np.column_stack(
+        [
+            centre, np.cos(angle), np.sin(angle), reach_deg, ra_from,
+            ra_from + width, dec.min(axis=0) - MARGIN_DEG, dec.max(axis=0) + MARGIN_DEG,
+        ]
+    )  # fmt: skip
 
 
 def _place(
@@ -98,5 +89,4 @@ def _every_second_bit(number: NDArray[np.int64], order: NDArray[np.int64]) -> ND
 
 
 def _turned(angle_deg: Array) -> Array:
-    """Return angles between -180 and 180 degrees."""
     return np.mod(angle_deg + 180.0, 360.0) - 180.0

@@ -45,20 +45,8 @@ UNIT_SUFFIXES = {
 }
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What is known of a column; empty where there is none."""
-
-    unit: str = ""
-    description: str = ""
-    ucd: str = ""
-
-    def as_metadata(self) -> dict[str, str]:
-        """Return the facts as the metadata of an Arrow field."""
-        return {key: value for key, value in vars(self).items() if value}
-
-    def __str__(self) -> str:
-        return f"{self.description} [{self.unit}]" if self.unit else self.description
+Facts = Mapping[str, str]
+"""Unit, description and UCD of a column, where there are any."""
 
 
 def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
@@ -68,25 +56,19 @@ def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
     """
     found: dict[str, Facts] = {}
     for view in views:
-        for column in view.schema.columns if view.schema else ():
-            facts = Facts(column.unit, column.description, column.ucd)
-            before = found.setdefault(column.name, facts)
-            if before != facts:
-                found[column.name] = Facts(facts.unit if facts.unit == before.unit else "")
+        for column in view.described:
+            before = found.setdefault(column.name, column.facts)
+            if before != column.facts:
+                unit = before.get("unit")
+                found[column.name] = {"unit": unit} if unit and unit == column.unit else {}
     return found
 
 
 def column_facts(name: str, known: Mapping[str, Facts]) -> Facts:
-    """Return the facts of the view's column of that name, else the unit that the name ends with.
-
-    Examples
-    --------
-    >>> column_facts("width_deg", {}).unit
-    'deg'
-    """
+    """Return the facts of the view's column of that name, else the unit that the name ends with."""
     if name in known:
         return known[name]
-    return Facts(next((unit for end, unit in UNIT_SUFFIXES.items() if name.endswith(end)), ""))
+    return next(({"unit": u} for end, u in UNIT_SUFFIXES.items() if name.endswith(end)), {})
 
 
 @dataclass(frozen=True)
@@ -102,6 +84,12 @@ class ResultColumn:
     def is_number(self) -> bool:
         """Whether its values are numbers, which stand at the right of a table."""
         return bool(_NUMERIC.match(self.type)) and "[" not in self.type
+
+
+def result_column(name: str, kind: str, known: Mapping[str, Facts]) -> ResultColumn:
+    """Return a column with what is known of it."""
+    facts = column_facts(name, known)
+    return ResultColumn(name, kind, facts.get("unit", ""), facts.get("description", ""))
 
 
 @dataclass(frozen=True)
@@ -197,15 +185,9 @@ class Answer:
         astropy.table.Table
             With units and meanings; nulls are masked.
         """
-        import pyarrow as pa
-
         from starcat.exchange.array_files import astropy_table, numpy_columns
-        from starcat.exchange.columns import plain_batch, plain_schema
 
-        schema = plain_schema(self._found.schema)
-        batches = [plain_batch(batch, schema) for batch in self._found.to_batches()]
-        plain = pa.Table.from_batches(batches, schema)
-        return astropy_table(numpy_columns(plain.combine_chunks(), signed=False))
+        return astropy_table(numpy_columns(self._found, signed=False))
 
     def __repr__(self) -> str:
         """Return the size and the first columns in one line."""
@@ -245,36 +227,21 @@ class RunningQuery:
         self._known = known
 
     @cached_property
-    def _described(self) -> list[tuple[str, str]]:
-        """Names and types of the columns."""
+    def columns(self) -> list[tuple[str, str]]:
+        """Names and DuckDB's types of the columns, in order."""
         [found] = self._ask("columns", self._text, self._values)
         return list(found)
-
-    @property
-    def columns(self) -> list[str]:
-        """Names, in order."""
-        return [name for name, _ in self._described]
-
-    @property
-    def types(self) -> list[str]:
-        """DuckDB's names of their types."""
-        return [kind for _, kind in self._described]
 
     def table(self, count: int) -> ResultTable:
         """Return the first rows with what is known of their columns."""
         rows = self.rows(count + 1)
-        columns = tuple(
-            ResultColumn(name, kind, facts.unit, facts.description)
-            for name, kind in self._described
-            for facts in (column_facts(name, self._known),)
-        )
+        columns = tuple(result_column(name, kind, self._known) for name, kind in self.columns)
         return ResultTable(columns, rows[:count], len(rows) > count)
 
     def rows(self, count: int) -> list[tuple[Any, ...]]:
         """Return the first rows."""
-        *parts, (described, last) = self._ask("rows", self._text, self._values, count)
-        # Known now, without looking at the files once more.
-        self._described = described
+        # The columns are known now, without looking at the files once more.
+        *parts, (self.columns, last) = self._ask("rows", self._text, self._values, count)
         return list(chain(*parts, last))
 
     def batches(self) -> pa.RecordBatchReader:
@@ -286,13 +253,12 @@ class RunningQuery:
 
         [begun] = self._ask("batches", self._text, self._values)
         schema = pa.schema(
-            field.with_metadata(column_facts(field.name, self._known).as_metadata())
+            field.with_metadata(column_facts(field.name, self._known))
             for field in pa.ipc.open_stream(begun).schema
         )
         return pa.RecordBatchReader.from_batches(schema, self._batches(schema))
 
     def _batches(self, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-        """Give the batches that follow, with a schema that has the metadata."""
         import pyarrow as pa
 
         while (found := self._ask("next_batch")[0]) is not None:

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,9 @@ from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine, WorkerEnded
 from starcat.query.gallery import macros
-from starcat.query.messages import Statement, Views
+from starcat.query.messages import Statement
 from starcat.query.names import quoted, short_names
-from starcat.query.result import Facts, RunningQuery, column_facts, facts_by_name
+from starcat.query.result import RunningQuery, facts_by_name, result_column
 from starcat.query.spatial_macros import place_macros, place_statements, places_schema, reading
 from starcat.query.targets import Target, View, open_targets
 
@@ -76,10 +76,7 @@ class Session:
 
     @contextmanager
     def ask(
-        self,
-        text: str,
-        values: Mapping[str, Any] | None = None,
-        progress: Progress = no_progress,
+        self, text: str, values: Mapping[str, Any] | None = None, progress: Progress = no_progress
     ) -> Iterator[RunningQuery]:
         """Ask a query; its rows are read within the context."""
         statement = self.check(text)
@@ -96,24 +93,19 @@ class Session:
         yield RunningQuery(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
 
     def _allowance(self) -> Allowance:
-        return Allowance(self.limits.time_s, self.limits.time_s)
+        return Allowance(self.limits.time_s)
 
     def _described(
         self, statement: Statement, values: dict[str, Any] | None, allowance: Allowance
     ) -> str:
         """Return a query for what DESCRIBE gives, and what the columns mean."""
         asked = f"SELECT column_name, column_type FROM ({statement.text})"
-        *parts, (_, last) = self._engine.ask(
-            "rows", asked, values, MAX_COLUMNS, allowance=allowance
-        )
+        found = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
         known = facts_by_name(self._view_of(statement) or self.views)
-        rows = [
-            ", ".join(map(quoted, (name, kind, facts.unit, facts.description)))
-            for part in (*parts, last)
-            for name, kind in part
-            for facts in (column_facts(name, known),)
-        ]
-        values_of = ", ".join(f"({row})" for row in rows)
+        values_of = ", ".join(
+            f"({', '.join(map(quoted, astuple(result_column(name, kind, known))))})"
+            for name, kind in found
+        )
         return f"SELECT * FROM (VALUES {values_of}) AS t(column_name, column_type, unit, meaning)"
 
     def _view_of(self, statement: Statement) -> list[View]:
@@ -188,21 +180,21 @@ def _view_statements(name: str, view: View) -> list[str]:
     made = [f"CREATE VIEW {name} AS {reading(view)};"]
     if view.schema is None:
         return made
-    facts = {c.name: str(Facts(c.unit, c.description)) for c in view.schema.columns}
     made.append(f"COMMENT ON VIEW {name} IS {quoted(view.schema.description)};")
     return made + [
-        f"COMMENT ON COLUMN {name}.{c} IS {quoted(told)};"
-        for c, told in facts.items()
-        if c in view.columns
+        f"COMMENT ON COLUMN {name}.{c.name} IS "
+        f"{quoted(f'{c.description} [{c.unit}]' if c.unit else c.description)};"
+        for c in view.described
+        if c.name in view.columns
     ]
 
 
 def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
-    files = tuple(file for view in views for file in view.files)
+    files = [file for view in views for file in view.files]
     names = frozenset(macro.name for macro in macros() if macro.is_table)
     try:
-        engine.open(Views(preamble(targets), files, names))
+        engine.open(preamble(targets), files, names)
     except QueryError as error:
         ended = isinstance(error, WorkerEnded)
         guilty = _which_fails(engine, views) if ended else None

@@ -17,9 +17,6 @@ from starcat.query.targets import POSITION, Target, View
 
 _MACROS = Path(__file__).parent / "sql" / "spatial_macros.sql"
 
-_NUMBERS = ["x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to"]
-"""What is known of each file beside its name. Angles are in degrees."""
-
 _NEAR = "_may_be_near(found, file, known, ra, dec, radius)"
 _BETWEEN = "_may_be_between(file, known, ra_min, ra_max, dec_min, dec_max)"
 
@@ -71,17 +68,16 @@ def reading(view: View, more: str = "") -> str:
 
 def _position(view: View) -> tuple[str, str]:
     """Return SQL for right ascension and declination of a row, degrees."""
-    named = view.position or POSITION
     by_lower = {column.lower(): column for column in view.columns}
-    missing = [name for name in named if name.lower() not in by_lower]
+    missing = [name for name in view.position if name.lower() not in by_lower]
     if missing:
         told = quoted(
             f"{view.name} has no column {' and no '.join(missing)}; cone, box and field are for "
             "tables with places, name another with of := 'TABLE'"
         )
         return f"error({told})::DOUBLE", f"error({told})::DOUBLE"
-    ra, dec = (quoted_name(by_lower[name.lower()]) for name in named)
-    if view.position is None:
+    ra, dec = (quoted_name(by_lower[name.lower()]) for name in view.position)
+    if view.position == POSITION:
         return ra, dec
     # Of a catalog of others it is not known whether right ascensions are from 0 or from -180 on.
     return f"({ra}::DOUBLE - 360 * floor({ra}::DOUBLE / 360))", f"{dec}::DOUBLE"
@@ -89,25 +85,17 @@ def _position(view: View) -> tuple[str, str]:
 
 def _known_of_files(view: View) -> str:
     """Return a list, as SQL writes it, of circles and boxes on the sky that hold the files."""
+    from starcat.query.partitions import EXTENT, extents
+
     if not view.pixels:
-        kinds = ", ".join(f"{name} DOUBLE" for name in _NUMBERS)
+        kinds = ", ".join(f"{name} DOUBLE" for name in EXTENT)
         return f"[]::STRUCT(file VARCHAR, {kinds}, files BIGINT)[]"
-    import numpy as np
-
-    from starcat.query.partitions import extents
-
-    found = extents(view.pixels)
-    reach = np.radians(found.reach_deg)
-    table = np.column_stack([
-        found.centre, np.cos(reach), np.sin(reach), found.reach_deg,
-        found.ra_from_deg, found.ra_to_deg, found.dec_from_deg, found.dec_to_deg,
-    ])  # fmt: skip
     rows = ", ".join(
         f"({quoted(file)}, {', '.join(map(repr, numbers))})"
-        for file, numbers in zip(view.files, table.tolist(), strict=True)
+        for file, numbers in zip(view.files, extents(view.pixels).tolist(), strict=True)
     )
-    row = ", ".join(f"'{name}': {name}" for name in ("file", *_NUMBERS))
-    names = ", ".join(("file", *_NUMBERS))
+    row = ", ".join(f"'{name}': {name}" for name in ("file", *EXTENT))
+    names = ", ".join(("file", *EXTENT))
     return (
         f"(SELECT list({{{row}, 'files': {len(view.files)}}}) FROM (VALUES {rows}) AS t({names}))"
     )

@@ -13,7 +13,7 @@ from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
 from starcat.query.names import distinct, identifier, short_names
-from starcat.storage.schema import ProductSchema, product_schema
+from starcat.storage.schema import ProductSchema, SchemaColumn, product_schema
 
 if TYPE_CHECKING:
     from starcat.store.layout import Store
@@ -31,10 +31,14 @@ class View:
     columns: tuple[str, ...]
     # The schema of the product, with units and meanings of its columns.
     schema: ProductSchema | None = None
-    # Columns with right ascension and declination, where they have other names than in starcat.
-    position: tuple[str, str] | None = None
+    position: tuple[str, str] = POSITION  # columns with right ascension and declination
     # For each file the part of the sky that its rows are in; empty where that is not known.
     pixels: tuple[Pixel, ...] = ()
+
+    @property
+    def described(self) -> tuple[SchemaColumn, ...]:
+        """What is known of its columns; nothing of tables that starcat did not write."""
+        return self.schema.columns if self.schema else ()
 
     @cached_property
     def files(self) -> tuple[str, ...]:
@@ -110,7 +114,6 @@ def _artifact(folder: Path) -> Target:
 
 
 def _check_file(path: Path) -> None:
-    """Check that a Parquet file is whole enough to be opened."""
     try:
         with path.open("rb") as file:
             begins = file.read(4)
@@ -131,11 +134,8 @@ def _tables(path: Path, engine: Engine) -> Target:
     """Return a Parquet file, with the rejected rows beside it where there are any."""
     from starcat.catalog.verdict import rejected_path
 
-    views = [_table(path, engine)]
-    beside = rejected_path(path)
-    if beside.is_file():
-        views.append(_table(beside, engine))
-    return Target(identifier(path.stem), "", tuple(views))
+    files = [path, *filter(Path.is_file, [rejected_path(path)])]
+    return Target(identifier(path.stem), "", tuple(_table(file, engine) for file in files))
 
 
 def _folder(path: Path, files: Sequence[Path], engine: Engine) -> Target:
@@ -150,7 +150,6 @@ def _folder(path: Path, files: Sequence[Path], engine: Engine) -> Target:
 
 
 def _store_in(folder: Path) -> Store | None:
-    """Return the store of a folder, if it is one."""
     from starcat.store.layout import is_store, open_store
 
     return open_store(folder) if is_store(folder) else None
@@ -172,7 +171,7 @@ def _store(store: Store, engine: Engine) -> Target:
     stars = replace(
         stars,
         name=stars.schema.product if stars.schema else "stars",
-        position=None if named == POSITION else named,
+        position=named,
         pixels=tuple(pixel for _, pixel in parts),
     )
     beside = {
@@ -217,7 +216,6 @@ def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
 
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
-    """Return the source that a text names, and the files it names of it."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import source_of_file
 
@@ -230,7 +228,6 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
 
 
 def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
-    """Read an archive's files into Parquet files that a query can see."""
     from starcat.catalog.ingest import ingest
     from starcat.catalog.source_files import locate
     from starcat.storage.parquet import write_parquet

@@ -23,17 +23,8 @@ import duckdb
 
 from starcat.errors import QueryError
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.query.messages import (
-    BROKEN,
-    DONE,
-    PART,
-    PROGRESS,
-    REFUSED,
-    SHORT,
-    Opening,
-    Statement,
-    Views,
-)
+from starcat.query.messages import BROKEN, DONE, PART, PROGRESS, REFUSED, SHORT, Opening, Statement
+from starcat.query.names import quoted_name
 from starcat.query.statement import check_statement
 
 if TYPE_CHECKING:
@@ -116,18 +107,18 @@ class Worker:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
         )
 
-    def open(self, views: Views) -> None:
+    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
         """Make the views, and allow no other file and no other setting from here on."""
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
-        self._connection.execute(views.sql)
-        self._macros = views.macros
+        self._connection.execute(sql)
+        self._macros = macros
         # Progress is kept, and printed by who asks for it. Times have the zone UTC everywhere.
         self._connection.execute(
             "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
             "SET TimeZone = 'UTC'"
         )
-        self._connection.execute("SET allowed_paths = $files", {"files": list(views.files)})
+        self._connection.execute("SET allowed_paths = $files", {"files": files})
         self._connection.execute("SET enable_external_access = false")
         self._connection.execute("SET lock_configuration = true")
 
@@ -215,7 +206,6 @@ def _settings(opening: Opening) -> dict[str, Any]:
 
 
 def _parts(running: Any, count: int) -> Iterator[list[tuple[Any, ...]]]:
-    """Give the first rows of a query, some thousand at once."""
     left = count
     while left > 0:
         asked = min(left, ROWS_AT_ONCE)
@@ -235,8 +225,7 @@ def _without_zones(text: str, columns: list[tuple[str, str]]) -> str:
             value = f"#{k} AT TIME ZONE 'UTC'"
         else:
             value = f"CAST(#{k} AS VARCHAR)" if _ZONED.search(kind) else f"#{k}"
-        quoted = name.replace('"', '""')
-        chosen.append(f'{value} AS "{quoted}"')
+        chosen.append(f"{value} AS {quoted_name(name)}")
     return f"SELECT {', '.join(chosen)} FROM ({text})"
 
 
@@ -253,7 +242,6 @@ def _in_utc(rows: list[tuple[Any, ...]], zoned: list[int]) -> list[tuple[Any, ..
 
 
 def _as_stream(schema: pa.Schema, batch: pa.RecordBatch | None = None) -> bytes:
-    """Return a batch, or the schema alone, as an Arrow stream."""
     import pyarrow as pa
 
     sink = pa.BufferOutputStream()
@@ -264,7 +252,6 @@ def _as_stream(schema: pa.Schema, batch: pa.RecordBatch | None = None) -> bytes:
 
 
 def _failure(error: Exception) -> tuple[str, str]:
-    """Return the kind of a failure, and what is to be said about it."""
     words = str(error).strip() or type(error).__name__
     if isinstance(error, QueryError):
         return REFUSED, words

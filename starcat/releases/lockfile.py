@@ -145,7 +145,6 @@ def pull_wanted(
 
 
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
-    """Return where an artifact was pulled from before."""
     if pin is None:
         raise ConfigError(
             f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "

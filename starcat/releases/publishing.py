@@ -69,7 +69,7 @@ def publish_artifact(artifact: Path, registry: str, progress: Progress = no_prog
     with writing(root, "what has arrived is kept: publish again to go on"):
         _prepare(root)
         _check_not_taken(root, release)
-        new = _keep_all(root, contents, progress)
+        new = _add_all(root, contents, progress)
         is_new = _record(root, release)
         _make_index(root)
     return Published(
@@ -78,7 +78,6 @@ def publish_artifact(artifact: Path, registry: str, progress: Progress = no_prog
 
 
 def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
-    """Return the files of a whole artifact and the release that they make."""
     manifest = check_artifact(artifact).manifest
     files = files_of(manifest, str(artifact / MANIFEST_NAME))
     path = artifact / MANIFEST_NAME
@@ -128,26 +127,26 @@ def _check_not_taken(root: Path, release: Listed) -> bool:
     return True
 
 
-def _keep_all(root: Path, contents: dict[Path, Blob], progress: Progress) -> set[Blob]:
+def _add_all(root: Path, contents: dict[Path, Blob], progress: Progress) -> set[Blob]:
     """Have all content in the registry, and return what was new."""
     total, done, new = sum(blob.bytes for blob in contents.values()), 0, set()
     for path, blob in contents.items():
         progress("publish", done, total)
-        if _keep(root, path, blob):
+        if _add_blob(root, path, blob):
             new.add(blob)
         done += blob.bytes
     progress("publish", done, total)
     return new
 
 
-def _keep(root: Path, source: Path, blob: Blob) -> bool:
+def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
     """Have content in the registry, and return whether it is new there."""
     final = root / blob.path
     part = root / INCOMING / f"{blob.sha256}.part"
     with locked(part) as is_mine:
         if os.path.lexists(final):
             part.unlink(missing_ok=True)
-            _check_kept(final, blob)
+            _check_blob(final, blob)
             return False
         arriving = part if is_mine else unique(part.parent, part.name)
         copy_to_part(source, blob, arriving)
@@ -161,8 +160,7 @@ def _keep(root: Path, source: Path, blob: Blob) -> bool:
     return True
 
 
-def _check_kept(path: Path, blob: Blob) -> None:
-    """Refuse to build a release upon a damaged blob."""
+def _check_blob(path: Path, blob: Blob) -> None:
     whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
     if not whole or file_sha256(path) != blob.sha256:
         raise damaged(

@@ -124,13 +124,8 @@ def _workplace(final: Path, release: Release) -> Iterator[Path]:
 
 
 def _assemble(
-    registry: Registry,
-    release: Release,
-    place: Path,
-    progress: Progress,
-    max_bytes: int | None,
+    registry: Registry, release: Release, place: Path, progress: Progress, max_bytes: int | None
 ) -> Path:
-    """Bring what is missing of a release, and return its folder, found whole."""
     whole, stage = place / "artifact", f"pull {release.name}"
     where = f"{registry.address}: {release.title}"
     _remove_links(place)
@@ -182,12 +177,10 @@ def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> N
 
 
 def _from(offset: int, total: int, stage: str, progress: Progress) -> Progress:
-    """Report the progress of one file as that of all."""
     return lambda name, done, of: progress(stage, offset + done, total)
 
 
 def _remove_links(place: Path) -> None:
-    """Remove what would lead out of the workplace."""
     for path in [*place.rglob("*")]:
         if path.is_symlink():
             path.unlink()

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
+from starcat.failures import validation_message
 from starcat.specs.product_sections import NAME_PATTERN, VERSION_PATTERN, version_numbers
 from starcat.storage.digests import json_bytes
 
@@ -141,13 +142,9 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(step) for step in first["loc"])
-        found = "" if first["type"] == "json_invalid" else f" (found {str(first['input'])[:80]!r})"
-        raise ProductError(
-            f"{where}: not what starcat writes: {place + ': ' if place else ''}{first['msg']}"
-            f"{found}; {advice}"
-        ) from error
+        key, found = validation_message(error, show_input=True)
+        named = f"{key}: {found}" if key else found
+        raise ProductError(f"{where}: not what starcat writes: {named}; {advice}") from error
 
 
 def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:

@@ -7,6 +7,7 @@ radius of the sphere that is projected.
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from html import escape
@@ -72,6 +73,21 @@ def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> 
     return raster
 
 
+MERIDIANS_DEG = (0, 60, 120, 240, 300)
+"""Right ascensions of the lines of a map; that of the edge is drawn as such."""
+
+
+def parallels() -> Iterator[tuple[float, float, str]]:
+    """Yield x of the right end, y and label of the parallels of a map, every 30 degrees.
+
+    Labels stand left of the edge, by a little more than the edge leans away from them.
+    """
+    for dec in range(-60, 90, 30):
+        x, y = project([180.0, 180.0], [dec, dec])
+        label = f"{dec:+d}°".replace("-", "\N{MINUS SIGN}") if dec else "0°"
+        yield abs(float(x[0])), float(y[0]), label
+
+
 def galactic_equator(count: int = 721) -> tuple[Array, Array]:
     """Return ra_deg and dec_deg along the galactic equator, the first again at the end."""
     pole = directions_from_radec(*GALACTIC_POLE_DEG)
@@ -109,7 +125,6 @@ class Fields:
     triangles: Counts
 
     def __len__(self) -> int:
-        """Return the number of fields."""
         return len(self.ra_deg)
 
 
@@ -235,25 +250,24 @@ def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
 
 @cache
 def _meridians() -> tuple[Line, ...]:
-    """Return the meridians, every 60 degrees but for that of the edge."""
     dec = np.linspace(-90.0, 90.0, 61)
     return tuple(
         Line(_path(*project(np.full(61, ra), dec)), f"{ra}°", *_place(ra, 0.0))
-        for ra in (0, 60, 120, 240, 300)
+        for ra in MERIDIANS_DEG
     )
 
 
 @cache
 def _parallels() -> tuple[Line, ...]:
-    """Return the parallels, every 30 degrees; labels stand left of the edge."""
-    lines = []
-    for dec in range(-60, 90, 30):
-        x, y = project([180.0, 180.0], [dec, dec])
-        end = np.array([-abs(x[0]), abs(x[0])])
-        label = f"{dec:+d}°".replace("-", "\N{MINUS SIGN}") if dec else "0°"
-        at = round(float(-1.03 * abs(x[0]) * UNIT), 1), round(float(-1.03 * y[0] * UNIT), 1)
-        lines.append(Line(_path(end, y), label, *at))
-    return tuple(lines)
+    return tuple(
+        Line(
+            _path(np.array([-end, end]), np.full(2, y)),
+            label,
+            round(-1.03 * end * UNIT, 1),
+            round(-1.03 * y * UNIT, 1),
+        )
+        for end, y, label in parallels()
+    )
 
 
 @cache

@@ -58,11 +58,11 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         *(_source(source, content["reasons"]) for source in content["sources"]),
         "<h2>Selection</h2>",
         _filters(content["filters"]),
-        _plot("stars_by_magnitude", plots),
+        figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
-        _plot("coverage_map", plots),
-        _plot("coverage_histogram", plots),
+        figure(_ALT["coverage_map"], plots["coverage_map"]),
+        figure(_ALT["coverage_histogram"], plots["coverage_histogram"]),
         "<h2>Products</h2>",
         _products(content["products"], content["database_bytes"]),
         "<h2>Self-test</h2>",
@@ -74,20 +74,22 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         "<p>Seconds and memory of each build are in the file <code>"
         f"{escape(title)}.build.json</code> beside the database: they differ from run to run.</p>",
     ]
+    return html_page(f"{title}: build report", parts)
+
+
+def html_page(title: str, parts: Iterable[str], more_style: str = "") -> str:
+    """Return a page of parts that are HTML."""
     body = "\n".join(parts)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}: build report</title>\n<style>{STYLE}</style>\n</head>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}{more_style}</style>\n</head>\n"
         f"<body>\n{body}\n</body>\n</html>\n"
     )
 
 
 def table(
-    caption: str,
-    columns: Sequence[str],
-    rows: Iterable[Sequence[Any]],
-    numbers: Sequence[int] = (),
+    caption: str, columns: Sequence[str], rows: Iterable[Sequence[Any]], numbers: Sequence[int] = ()
 ) -> str:
     """Return a table."""
     kinds = [' class="number"' if k in numbers else "" for k in range(len(columns))]
@@ -119,11 +121,10 @@ def _class(cell: Any, kind: str) -> str:
     return ' class="digest"' if is_digest else kind
 
 
-def _plot(name: str, plots: Mapping[str, bytes]) -> str:
-    data = base64.b64encode(plots[name]).decode()
-    return (
-        f'<figure><img alt="{escape(_ALT[name])}" src="data:image/svg+xml;base64,{data}"></figure>'
-    )
+def figure(alt: str, svg: bytes) -> str:
+    """Return a drawing within the page."""
+    data = base64.b64encode(svg).decode()
+    return f'<figure><img alt="{escape(alt)}" src="data:image/svg+xml;base64,{data}"></figure>'
 
 
 def _summary(content: Mapping[str, Any]) -> str:

@@ -18,8 +18,10 @@ from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.report.coverage_map import (
     HALF_HEIGHT,
     HALF_WIDTH,
+    MERIDIANS_DEG,
     galactic_equator,
     nearest_raster,
+    parallels,
     project,
 )
 
@@ -56,6 +58,7 @@ _COLOURS = 24
 
 def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
     """Draw the number of stars in each field over the whole sky."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
     from matplotlib.patches import Ellipse
 
@@ -68,7 +71,7 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
         axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
         edge = Ellipse((0, 0), 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fill=False, color="#333", lw=1)
         axes.add_patch(edge)
-        colours = colour_map(min(most - least + 1, _COLOURS))
+        colours = colormaps["viridis"].resampled(min(most - least + 1, _COLOURS))
         extent = (-HALF_WIDTH, HALF_WIDTH, -HALF_HEIGHT, HALF_HEIGHT)
         image = axes.imshow(
             raster, colours, vmin=least - 0.5, vmax=most + 0.5, extent=extent,
@@ -105,28 +108,16 @@ def headline(figure: Figure, title: str, below: str) -> None:
     figure.text(0.03, 1.0 - 0.52 / height, below, color="#555")
 
 
-def colour_map(steps: int) -> Any:
-    """Return a colour map for counts."""
-    import matplotlib
-
-    return matplotlib.colormaps["viridis"].resampled(steps)
-
-
 def _graticule(axes: Axes) -> None:
-    """Draw meridians and parallels every 60 and 30 deg, labelled."""
     line: dict[str, Any] = {"color": "white", "lw": 0.5, "alpha": 0.55}
     dec = np.linspace(-90.0, 90.0, 91)
-    for ra in (0, 60, 120, 240, 300):
+    for ra in MERIDIANS_DEG:
         x, y = project(np.full(91, ra), dec)
         axes.plot(x, y, **line)
         # The label is on the side of the meridian that the galactic equator does not cross.
         axes.text(float(x[45]) - 0.03, 0.03, f"{ra}°", color="white", ha="right", size=8)
-    for value in range(-60, 90, 30):
-        x, y = project([180.0, 180.0], [value, value])
-        end, height = abs(float(x[0])), float(y[0])
-        axes.plot([-end, end], y, **line)
-        # The edge of the map leans away from the label of its parallel.
-        label = f"{value:+d}°".replace("-", "\N{MINUS SIGN}") if value else "0°"
+    for end, height, label in parallels():
+        axes.plot([-end, end], [height, height], **line)
         axes.text(-1.03 * end - 0.02, 1.03 * height, label, ha="right", va="center", size=8)
 
 

@@ -5,7 +5,7 @@ All of it is plain data of the stages before; the files hold neither clock nor h
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,6 @@ class CoverageReport:
     gap: TilingGap  # the widest gap between the boresights
 
     def __repr__(self) -> str:
-        """Return the stars of a field in one line."""
         stars = self.summary.stars
         return (
             f"<CoverageReport: {self.summary.fields:,} fields of {stars.minimum} to "
@@ -48,17 +47,15 @@ class CoverageReport:
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as JSON holds it."""
         summary, gap = self.summary, self.gap
-        counts = {
-            name: {**asdict(spread), "mean": round(spread.mean, DECIMALS)}
-            for name, spread in (
-                ("stars", summary.stars),
-                ("pairs", summary.pairs),
-                ("triangles", summary.triangles),
-            )
-        }
+        spreads = (summary.stars, summary.pairs, summary.triangles)
+        stars, pairs, triangles = (
+            {**asdict(spread), "mean": round(spread.mean, DECIMALS)} for spread in spreads
+        )
         return {
             "fields": summary.fields,
-            **counts,
+            "stars": stars,
+            "pairs": pairs,
+            "triangles": triangles,
             "worst_field": {
                 "boresight": summary.worst_boresight,
                 "ra_deg": round(summary.worst_ra_deg, DECIMALS),
@@ -98,22 +95,22 @@ def coverage_csv(coverage: Coverage) -> bytes:
     """Return the coverage by boresight as CSV."""
     ra_deg, dec_deg = radec_from_directions(coverage.boresights)
     columns = (ra_deg, dec_deg, coverage.stars, coverage.pairs, coverage.triangles)
-    lines = ["boresight,ra_deg,dec_deg,stars,pairs,triangles"]
-    for number, (ra, dec, *counts) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-        lines.append(f"{number},{ra:.6f},{dec:.6f},{counts[0]},{counts[1]},{counts[2]}")
-    return ("\n".join(lines) + "\n").encode()
+    rows = enumerate(zip(*(column.tolist() for column in columns), strict=True))
+    return _csv(
+        "boresight,ra_deg,dec_deg,stars,pairs,triangles",
+        (f"{n},{ra:.6f},{dec:.6f},{a},{b},{c}" for n, (ra, dec, a, b, c) in rows),
+    )
 
 
-def histogram_csv(summary: CoverageSummary) -> bytes:
-    """Return the histogram of stars in a field as CSV."""
-    rows = (f"{stars},{fields}" for stars, fields in enumerate(summary.histogram.tolist()))
-    return ("\n".join(["stars,fields", *rows]) + "\n").encode()
+def _csv(head: str, rows: Iterable[str]) -> bytes:
+    return ("\n".join([head, *rows]) + "\n").encode()
 
 
 def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str]:
     """Write tables and plots of a coverage."""
     (folder / "coverage.csv").write_bytes(coverage_csv(report.coverage))
-    (folder / "coverage_histogram.csv").write_bytes(histogram_csv(report.summary))
+    histogram = (f"{n},{fields}" for n, fields in enumerate(report.summary.histogram.tolist()))
+    (folder / "coverage_histogram.csv").write_bytes(_csv("stars,fields", histogram))
     (folder / "coverage.json").write_bytes(json_bytes(report.as_dict()))
     save_plot(draw_map(title, report.coverage, report.summary), folder, "coverage_map")
     save_plot(draw_histogram(title, report.summary), folder, "coverage_histogram")
@@ -144,19 +141,17 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
         np.bincount((one - first).astype(np.int64), minlength=count).tolist() for one in bins
     )
     edges = ((first + np.arange(count + 1)) * MAG_BIN).tolist()
-    return {
-        "from_mag": edges[:-1],
-        "to_mag": edges[1:],
-        "guide_stars": kept,
-        "rejected": rejected,
-    }
+    return {"from_mag": edges[:-1], "to_mag": edges[1:], "guide_stars": kept, "rejected": rejected}
 
 
 def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageReport) -> None:
     """Write all files of a report; ``content`` is that of report.json."""
     title, counts = f"{content['name']}-{content['version']}", content["magnitudes"]
     write_coverage(folder, title, coverage)
-    (folder / "stars_by_magnitude.csv").write_bytes(_magnitude_csv(counts))
+    names = ("from_mag", "to_mag", "guide_stars", "rejected")
+    rows = zip(*(counts[name] for name in names), strict=True)
+    bars = _csv(",".join(names), (f"{a:g},{b:g},{kept},{out}" for a, b, kept, out in rows))
+    (folder / "stars_by_magnitude.csv").write_bytes(bars)
     save_plot(draw_magnitudes(title, counts["band"], counts), folder, "stars_by_magnitude")
     (folder / "self_test.json").write_bytes(json_bytes(content["self_test"]))
     (folder / "report.json").write_bytes(json_bytes(content))
@@ -165,10 +160,3 @@ def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageRep
         for name in ("coverage_map", "coverage_histogram", "stars_by_magnitude")
     }
     (folder / "index.html").write_text(report_page(content, plots), encoding="utf-8")
-
-
-def _magnitude_csv(counts: Mapping[str, Any]) -> bytes:
-    names = ("from_mag", "to_mag", "guide_stars", "rejected")
-    rows = zip(*(counts[name] for name in names), strict=True)
-    lines = [",".join(names), *(f"{a:g},{b:g},{kept},{out}" for a, b, kept, out in rows)]
-    return ("\n".join(lines) + "\n").encode()

@@ -11,21 +11,13 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import (
-    catalogs,
-    databases,
-    identify,
-    jobs,
-    releases,
-    specs,
-    sql,
-)
+from starcat.service.access import Authentication, Identities
+from starcat.service.api import catalogs, databases, identify, jobs, releases, specs, sql
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.removal import keep_removing
 from starcat.service.security import metrics
-from starcat.service.security.auth import Authentication, Identities
 from starcat.service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
 from starcat.service.security.origin import Origins
 from starcat.service.security.request_limits import BodyLimits, check_shape
@@ -67,7 +59,7 @@ def make_app(settings: Settings) -> FastAPI:
     app = FastAPI(
         title="starcat",
         version=__version__,
-        description="Guide-star databases for star trackers: designed, built, asked and shipped.",
+        description="Guide-star databases for star trackers: design, build, query, release.",
         lifespan=_lifespan,
         openapi_url="/api/openapi.json",
         docs_url=None,

@@ -142,7 +142,7 @@ class Catalogs:
         found = self._cached(self._read, key)
         if found is not None:
             return found[0]
-        check_size(spec)
+        _check_size(spec)
         with self._lock:
             future = self._underway.get(key)
             if future is None:
@@ -223,8 +223,7 @@ def is_here(name: str) -> bool:
         return False
 
 
-def check_size(spec: BuildSpec) -> None:
-    """Check that the files of a spec's catalogs are not too large to be read for an estimate."""
+def _check_size(spec: BuildSpec) -> None:
     for name in _sources_read(spec):
         limit = spec.catalog.read_limit_mag
         key = "catalog.read_limit_mag"
@@ -248,7 +247,6 @@ def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
 
 
 def _stamps(name: str) -> list[tuple[str, int, int]]:
-    """Return path, size and time of the files of a source."""
     found = []
     for path in source_files(name, locate(name, {})):
         stat = path.stat()

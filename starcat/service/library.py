@@ -52,7 +52,7 @@ class Database:
 
     @property
     def description(self) -> str:
-        """What the spec says of it."""
+        """Description from the spec."""
         return str(self.spec.get("description") or "")
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 from starcat.errors import TargetMissing
@@ -13,51 +12,19 @@ DATABASE_ID = re.compile(r"[0-9a-f]{16}")
 JOB_ID = re.compile(r"[0-9a-f]{32}")
 
 
-@dataclass(frozen=True)
 class ServicePaths:
     """Files and folders of a service."""
 
-    root: Path  # its folder, in full
-
-    @property
-    def records(self) -> Path:
-        """The SQLite file with jobs, tokens and what else is remembered."""
-        return self.root / "records.sqlite"
-
-    @property
-    def lock(self) -> Path:
-        """What the one server of this root holds while it runs."""
-        return self.root / "server.lock"
-
-    @property
-    def databases(self) -> Path:
-        """Built databases, a folder each, by id."""
-        return self.root / "databases"
-
-    @property
-    def registry(self) -> Path:
-        """The registry that releases are published into."""
-        return self.root / "registry"
-
-    @property
-    def catalogs(self) -> Path:
-        """Star tables of catalogs that were read."""
-        return self.root / "catalogs"
-
-    @property
-    def jobs(self) -> Path:
-        """A folder for each job: its log, and what it makes before it is whole."""
-        return self.root / "jobs"
-
-    @property
-    def results(self) -> Path:
-        """Answers to asynchronous queries."""
-        return self.root / "results"
-
-    @property
-    def scratch(self) -> Path:
-        """Uploads and files that are on their way; emptied at each start."""
-        return self.root / "scratch"
+    def __init__(self, root: Path) -> None:
+        self.root = root  # its folder, in full
+        self.records = root / "records.sqlite"  # jobs, tokens and what else is remembered
+        self.lock = root / "server.lock"  # what the one server of this root holds while it runs
+        self.databases = root / "databases"  # a folder each, by id
+        self.registry = root / "registry"  # what releases are published into
+        self.catalogs = root / "catalogs"  # star tables of catalogs that were read
+        self.jobs = root / "jobs"  # a folder each: its log, and what is not whole yet
+        self.results = root / "results"  # answers to asynchronous queries
+        self.scratch = root / "scratch"  # what is on its way; emptied at each start
 
     def database(self, database_id: str) -> Path:
         """Return the folder that the folder of a database lies in."""

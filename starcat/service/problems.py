@@ -54,13 +54,13 @@ _logger = logging.getLogger(__name__)
 class ProblemDetails(BaseModel):
     """What is sent when a request cannot be answered."""
 
-    type: str = Field("about:blank", description="Kind of the problem, as RFC 9457 says.")
+    type: str = Field("about:blank", description="Kind of the problem (RFC 9457).")
     title: str = Field(description="Words of the status.")
     status: int = Field(description="Status of the answer.")
     detail: str = Field(description="What was found, what was expected, what to do next.")
     code: int = Field(1, description="Exit code that the command line gives for it.")
     kind: str | None = Field(None, description="Class of the error.")
-    hint: str | None = Field(None, description="The part of the detail that says what to do.")
+    hint: str | None = Field(None, description="Part of the detail that tells what to do.")
     key: str | None = Field(None, description="Key of the spec, or parameter, that is wrong.")
 
 

@@ -142,15 +142,14 @@ class Records:
         self._of_thread = threading.local()
         self._migrate()
 
-    @contextmanager
-    def reading(self) -> Iterator[sqlite3.Connection]:
-        """Give the connection of this thread, to read."""
-        yield self._connection()
+    def rows(self, statement: str, *values: object) -> list[sqlite3.Row]:
+        """Return all rows that a statement reads."""
+        return self.connection().execute(statement, values).fetchall()
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """Give the connection of this thread within a transaction that nobody else writes in."""
-        connection = self._connection()
+        connection = self.connection()
         connection.execute("BEGIN IMMEDIATE")
         try:
             yield connection
@@ -166,7 +165,8 @@ class Records:
             connection.close()
             self._of_thread.connection = None
 
-    def _connection(self) -> sqlite3.Connection:
+    def connection(self) -> sqlite3.Connection:
+        """Return the connection of this thread."""
         connection: sqlite3.Connection | None = getattr(self._of_thread, "connection", None)
         if connection is None:
             connection = sqlite3.connect(self.path, timeout=WAIT_S, isolation_level=None)

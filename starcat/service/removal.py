@@ -11,7 +11,6 @@ import logging
 import secrets
 import shutil
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from starcat.service.jobs.job import ENDED, QUERY, State
@@ -47,27 +46,17 @@ def remove_database(service: Service, database_id: str) -> None:
     shutil.rmtree(gone, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class Removed:
-    """How many of each were removed."""
-
-    jobs: int
-    results: int
-    scratch: int
-    sessions: int
-
-
-def remove_old(service: Service, now_s: float) -> Removed:
-    """Remove what is older than the settings say."""
+def remove_old(service: Service, now_s: float) -> dict[str, int]:
+    """Remove what is older than the settings say, and return how many of each."""
     settings, paths = service.settings, service.paths
-    removed = Removed(
-        _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
-        _remove_entries(paths.results, now_s - settings.keep_results_days * DAY_S),
-        _remove_entries(paths.scratch, now_s - SCRATCH_DAYS * DAY_S),
-        SessionStore(service.records, settings.session_hours).forget_expired(),
-    )
-    if removed != Removed(0, 0, 0, 0):
-        _logger.info("removed what is old", extra={"facts": {"removed": vars(removed)}})
+    removed = {
+        "jobs": _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
+        "results": _remove_entries(paths.results, now_s - settings.keep_results_days * DAY_S),
+        "scratch": _remove_entries(paths.scratch, now_s - SCRATCH_DAYS * DAY_S),
+        "sessions": SessionStore(service.records, settings.session_hours).forget_expired(),
+    }
+    if any(removed.values()):
+        _logger.info("removed what is old", extra={"facts": {"removed": removed}})
     return removed
 
 
@@ -94,7 +83,6 @@ def _remove_jobs(service: Service, before_s: float) -> int:
 
 
 def _remove_entries(folder: Path, before_s: float) -> int:
-    """Remove what lies in a folder and has not changed since."""
     removed = 0
     for path in folder.iterdir():
         if path.lstat().st_mtime >= before_s:

@@ -15,15 +15,14 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
-from starcat.service.access import Role
 from starcat.service.app import make_app
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.paths import ServicePaths
-from starcat.service.security.logs import log_settings
+from starcat.service.security.middleware import log_settings
 from starcat.service.security.request_limits import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.security.tokens import TokenStore
 from starcat.service.service import Service
-from starcat.service.settings import Settings
+from starcat.service.settings import Role, Settings
 from starcat.storage.atomic import make_folder
 from starcat.storage.locks import locked
 
@@ -48,8 +47,8 @@ HEAD_S = 15.0
 class HeaderTimeout(H11Protocol):
     """The protocol of the server, with an end to its patience between requests.
 
-    While a request is answered its handler decides how long that takes; `Bodies` sees to the time
-    of what it reads.
+    While a request is answered its handler decides how long that takes; `BodyLimits` sees to the
+    time of what it reads.
     """
 
     _waiting: asyncio.TimerHandle | None = None
@@ -101,7 +100,6 @@ def run_server(settings: Settings, announce: Announce) -> None:
 
 @contextmanager
 def _only_server(paths: ServicePaths) -> Iterator[None]:
-    """See that no other server uses a root."""
     with ExitStack() as stack:
         try:
             make_folder(paths.root)
@@ -206,7 +204,7 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
         return
     if not settings.is_private:
         raise _without_token(settings)
-    if Role.named(settings.anonymous_role) >= Role.PUBLISHER:
+    if settings.anonymous_role >= Role.PUBLISHER:
         return
     if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
         how = _how_to_make_one(settings)

@@ -11,34 +11,14 @@ from starcat.service.catalogs import Catalogs
 from starcat.service.jobs.job import JobStore
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
-from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
+from starcat.service.sandbox.pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
 from starcat.service.vo.tap_jobs import QueryJobs
-from starcat.service.vo.tap_queries import TapQueries, TapTables
-from starcat.vo.documents import ServiceLimits
+from starcat.service.vo.tap_queries import Tap
 
 GIB = 2**30
-DAY_S = 86_400
-
-
-class Tap:
-    """The parts of TAP: what is granted, what there is to be asked, and what answers."""
-
-    def __init__(self, service: Service) -> None:
-        settings, paths, query_pool = service.settings, service.paths, service.query_pool
-        self.limits = ServiceLimits(
-            run_s=int(settings.job_time_s),
-            keep_s=int(settings.keep_results_days * DAY_S),
-            rows=settings.max_rows,
-            upload_bytes=int(settings.upload_mib * 2**20),
-        )
-        self.tables = TapTables(paths, service.library, query_pool)
-        self.queries = TapQueries(
-            paths, self.tables, query_pool, service.sandbox, settings.max_rows
-        )
-        self.jobs = QueryJobs(service.records, paths, self.limits, self.queries, service.wake_slots)
 
 
 class Service:
@@ -54,7 +34,8 @@ class Service:
         self.job_queued = threading.Condition()  # notified when a job waits
         self.query_pool = QueryPool(settings)
         self.sandbox = Sandbox(settings, self.paths.scratch)
-        self.tap = Tap(self)
+        self.tap = Tap(settings, self.paths, self.library, self.query_pool, self.sandbox)
+        self.query_jobs = QueryJobs(self.records, self.paths, self.tap, self.wake_slots)
         self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
         self.stopping = threading.Event()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import tomllib
+from enum import IntEnum
 from pathlib import Path
 from typing import Literal
 
@@ -17,19 +18,32 @@ FILE_NAME = "service.toml"
 RoleName = Literal["none", "reader", "builder", "publisher"]
 
 
+class Role(IntEnum):
+    """What somebody may do; each role may do what those below may."""
+
+    NONE = 0
+    READER = 1
+    BUILDER = 2
+    PUBLISHER = 3
+
+    @classmethod
+    def named(cls, name: str) -> Role:
+        """Return the role of a name such as ``reader``."""
+        return cls[name.upper()]
+
+
 class Settings(BaseModel):
     """Everything that an operator may set; docs/howto-serve.md prints the descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    root: Path = Field(description="Folder with all that the service keeps.")
+    root: Path = Field(description="Folder with all data of the service.")
     host: str = Field("127.0.0.1", description="Address to listen at.")
     port: int = Field(8000, ge=0, le=65535, description="Port; 0 for any that is free.")
     public_url: str | None = Field(
         None,
         pattern=r"^https?://[^/?#@\s]+/?$",
-        description="Address that others see, where a proxy stands before the service: "
-        "https://HOST[:PORT].",
+        description="Public address, if a proxy stands before the service: https://HOST[:PORT].",
     )
     anonymous: RoleName | None = Field(
         None,
@@ -59,8 +73,10 @@ class Settings(BaseModel):
     requests_per_minute: int = Field(
         6000, ge=1, description="Requests of one address or token in a minute."
     )
-    keep_jobs_days: float = Field(90.0, gt=0, description="Days that ended jobs are kept.")
-    keep_results_days: float = Field(7.0, gt=0, description="Days that results of TAP are kept.")
+    keep_jobs_days: float = Field(90.0, gt=0, description="Days until ended jobs are deleted.")
+    keep_results_days: float = Field(
+        7.0, gt=0, description="Days until results of TAP are deleted."
+    )
     session_hours: float = Field(12.0, gt=0, description="Hours that a sign-in lasts.")
     shutdown_s: float = Field(
         20.0, ge=0, description="Seconds that jobs have to end when the service stops."
@@ -87,9 +103,9 @@ class Settings(BaseModel):
         return self.public_url is not None and self.public_url.lower().startswith("https:")
 
     @property
-    def anonymous_role(self) -> RoleName:
+    def anonymous_role(self) -> Role:
         """What somebody without a token may do."""
-        return self.anonymous or ("reader" if self.is_private else "none")
+        return Role.named(self.anonymous or ("reader" if self.is_private else "none"))
 
 
 def read_settings(root: Path, **options: object) -> Settings:

@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
-from starlette.types import Receive, Scope, Send
+from starlette.datastructures import MutableHeaders
 
 from starcat.errors import QueryLimitError, TargetMissing
 from starcat.exchange.columns import FirstRows
@@ -71,19 +71,6 @@ FILE: dict[int | str, dict[str, Any]] = {
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
 
 
-class _Part(FileResponse):
-    """A file of which a range is sent only where this module allowed one."""
-
-    may_be_part = False
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file."""
-        if not self.may_be_part:
-            headers = [(name, value) for name, value in scope["headers"] if name != b"range"]
-            scope = {**scope, "headers": headers}
-        await super().__call__(scope, receive, send)
-
-
 def file_answer(
     request: Request,
     path: Path,
@@ -102,9 +89,12 @@ def file_answer(
     if has_already(request, sha256):
         return Response(status_code=304, headers=headers)
     kind = content_type or type_of(file_name)
-    answer = _Part(path, headers=headers, media_type=kind, filename=file_name, stat_result=found)
+    answer = FileResponse(
+        path, headers=headers, media_type=kind, filename=file_name, stat_result=found
+    )
     part = _part(request, found.st_size, answer.headers)
-    answer.may_be_part = part is not None
+    if part is None:  # Starlette is not to send one either
+        del MutableHeaders(scope=request.scope)["range"]
     if request.method == "HEAD" or found.st_size > SMALL_BYTES:
         return answer
     return _at_once(path.read_bytes(), part, dict(answer.headers))

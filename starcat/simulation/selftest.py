@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
@@ -27,23 +28,16 @@ HARD = {"drop_probability": 0.1, "false_stars": 3}
 class Rates:
     """How a number of frames fared."""
 
-    # Which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given.
-    name: str
-    # What they suffered.
-    noise_px: float
+    name: str  # which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given
+    noise_px: float  # what they suffered, as the next two
     drop_probability: float
-    # The same.
     false_stars: int
-    # Standard deviation of the magnitudes; None where none were given.
-    noise_mag: float | None
-    # All, and those with at least 4 stars.
+    noise_mag: float | None  # standard deviation of the magnitudes; None where none were given
     frames: int
-    identifiable: int
-    # Identified rightly; answered with a wrong star or attitude.
-    identified: int
-    wrong: int
-    # Median over the identified frames; 0 where there are none.
-    median_residual_arcsec: float
+    identifiable: int  # frames with at least 4 stars
+    identified: int  # rightly
+    wrong: int  # answered with a wrong star or attitude
+    median_residual_arcsec: float  # median over the identified frames; 0 where there are none
     # Stars in each of the identifiable frames that were not identified rightly.
     missed: tuple[int, ...] = ()
 
@@ -72,8 +66,7 @@ class Rates:
 
 def rates_of(content: Mapping[str, Any]) -> Rates:
     """Return the rates that a report tells."""
-    names = [field.name for field in fields(Rates) if field.name in content]
-    return Rates(**{name: content[name] for name in names})
+    return Rates(**{f.name: content[f.name] for f in fields(Rates) if f.name in content})
 
 
 def self_test(
@@ -91,7 +84,6 @@ def self_test(
     bare = frames if without_magnitudes is None else min(frames, without_magnitudes)
     with_mag, without = [], []
     for step, (name, noise) in enumerate(kinds.items()):
-        counts = _Count(name, noise, noise_mag), _Count(f"{name}, no magnitudes", noise, None)
         simulated = simulate_frames(
             matcher.database.directions,
             matcher.database.camera,
@@ -100,56 +92,50 @@ def self_test(
             seed,
             matcher.database.mag,
         )
+        outcomes: list[_Outcome] = []
+        bare_outcomes: list[_Outcome] = []
         for number, frame in enumerate(simulated):
-            counts[0].add(frame, matcher)
+            outcomes.append(_outcome(matcher, frame, frame.mag))
             if number < bare:
-                counts[1].add(frame, matcher)
+                bare_outcomes.append(_outcome(matcher, frame, None))
             progress("self-test", step * frames + number + 1, 2 * frames)
-        with_mag.append(counts[0].rates())
-        without.append(counts[1].rates())
+        with_mag.append(_rates(name, noise, noise_mag, outcomes))
+        without.append(_rates(f"{name}, no magnitudes", noise, None, bare_outcomes))
     return (*with_mag, *without)
 
 
-class _Count:
-    """Frames of one kind, counted one by one."""
+class _Outcome(NamedTuple):
+    """What came of one frame."""
 
-    def __init__(self, name: str, noise: Noise, noise_mag: float | None) -> None:
-        self._name, self._noise, self._noise_mag = name, noise, noise_mag
-        self._frames = self._identifiable = self._identified = self._wrong = 0
-        self._residuals: list[float] = []
-        self._missed: list[int] = []
+    n_stars: int
+    is_right: bool
+    residual_arcsec: float | None  # None where it was not identified
 
-    def add(self, frame: Frame, matcher: Matcher) -> None:
-        """Identify a frame and count how it fared."""
-        magnitudes = None if self._noise_mag is None else frame.mag
-        result = matcher.identify(frame.centroids_px, magnitudes=magnitudes)
-        is_identifiable = frame.n_stars >= MIN_STARS
-        is_right = False
-        if result.status == "identified":
-            is_right = answers_rightly(result, frame, matcher)
-            self._residuals.append(result.residual_arcsec)
-            self._wrong += not is_right
-        self._frames += 1
-        self._identifiable += is_identifiable
-        self._identified += is_identifiable and is_right
-        if is_identifiable and not is_right:
-            self._missed.append(frame.n_stars)
 
-    def rates(self) -> Rates:
-        """Return what was counted."""
-        return Rates(
-            self._name,
-            self._noise.noise_px,
-            self._noise.drop_probability,
-            self._noise.false_stars,
-            self._noise_mag,
-            self._frames,
-            self._identifiable,
-            self._identified,
-            self._wrong,
-            round(float(np.median(self._residuals)), 6) if self._residuals else 0.0,
-            tuple(self._missed),
-        )
+def _outcome(matcher: Matcher, frame: Frame, mag: Array | None) -> _Outcome:
+    result = matcher.identify(frame.centroids_px, magnitudes=mag)
+    if not result.ok:
+        return _Outcome(frame.n_stars, is_right=False, residual_arcsec=None)
+    return _Outcome(frame.n_stars, answers_rightly(result, frame, matcher), result.residual_arcsec)
+
+
+def _rates(name: str, noise: Noise, noise_mag: float | None, outcomes: list[_Outcome]) -> Rates:
+    identifiable = [one for one in outcomes if one.n_stars >= MIN_STARS]
+    missed = tuple(one.n_stars for one in identifiable if not one.is_right)
+    residuals = [one.residual_arcsec for one in outcomes if one.residual_arcsec is not None]
+    return Rates(
+        name,
+        noise.noise_px,
+        noise.drop_probability,
+        noise.false_stars,
+        noise_mag,
+        frames=len(outcomes),
+        identifiable=len(identifiable),
+        identified=len(identifiable) - len(missed),
+        wrong=len(residuals) - sum(one.is_right for one in outcomes),
+        median_residual_arcsec=round(float(np.median(residuals)), 6) if residuals else 0.0,
+        missed=missed,
+    )
 
 
 def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool:
@@ -167,11 +153,7 @@ Z95 = 1.959963984540054
 
 
 def wilson_interval(hits: int, count: int) -> tuple[float, float]:
-    """Return Wilson's interval of 95 % of a share.
-
-    References
-    ----------
-    Wilson 1927, Journal of the American Statistical Association 22, 209.
+    """Return Wilson's interval of 95 % of a share (1927, J. Am. Stat. Assoc. 22, 209).
 
     Examples
     --------

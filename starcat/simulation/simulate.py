@@ -19,16 +19,12 @@ from starcat.geometry.sphere import Zones, zones_of
 class Frame:
     """One simulated frame."""
 
-    # True attitude, ``body = matrix @ icrs``; shape (3, 3).
-    matrix: Array
-    # Measured centroids, in random order; shape (N, 2).
-    centroids_px: Array
+    matrix: Array  # true attitude, ``body = matrix @ icrs``; shape (3, 3)
+    centroids_px: Array  # measured centroids, in random order; shape (N, 2)
     # Row of each centroid's guide star; -1 for another star and for a false one; shape (N,).
     star_index: NDArray[np.int64]
-    # Measured magnitudes; shape (N,).
-    mag: Array
-    # Which centroids are no stars at all; shape (N,).
-    is_false: NDArray[np.bool_]
+    mag: Array  # measured magnitudes; shape (N,)
+    is_false: NDArray[np.bool_]  # which centroids are no stars at all; shape (N,)
 
     @property
     def n_stars(self) -> int:
@@ -40,30 +36,21 @@ class Frame:
 class Noise:
     """What a frame suffers."""
 
-    # Standard deviation of a centroid, each axis.
-    noise_px: float = 0.0
-    # Chance of a star to be missing.
-    drop_probability: float = 0.0
-    # Spots at random places, with the magnitudes of stars drawn from the sky.
-    false_stars: int = 0
+    noise_px: float = 0.0  # standard deviation of a centroid, each axis
+    drop_probability: float = 0.0  # chance of a star to be missing
+    false_stars: int = 0  # spots at random places, with the magnitudes of stars drawn from the sky
     # Further such spots, so many that they are this share of all centroids; below 1.
     false_share: float = 0.0
     # Standard deviation of a magnitude, before the limit decides what is seen.
     noise_mag: float = 0.0
-    # Fainter ones are not seen.
-    limit_mag: float = float("inf")
+    limit_mag: float = float("inf")  # fainter ones are not seen
     # Whether the true magnitude decides what is seen, not the measured one: then the noise of
     # magnitudes neither hides a star nor lifts a fainter one over the limit.
     is_limit_true: bool = False
 
 
 def simulate_frames(
-    directions: Array,
-    camera: Camera,
-    count: int,
-    noise: Noise,
-    seed: int,
-    mag: Array | None = None,
+    directions: Array, camera: Camera, count: int, noise: Noise, seed: int, mag: Array | None = None
 ) -> Iterator[Frame]:
     """Simulate frames of guide stars at attitudes uniform over all rotations."""
     generator = np.random.default_rng(seed)
@@ -106,7 +93,6 @@ def simulate_frame(
 def _visible(
     sky: Sky, limit_mag: float, count: int, generator: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Draw stars up to a magnitude."""
     bright = np.flatnonzero(sky.mag <= limit_mag)
     return bright[generator.integers(0, max(1, len(bright)), count)] if len(bright) else bright
 
@@ -115,15 +101,12 @@ def _visible(
 class Sky:
     """Points of light."""
 
-    # ICRS unit vectors; shape (N, 3).
-    directions: Array
-    # Magnitudes; shape (N,).
-    mag: Array
+    directions: Array  # ICRS unit vectors; shape (N, 3)
+    mag: Array  # magnitudes; shape (N,)
     # Row of the guide star in the database, -1 for what is none; shape (N,).
     star_index: NDArray[np.int32]
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.mag)
 
     @cached_property

@@ -9,7 +9,7 @@ Allen's Astrophysical Quantities (4th ed., 2000, sections 14.2 and 12.9).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -48,6 +48,7 @@ _MOON_ERROR_ARCSEC = 20.0  # of ``moon98``, with a second of unknown leap second
 
 # How far from the middle of the Earth an observer without a position may be.
 _WITHIN_ORBIT_KM = 7000.0
+PhaseCurve = Callable[[float], float]
 _AU_DAY = LIGHT_KM_S * DAY_S / AU_KM  # speed of light, au per day
 
 
@@ -83,16 +84,11 @@ def bodies_seen(observer: Observer) -> Bodies:
     u = aberrated(seen / distance[:, None], observer.velocity_km_s)
     radius_au = np.array([RADII_KM[name] for name in names]) / AU_KM
     from_sun = seen + (observer.position_au - observer.sun_au)
-    mag = [
-        apparent_magnitude(name, sun, own)
-        for name, sun, own in zip(names, from_sun, seen, strict=True)
-    ]
-    error_au = np.zeros(len(names)) if observer.is_placed else np.full(
-        len(names), _WITHIN_ORBIT_KM / AU_KM
-    )  # fmt: skip
+    known = list(zip(names, from_sun, seen, strict=True))
+    mag = [apparent_magnitude(name, sun, own) for name, sun, own in known]
+    error_au = 0.0 if observer.is_placed else _WITHIN_ORBIT_KM / AU_KM
     error_rad = error_au / distance + [
-        _ephemeris_error_rad(name, sun, own)
-        for name, sun, own in zip(names, from_sun, seen, strict=True)
+        _ephemeris_error_rad(name, sun, own) for name, sun, own in known
     ]
     radius_rad = np.arcsin(np.minimum(radius_au / distance, 1.0))
     arrays = (u, distance, radius_rad, np.array(mag), error_rad)
@@ -111,7 +107,6 @@ def _light_time_corrected(name: str, observer: Observer) -> Array:
 
 
 def _barycentric_au(name: str, observer: Observer, days_before: float) -> Array:
-    """Return a body's position some time before the observer's."""
     whole, part = observer.tt_jd[0], observer.tt_jd[1] - days_before
     heliocentric, barycentric = erfa.epv00(whole, part)
     earth = np.array(barycentric["p"])
@@ -175,27 +170,6 @@ def _latitudes(pole: Array, from_sun_au: Array, from_observer_au: Array) -> tupl
     return _angle_deg(pole, from_sun_au) - 90.0, _angle_deg(pole, from_observer_au) - 90.0
 
 
-def _mercury(a: float) -> float:
-    terms = (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
-    return _polynomial(a, *terms)
-
-
-def _venus(a: float) -> float:
-    if a < 163.7:
-        return _polynomial(a, -4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
-    return _polynomial(a, 236.05828, -2.81914, 8.39034e-3)
-
-
-def _earth(a: float) -> float:
-    return _polynomial(a, -3.99, -1.060e-3, 2.054e-4)
-
-
-def _mars(a: float) -> float:
-    if a <= 50.0:
-        return _polynomial(a, -1.601, 2.267e-2, -1.302e-4)
-    return _polynomial(a, -0.367, -2.573e-2, 3.445e-4)
-
-
 def _jupiter(a: float) -> float:
     if a <= 12.0:
         return _polynomial(a, -9.395, -3.7e-4, 6.16e-4)
@@ -215,20 +189,23 @@ def _uranus(a: float, latitude_deg: float) -> float:
     return -7.110 - 0.00084 * latitude_deg + beyond
 
 
-def _neptune(a: float) -> float:
-    return -7.00 + (_polynomial(a, 0.0, 7.944e-3, 9.617e-5) if a > 1.9 else 0.0)
-
-
 def _polynomial(x: float, *terms: float) -> float:
     return float(np.polynomial.polynomial.polyval(x, terms))
 
 
+def _polynomials(up_to: float, terms: Sequence[float], beyond: Sequence[float]) -> PhaseCurve:
+    return lambda a: _polynomial(a, *(terms if a <= up_to else beyond))
+
+
+_MERCURY = (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
+_VENUS = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
+
 # Magnitude at 1 au from the Sun and from the observer, by the phase angle in degrees.
-PHASE_CURVES: Mapping[str, Callable[[float], float]] = {
-    "Mercury": _mercury,
-    "Venus": _venus,
-    "Earth": _earth,
-    "Mars": _mars,
+PHASE_CURVES: Mapping[str, PhaseCurve] = {
+    "Mercury": _polynomials(180.0, _MERCURY, ()),
+    "Venus": _polynomials(163.7, _VENUS, (236.05828, -2.81914, 8.39034e-3)),
+    "Earth": _polynomials(180.0, (-3.99, -1.060e-3, 2.054e-4), ()),
+    "Mars": _polynomials(50.0, (-1.601, 2.267e-2, -1.302e-4), (-0.367, -2.573e-2, 3.445e-4)),
     "Jupiter": _jupiter,
-    "Neptune": _neptune,
+    "Neptune": _polynomials(1.9, (-7.00,), (-7.00, 7.944e-3, 9.617e-5)),
 }

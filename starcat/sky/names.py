@@ -17,11 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
-from starcat.geometry.sphere import (
-    chord_from_separation,
-    directions_from_radec,
-    tangent_axes,
-)
+from starcat.geometry.sphere import chord_from_separation, directions_from_radec, tangent_axes
 
 REACH_ARCSEC = 20.0  # largest separation from the place that the list has for a star
 

@@ -157,10 +157,7 @@ def _unset(frame: Array, rows: tuple[int, ...]) -> Array:
 
 
 def _without(
-    identify: Callable[..., MatchResult],
-    frame: Array,
-    mag: Array | None,
-    names: dict[int, str],
+    identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
 ) -> MatchResult:
     """Identify a frame without the spots of planets, and say what they were."""
     found = identify(_unset(frame, tuple(names)), magnitudes=mag)

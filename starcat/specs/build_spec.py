@@ -37,8 +37,7 @@ class Catalog(Section):
         None, description="band of the magnitudes; default: the source's first", examples=["G"]
     )
     read_limit_mag: Mag | None = Field(
-        None,
-        description="fainter records, and those without magnitude, are counted and left out",
+        None, description="fainter records, and those without magnitude, are counted and left out"
     )
     motions: tuple[Literal["hipparcos", "tycho2"], ...] = Field(
         (),
@@ -112,14 +111,14 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="only this many are kept, the brightest"
+        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
     )
     max_stars_per_field: int | None = Field(
         None,
         ge=1,
         le=10_000,
-        description="thins to an even density: stars are kept that are among the brightest this "
-        "many of some field of the tiling",
+        description="thins to an even density: keeps the stars that are among this many brightest "
+        "of any field of the tiling",
     )
     doubles: Doubles = Doubles()
     variables: Variables = Variables()
@@ -301,7 +300,6 @@ class BuildSpec(Section):
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:
-        """Return the spec in one line."""
         camera = self.camera.camera()
         return (
             f"<BuildSpec {self.name}-{self.version}: {self.catalog.source} to "

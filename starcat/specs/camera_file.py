@@ -7,14 +7,14 @@ said here with the file and the key.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ConfigError, reason, suggest
+from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
+from starcat.specs.reading import content_of_toml, text_of_toml
 
 SCALES = (
     ("focal_length_px",),
@@ -33,23 +33,12 @@ COEFFICIENTS = tuple(field.name for field in fields(Distortion))
 
 def read_camera(path: Path) -> Camera:
     """Read a camera from a TOML file."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such camera file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {reason(error)}") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
-    return parse_camera(text, path)
+    return parse_camera(text_of_toml(path, "no such camera file"), path)
 
 
 def parse_camera(text: str, path: Path) -> Camera:
     """Return the camera of a TOML text; messages call it ``path``."""
-    try:
-        content = tomllib.loads(text)
-    except ValueError as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    content = content_of_toml(text, str(path))
     if "camera" not in content:
         return _camera(content, path, "")
     for key in KEYS:

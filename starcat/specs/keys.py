@@ -15,15 +15,8 @@ from typing import Any
 
 from starcat.specs.build_spec import BuildSpec
 
-UNITS = {
-    "deg": "deg",
-    "arcsec": "arcsec",
-    "mag": "mag",
-    "px": "px",
-    "mm": "mm",
-    "um": "um",
-    "jyear": "Julian year",
-}
+UNITS = {unit: unit for unit in ("deg", "arcsec", "mag", "px", "mm", "um")}
+UNITS["jyear"] = "Julian year"
 """Units by the last part of a name; proper motions are the one unit of two parts."""
 
 REQUIRED = object()

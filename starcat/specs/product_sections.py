@@ -143,13 +143,13 @@ class Levels(Product):
 
     enabled: bool = Field(False, description="whether the artifact has this product")
     widest_fov_x_deg: FieldDeg = Field(
-        30.0, description="field across the width that the range goes up to, from the camera's own"
+        30.0, description="largest field across the width; the range begins at the camera's own"
     )
     max_ratio: float = Field(
         1.5, ge=1.1, le=2.0, description="largest ratio of the fields of neighbouring levels"
     )
     stars_per_field: int = Field(
-        20, ge=4, le=10_000, description="stars are kept that are the brightest of a level's field"
+        20, ge=4, le=10_000, description="number of stars of each field of a level, the brightest"
     )
 
 

@@ -8,11 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import (
-    ValidationError,
-)
+from pydantic import ValidationError
 
-from starcat.errors import ConfigError, quoted, suggest
+from starcat.errors import ConfigError, quoted, reason, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 
@@ -60,22 +58,24 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
         If the file is missing or not TOML, or a key is unknown, missing or out of range.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: no such spec; 'starcat presets' lists those that ship with starcat"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     return spec_from_dict(changed(content_of_toml(text, str(path)), changes or {}), path.name)
 
 
-def content_of_toml(text: str, origin: str) -> dict[str, Any]:
-    """Read the text of a spec.
+def text_of_toml(path: Path, missing: str) -> str:
+    """Read a TOML file; ``missing`` is what to say where there is none."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: {missing}") from None
+    except (OSError, ValueError) as error:
+        why = reason(error) if isinstance(error, OSError) else error
+        raise ConfigError(f"{path}: not a readable TOML file: {why}") from error
 
-    Notes
-    -----
+
+def content_of_toml(text: str, origin: str) -> dict[str, Any]:
+    """Read the text of a spec or of a camera.
+
     The parser's time grows with the square of the parts of a dotted key: 40 kB of them take 8 s.
     Such lines are refused before.
     """
@@ -100,20 +100,28 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
     """Change what a spec says, key by key."""
     for key, text in changes.items():
-        _change(content, key, text)
+        put_key(content, key, _value(text) if text else None)
     return content
 
 
-def _change(content: dict[str, Any], key: str, text: str) -> None:
+def put_key(content: dict[str, Any], key: str, value: Any) -> None:
+    """Change a dotted key; None removes it, with each table inside another that becomes empty."""
     *tables, name = key.split(".")
+    around = []
     for table in tables:
-        content = content.setdefault(table, {})
+        if table not in content:
+            content[table] = {}
+        around.append((content, table))
+        content = content[table]
         if not isinstance(content, dict):
             raise ConfigError(f"{key}: {table} is a value, not a table of the spec", key=key)
-    if text:
-        content[name] = _value(text)
-    else:
-        content.pop(name, None)
+    if value is not None:
+        content[name] = value
+        return
+    content.pop(name, None)
+    for outer, table in reversed(around[1:]):
+        if not outer[table]:
+            del outer[table]
 
 
 def _value(text: str) -> Any:

@@ -26,14 +26,8 @@ READ_ONLY = 0o444
 """Mode of the files of a folder that `move_into_place` has put at its final name."""
 
 _WRITING_FAILED = {
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EROFS,
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOTDIR,
-    errno.EEXIST,
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
+    *(errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EEXIST),
 }
 
 
@@ -42,20 +36,32 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Give a file to write to, which gets its final name when all of it is there."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _renamed(unique(path.parent, path.name), path) as partial:
+        with placed(path) as partial:
             yield partial
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)}); choose another --output",
-            path=path,
+            f"{path}: cannot be written ({reason(error)}); choose another --output", path=path
         ) from error
 
 
+def write_file(path: Path, data: bytes) -> None:
+    """Write a small file in one go."""
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+
+
 @contextmanager
-def placed(path: Path) -> Iterator[Path]:
+def placed(path: Path, beside: Path | None = None) -> Iterator[Path]:
     """Give a file to write to, which gets its name at the end; the system's errors pass."""
-    with _renamed(unique(path.parent, path.name), path) as partial:
+    partial = unique(beside or path.parent, path.name)
+    try:
         yield partial
+        partial.replace(path)
+    finally:
+        with suppress(OSError):  # where the folder could not be made there is nothing to remove
+            partial.unlink(missing_ok=True)
 
 
 def remove_partial(folder: Path) -> None:
@@ -66,21 +72,10 @@ def remove_partial(folder: Path) -> None:
 
 def replace_file(path: Path, data: bytes, beside: Path) -> None:
     """Give a file other content, at once and for good."""
-    with _renamed(unique(beside, path.name), path) as new:
+    with placed(path, beside) as new:
         new.write_bytes(data)
         sync(new)
     sync(path.parent)
-
-
-@contextmanager
-def _renamed(partial: Path, final: Path) -> Iterator[Path]:
-    """Rename a file when the work is done; remove it if that fails."""
-    try:
-        yield partial
-        partial.replace(final)
-    finally:
-        with suppress(OSError):  # where the folder could not be made there is nothing to remove
-            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -170,14 +165,8 @@ def unique(folder: Path, name: str) -> Path:
 
 
 def sync(path: Path) -> None:
-    """Have the content of a file, or the names in a folder, on disk.
-
-    Notes
-    -----
-    Windows synchronises files only while they are open for writing, and folders not at all:
-    nothing is done there.
-    """
-    if os.name == "nt":
+    """Have the content of a file, or the names in a folder, on disk."""
+    if os.name == "nt":  # which synchronises files only while they are open, and folders never
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:

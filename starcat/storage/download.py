@@ -187,11 +187,7 @@ def _validator(response: requests.Response) -> str | None:
 
 
 def _receive(
-    response: requests.Response,
-    path: Path,
-    there: int,
-    total: int | None,
-    options: DownloadOptions,
+    response: requests.Response, path: Path, there: int, total: int | None, options: DownloadOptions
 ) -> None:
     """Append a body to the part as it comes, and see that all of it came, and no more."""
     done = there

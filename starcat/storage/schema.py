@@ -30,10 +30,10 @@ class SchemaColumn:
 
     name: str  # as in every file and query
     dtype: str  # ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column
-    unit: str  # empty where the column has none
-    nullable: bool  # whether a row may lack a value
-    description: str  # meaning, and the IVOA content descriptor where there is one
-    ucd: str
+    description: str
+    unit: str = ""  # empty where the column has none
+    nullable: bool = False  # whether a row may lack a value
+    ucd: str = ""  # the IVOA content descriptor where there is one
     refers_to: str = ""  # product whose rows the values are; empty where they are no rows
     in_database: bool = True  # whether the matcher's HDF5 file has the column
 
@@ -48,6 +48,12 @@ class SchemaColumn:
         return self.dtype[5:-1] if self.is_list else self.dtype
 
     @property
+    def facts(self) -> dict[str, str]:
+        """Unit, description and UCD, where there are any, as the metadata of a field has them."""
+        known = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
+        return {key: text for key, text in known.items() if text}
+
+    @property
     def arrow_field(self) -> pa.Field:
         """The column as pyarrow knows it, with unit and meaning as metadata."""
         import pyarrow as pa  # not needed to know what a column means
@@ -55,9 +61,7 @@ class SchemaColumn:
         kind = pa.type_for_alias(self.item_dtype)
         if self.is_list:
             kind = pa.list_(pa.field("item", kind, nullable=False))
-        facts = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
-        metadata = {key: value for key, value in facts.items() if value}
-        return pa.field(self.name, kind, self.nullable, metadata)
+        return pa.field(self.name, kind, self.nullable, self.facts)
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,11 @@ class ProductSchema:
     def name(self) -> str:
         """``<product>-<version>``."""
         return f"{self.product}-{self.version}"
+
+    @property
+    def summary(self) -> str:
+        """What a row is, without what is said beside it."""
+        return re.split(r"[.:;] ", self.description)[0].rstrip(".")
 
     @cached_property
     def arrow_schema(self) -> pa.Schema:
@@ -126,26 +135,9 @@ def read_schema(path: Path) -> ProductSchema:
             for c in base.columns
             if c.name not in content.get("extends_without", ())
         ]
-    columns += [
-        SchemaColumn(
-            name=column["name"],
-            dtype=column["dtype"],
-            unit=column.get("unit", ""),
-            nullable=column.get("nullable", False),
-            description=column["description"],
-            ucd=column.get("ucd", ""),
-            refers_to=column.get("refers_to", ""),
-            in_database=column.get("in_database", True),
-        )
-        for column in content["columns"]
-    ]
-    return ProductSchema(
-        product=content["product"],
-        version=content["version"],
-        description=content["description"],
-        order=tuple(content["order"]),
-        columns=tuple(columns),
-    )
+    columns += [SchemaColumn(**column) for column in content["columns"]]
+    facts = {name: content[name] for name in ("product", "version", "description")}
+    return ProductSchema(**facts, order=tuple(content["order"]), columns=tuple(columns))
 
 
 @cache
@@ -160,12 +152,11 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     known = _schema_files().get(product, {})
     chosen = max(known, key=_version_key, default=None) if version is None else version
     if chosen is None or chosen not in known:
-        wanted = "any" if version is None else version
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
         # Both may come from the footer of somebody's file, of any length.
-        wanted = "any" if version is None else version
+        found = _shown("any" if version is None else version)
         raise SchemaVersionError(
-            f"{_shown(product)}: schema version {_shown(wanted)} found; this starcat reads: "
+            f"{_shown(product)}: schema version {found} found; this starcat reads: "
             f"{readable}. Install the starcat that wrote it, or a newer one",
             product=product,
             found=version,
@@ -186,11 +177,8 @@ def _schema_files() -> dict[str, dict[str, Path]]:
 
 def _shown(text: str) -> str:
     """Return a text that somebody wrote, fit for one line."""
-    return (
-        text
-        if text.isprintable() and len(text) <= SHOWN_CHARACTERS
-        else ascii(text[:SHOWN_CHARACTERS])
-    )
+    is_short = text.isprintable() and len(text) <= SHOWN_CHARACTERS
+    return text if is_short else ascii(text[:SHOWN_CHARACTERS])
 
 
 def _version_key(version: str) -> tuple[int, ...]:

@@ -66,7 +66,7 @@ def cluster(
             scheduler_kwargs={"dashboard": False},
             silence_logs=logging.CRITICAL,
         ) as local,
-        distributed.Client(local) as client,
+        distributed.Client(local, set_as_default=False) as client,
     ):
         yield client
 
@@ -74,7 +74,7 @@ def cluster(
 @contextmanager
 def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
     try:
-        client = client_class(scheduler, timeout=_CONNECT_S)
+        client = client_class(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(
             f"--scheduler {scheduler}: no scheduler answers ({error}); start one with 'dask "
@@ -121,7 +121,7 @@ def run_tasks(
     place = {future.key: number for number, future in enumerate(futures)}
     results: list[Any] = [None] * len(futures)
     try:
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             number = place[future.key]
             results[number] = future.result()
             if report is not None:

@@ -33,7 +33,14 @@ from starcat.store.pixels import (
     runs_of,
 )
 from starcat.store.plan import StorePlan
-from starcat.store.runs import RunIndex, places_of, read_index, read_shares, with_constants
+from starcat.store.runs import (
+    RunIndex,
+    arrow_writer,
+    places_of,
+    read_index,
+    read_shares,
+    with_constants,
+)
 
 SKYMAP_ORDER = 6
 """Order of the map of star counts (55 arcmin)."""
@@ -143,22 +150,15 @@ def _write_borders(
     path = border_path(plan, pixel)
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     schema = store_schema()
-    with (
-        placed(path) as partial,
-        pa.OSFile(str(partial), "wb") as sink,
-        pa.ipc.new_file(sink, schema) as writer,
-    ):
+    with arrow_writer(path, schema) as writer:
         for other in beside:
             order, border = border_of(other, plan.margin_rad)
             rows = rows_within(pixels, order, border, other)
             some = with_constants(stars.take(pa.array(rows)), schema)
             batches = some.combine_chunks().to_batches()
-            writer.write_batch(batches[0] if batches else _empty(schema))
+            empty = pa.RecordBatch.from_pylist([], schema=schema)
+            writer.write_batch(batches[0] if batches else empty)
     return [path]
-
-
-def _empty(schema: pa.Schema) -> pa.RecordBatch:
-    return pa.RecordBatch.from_pylist([], schema=schema)
 
 
 def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArray[np.int64]:

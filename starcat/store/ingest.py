@@ -29,23 +29,11 @@ from starcat.storage.atomic import Outcome, move_into_place, remove_partial, wri
 from starcat.storage.digests import file_sha256
 from starcat.store.cluster import cluster, run_tasks, versions
 from starcat.store.finish import border_path, finish, write_margin
-from starcat.store.ledger import RESUME_ADVICE, ResumePlan, Task
+from starcat.store.ledger import RESUME_ADVICE, Digests, Task
 from starcat.store.metadata import Written, describe_store, make_manifest
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
-from starcat.store.plan import (
-    StoreOptions,
-    StorePlan,
-    partition_pixels,
-    rows_of_a_run,
-    spill_order,
-)
-from starcat.store.runs import (
-    BUCKETS,
-    HISTOGRAM_ORDER,
-    find_repeated,
-    read_runs,
-    write_index,
-)
+from starcat.store.plan import StoreOptions, StorePlan, partition_pixels, rows_of_a_run, spill_order
+from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER, find_repeated, read_runs, write_index
 from starcat.store.split import is_unchanged, split, split_name
 
 if TYPE_CHECKING:
@@ -119,7 +107,7 @@ def ingest_to_store(
         raise OutputError(
             f"{output} already exists; choose another --output, or pass --replace", path=output
         )
-    plan = StorePlan(ResumePlan.of(output), output.name, reading, options)
+    plan = StorePlan.of(output, reading, options)
     plan.resume.begin(_all_options(plan, files), resume=options.resume)
     is_small = sum(files.sizes) < _SMALL_BYTES
     with (
@@ -160,17 +148,14 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     run.files.check_contents(facts)
     content = _begin_partitions(plan, facts)
     indexes = [plan.runs / f"{split_name(number)}.npz" for number in range(len(parts))]
-    runs = [
-        one
-        for path, part in zip(indexes, parts, strict=True)
-        for one in read_runs(path, part["runs"])
-    ]
+    counts = [part["runs"] for part in parts]
+    runs = [run for each in map(read_runs, indexes, counts) for run in each]
     index = _kept(plan.resume / "index.npz", partial(write_index, order=order, runs=runs))
     found = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
     places = np.sort(np.concatenate(found))
     repeated = _kept(plan.resume / "repeated.npy", lambda path: np.save(path, places))
     pixels = _partitions(plan, indexes)
-    left = int(sum(run.rows.sum() for run in runs)) - len(places)
+    left = sum(part["kept"] for part in parts) - len(places)
     beside = bordering(pixels, plan.margin_rad)
     finished = _finish_all(run, beside, index, repeated, left, content)
     margins = _margins_all(run, beside, finished, content)
@@ -185,14 +170,8 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
 def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
     plan = run.plan
     tasks = [
-        Task(
-            plan.resume,
-            split_name(number),
-            split,
-            (plan, number, file, order),
-            partial(is_unchanged, file),
-        )
-        for number, file in enumerate(run.files.files)
+        Task(plan.resume, split_name(file.number), split, (plan, file, order), is_unchanged)
+        for file in run.files.files
     ]
     return run.run(tasks, f"rows {plan.ingest.source_name}", run.files.sizes)
 
@@ -233,15 +212,22 @@ def _finish_all(
     run: _Ingest, beside: Bordering, index: Path, repeated: Path, rows: int, content: str
 ) -> list[dict[str, Any]]:
     tasks = [
-        Task(
-            run.plan.resume,
-            f"finish-{content}-{pixel.order}-{pixel.number}",
-            finish,
-            (run.plan, pixel, others, index, repeated, rows == 1),
-        )
+        _task_of(run, "finish", content, pixel, finish, (others, index, repeated, rows == 1))
         for pixel, others in beside.items()
     ]
     return run.run(tasks, "rows by partition", [1] * len(tasks), rows)
+
+
+def _task_of(
+    run: _Ingest,
+    step: str,
+    content: str,
+    pixel: Pixel,
+    function: Callable[..., tuple[dict[str, Any], Digests]],
+    arguments: tuple[Any, ...],
+) -> Task:
+    name = f"{step}-{content}-{pixel.order}-{pixel.number}"
+    return Task(run.plan.resume, name, function, (run.plan, pixel, *arguments))
 
 
 def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
@@ -273,12 +259,7 @@ def _margins_all(
             batches[other].append((border_path(run.plan, pixel), number))
     wanted = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
     tasks = [
-        Task(
-            run.plan.resume,
-            f"margin-{content}-{pixel.order}-{pixel.number}",
-            write_margin,
-            (run.plan, pixel, tuple(batches[pixel])),
-        )
+        _task_of(run, "margin", content, pixel, write_margin, (tuple(batches[pixel]),))
         for pixel in wanted
     ]
     run.progress("margins", 0, None)

@@ -18,13 +18,17 @@ Catalogs of others are opened too: a collection, or a HATS catalog by itself.
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ProductError, TargetMissing
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.errors import ProductError, SchemaError, SourceError, TargetMissing, reason
 from starcat.store.pixels import Pixel
 
 COLLECTION_NAME = "collection.properties"
@@ -102,6 +106,35 @@ def open_store(folder: Path) -> Store:
     return Store(
         folder, _read_catalog(inner), _read_catalog(_within(folder, margin)) if margin else None
     )
+
+
+@contextmanager
+def parquet_file(
+    path: Path, refusal: type[SourceError | ProductError], advice: str
+) -> Iterator[pq.ParquetFile]:
+    """Open a Parquet file; what the library says of a damaged one is said as starcat does."""
+    try:
+        with pq.ParquetFile(path) as file:
+            yield file
+    except (OSError, pa.ArrowException, KeyError) as error:
+        why = reason(error) if isinstance(error, OSError) else str(error)
+        message = f"{path}: cannot be read as Parquet ({why}); {advice}"
+        raise refusal(message, path=path) from error
+
+
+def check_has_columns(
+    place: Path, found: Sequence[str], expected: Sequence[str], advice: str
+) -> None:
+    """Check that a table of stars has some columns."""
+    lacking = [name for name in expected if name not in found]
+    if lacking:
+        raise SchemaError(
+            f"{place}: no column {', '.join(lacking)}; {advice}",
+            product="stars",
+            field=lacking[0],
+            found=list(found),
+            expected=expected,
+        )
 
 
 def _within(folder: Path, name: str) -> Path:

@@ -114,12 +114,13 @@ class Task:
     name: str  # unique in the run
     function: Callable[..., tuple[dict[str, Any], Digests]]
     arguments: tuple[Any, ...]
-    is_valid: Callable[[dict[str, Any]], bool] | None = None  # whether an earlier result holds
+    # whether an earlier result holds for the arguments; None where it always does
+    is_valid: Callable[..., bool] | None = None
 
     def run(self) -> dict[str, Any]:
         """Do the task and record it, if it is not done."""
         before = self.plan.done(self.name)
-        if before is not None and (self.is_valid is None or self.is_valid(before)):
+        if before is not None and (self.is_valid is None or self.is_valid(before, *self.arguments)):
             return before
         with writing(self.plan.folder.parent, RESUME_ADVICE):
             result, written = self.function(*self.arguments)

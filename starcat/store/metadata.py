@@ -51,11 +51,6 @@ class Described:
     max_rows: int  # stars that a partition may hold
     more: Mapping[str, Any]  # further properties
 
-    @property
-    def pixels(self) -> list[Pixel]:
-        """The parts of the sky that have a partition."""
-        return [pixel for pixel, _ in self.partitions]
-
     def total(self, fact: str) -> int:
         """Sum what is known of each partition."""
         return sum(facts[fact] for _, facts in self.partitions)
@@ -85,16 +80,16 @@ def write_pixel_list(folder: Path, partitions: Sequence[Pixel]) -> None:
 
 def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> None:
     """Write what a HATS catalog has beside its partitions."""
-    dataset = folder / DATASET
+    dataset, pixels = folder / DATASET, [pixel for pixel, _ in catalog.partitions]
     footers = []
-    for pixel in catalog.pixels:
+    for pixel in pixels:
         footer = pq.read_metadata(dataset / pixel.path)
         footer.set_file_path(pixel.path.as_posix())
         footers.append(footer)
     known = {**(schema.metadata or {}), **votable_metadata(schema.empty_table())}
     pq.write_metadata(schema.with_metadata(known), dataset / "_common_metadata")
     pq.write_metadata(schema, dataset / "_metadata", footers)
-    write_pixel_list(folder, catalog.pixels)
+    write_pixel_list(folder, pixels)
     write_properties(folder / "hats.properties", _properties(catalog))
 
 
@@ -108,7 +103,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
         "hats_col_healpix": HEALPIX_COLUMN,
         "hats_col_healpix_order": MAX_ORDER,
         "hats_max_rows": catalog.max_rows,
-        "hats_order": max((pixel.order for pixel in catalog.pixels), default=0),
+        "hats_order": max((pixel.order for pixel, _ in catalog.partitions), default=0),
         "hats_npix_suffix": ".parquet",
         "hats_estsize": -(-catalog.total("bytes") // 1024),
         "hats_builder": f"starcat {__version__}",
@@ -136,14 +131,6 @@ def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
         }
     )
     fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
-
-
-def sum_maps(order: int, maps: Sequence[Sequence[Sequence[int]]]) -> NDArray[np.int64]:
-    """Return the sum of maps that list the pixels that have stars."""
-    counts = np.zeros(12 * 4**order, dtype=np.int64)
-    for pixels, found in maps:
-        np.add.at(counts, pixels, found)
-    return counts
 
 
 @dataclass(frozen=True)
@@ -204,15 +191,15 @@ def describe_store(
     more = {"hats_skymap_order": SKYMAP_ORDER, **_provenance(manifest)}
     described = Described(name, "object", full, options.max_partition_rows, more)
     describe_catalog(folder / name, described, schema)
-    counts = sum_maps(SKYMAP_ORDER, [facts["map"] for _, facts in full])
+    counts = np.zeros(12 * 4**SKYMAP_ORDER, dtype=np.int64)
+    for _, facts in full:
+        pixels, found = facts["map"]
+        np.add.at(counts, pixels, found)
     write_skymap(folder / name / SKYMAP_NAME, SKYMAP_ORDER, counts)
     collection = {"obs_collection": name, "hats_primary_table_url": name}
     if written.margins:
         margin = f"{name}_margin"
-        more = {
-            "hats_primary_table_url": name,
-            "hats_margin_threshold": options.margin_arcsec,
-        }
+        more = {"hats_primary_table_url": name, "hats_margin_threshold": options.margin_arcsec}
         described = replace(
             described, name=margin, kind="margin", partitions=written.margins, more=more
         )

@@ -38,21 +38,6 @@ class _Nearest:
     mag: NDArray[np.float64]
     star_id: NDArray[np.int64]
 
-    def take(
-        self,
-        rows: NDArray[np.int64],
-        chord: NDArray[np.float64],
-        mag: NDArray[np.float64],
-        star_id: NDArray[np.int64],
-    ) -> None:
-        """Take other neighbours where they are nearer, or as near and of a lower number."""
-        nearer = (chord < self.chord[rows]) | (
-            (chord == self.chord[rows]) & (star_id < self.star_id[rows])
-        )
-        rows = rows[nearer]
-        self.chord[rows], self.mag[rows] = chord[nearer], mag[nearer]
-        self.star_id[rows] = star_id[nearer]
-
 
 def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool) -> pa.Table:
     """Return the stars of a partition with the columns of the nearest neighbour filled in."""
@@ -100,9 +85,16 @@ def _among(stars: pa.Table, directions: NDArray[np.float64], pieces: list[pa.Tab
 def _look(
     found: _Nearest, rows: NDArray[np.int64], directions: NDArray[np.float64], piece: pa.Table
 ) -> None:
+    """Take the stars of a piece for neighbours of some rows where they are nearer."""
     if not len(piece):
         return
     number = piece["star_id"].to_numpy()
     nobody = np.full(len(rows), -1)
     chord, index = nearest_chords(directions[rows], directions_of(piece), nobody, number)
-    found.take(rows, chord, floats_of(piece, "mag")[index], number[index])
+    mag, number = floats_of(piece, "mag")[index], number[index]
+    is_nearer = chord < found.chord[rows]
+    # Of two that are as near the one of the lower number counts.
+    is_nearer |= (chord == found.chord[rows]) & (number < found.star_id[rows])
+    rows = rows[is_nearer]
+    found.chord[rows], found.mag[rows] = chord[is_nearer], mag[is_nearer]
+    found.star_id[rows] = number[is_nearer]

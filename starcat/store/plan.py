@@ -64,45 +64,38 @@ def rows_of_a_run(options: StoreOptions) -> int:
 class StorePlan:
     """What every task that makes a store knows: what is read, how, and where files go."""
 
-    resume: ResumePlan
     name: str
     ingest: IngestOptions
     options: StoreOptions
+    resume: ResumePlan
+    # folders: the store before it gets its final name, and in it the HATS catalog and its margin,
+    # rejected records, and records whose star was read before
+    store: Path
+    catalog: Path
+    margin: Path
+    rejected: Path
+    repeated: Path
+    runs: Path
+    borders: Path  # of the stars that are in the margins of other partitions
 
-    @property
-    def store(self) -> Path:
-        """The store before it gets its final name."""
-        return self.resume / "store"
-
-    @property
-    def catalog(self) -> Path:
-        """Folder of the HATS catalog."""
-        return self.store / self.name
-
-    @property
-    def margin(self) -> Path:
-        """Folder of the HATS margin catalog."""
-        return self.store / f"{self.name}_margin"
-
-    @property
-    def rejected(self) -> Path:
-        """Folder of the rejected records."""
-        return self.store / REJECTED
-
-    @property
-    def repeated(self) -> Path:
-        """Folder of the records whose star was read before."""
-        return self.store / REPEATED
-
-    @property
-    def runs(self) -> Path:
-        """Folder of the runs."""
-        return self.resume / "runs"
-
-    @property
-    def borders(self) -> Path:
-        """Folder of the stars that are in the margins of other partitions."""
-        return self.resume / "borders"
+    @classmethod
+    def of(cls, output: Path, ingest: IngestOptions, options: StoreOptions) -> StorePlan:
+        """Return the plan of a store with a final place."""
+        name, resume = output.name, ResumePlan.of(output)
+        store = resume / "store"
+        return cls(
+            name,
+            ingest,
+            options,
+            resume,
+            store,
+            store / name,
+            store / f"{name}_margin",
+            store / REJECTED,
+            store / REPEATED,
+            resume / "runs",
+            resume / "borders",
+        )
 
     @property
     def margin_rad(self) -> float:
@@ -113,13 +106,7 @@ class StorePlan:
 def partition_pixels(
     pixels: Pixels, counts: NDArray[np.int64], order: int, max_rows: int, name: str
 ) -> tuple[Pixel, ...]:
-    """Return the largest pixels that hold no more stars than allowed and cover all of them.
-
-    Examples
-    --------
-    >>> partition_pixels(np.array([0, 1, 40]), np.array([5, 5, 3]), 2, 5, "some")
-    (Pixel(order=2, number=0), Pixel(order=2, number=1), Pixel(order=0, number=2))
-    """
+    """Return the largest pixels that hold no more stars than allowed and cover all of them."""
     chosen: list[Pixel] = []
     for level in range(order + 1):
         parent, first = np.unique(pixels >> 2 * (order - level), return_index=True)

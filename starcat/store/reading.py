@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,44 +21,37 @@ import pyarrow.parquet as pq
 
 from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
-from starcat.catalog.readers.blocks import map_in_order
 from starcat.catalog.source_files import FileFacts
-from starcat.catalog.stars import add_nearest_neighbours, floats_of, move_to_epoch, with_columns
+from starcat.catalog.stars import Columns, floats_of, move_to_epoch, table_from_columns
 from starcat.catalog.verdict import Reason
-from starcat.errors import ConfigError, ProductError, SchemaError, SchemaVersionError
+from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
-from starcat.store.layout import MANIFEST_NAME, REJECTED, REPEATED, Store, is_store, open_store
+from starcat.store.layout import (
+    MANIFEST_NAME,
+    REJECTED,
+    REPEATED,
+    Store,
+    check_has_columns,
+    is_store,
+    open_store,
+    parquet_file,
+)
 from starcat.store.metadata import MANIFEST_VERSION
+from starcat.threads import map_in_order
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
 
+_HINT = f"a build reads {', '.join(NEEDED)} of a HATS catalog, and what else the stars schema names"
+_PLACE = ("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
 
-def read_catalog(
-    source_name: str,
-    paths: Sequence[Path],
-    *,
-    band: str | None = None,
-    epoch_jyear: float | None = None,
-    read_limit_mag: float | None = None,
-    neighbours: bool = True,
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> Ingested:
-    """Read a star catalog from a store or from archive files."""
+
+def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
+    """Read a star catalog from a store or from archive files; what is chosen is as for `ingest`."""
     if not any(path.is_dir() and is_store(path) for path in paths):
-        return ingest(
-            source_name,
-            paths,
-            band=band,
-            epoch_jyear=epoch_jyear,
-            read_limit_mag=read_limit_mag,
-            neighbours=neighbours,
-            workers=workers,
-            progress=progress,
-        )
+        return ingest(source_name, paths, **chosen)
     if len(paths) > 1:
         raise ConfigError(
             f"{source_name}: {len(paths)} inputs are given, and one of them is a store; a store is "
@@ -66,49 +59,51 @@ def read_catalog(
             key="input",
             value=[str(path) for path in paths],
         )
-    options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
-    read = _read_store(open_store(paths[0]), options, workers, progress)
-    return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
+    return _read_store(source_name, open_store(paths[0]), **chosen)
 
 
-def _read_store(store: Store, options: IngestOptions, workers: int, progress: Progress) -> Ingested:
+def _read_store(
+    source_name: str,
+    store: Store,
+    *,
+    neighbours: bool = True,
+    workers: int = 2,
+    progress: Progress = no_progress,
+    band: str | None = None,
+    **limits: float | None,
+) -> Ingested:
+    options = ingest_options(source_name, band, **limits)
     manifest = read_manifest(store)
     if manifest is not None:
         _check_made_for(store, manifest, options)
-    stage = f"rows {options.source_name}"
-    partitions = [(number, path) for number, path in enumerate(_paths(store))]
+    read = partial(_bright_rows, options=options, manifest=manifest)
+    paths = [path for partition in store.catalog.partitions for path in partition.paths]
     found = StarTables()
-
-    def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int]:
-        return _bright_rows(*numbered, options, is_ours=manifest is not None)
-
-    done = 0
-    rows = [0] * len(partitions)
-    for (number, _), (stars, beyond) in zip(
-        partitions, map_in_order(read, iter(partitions), workers), strict=True
-    ):
+    rows: list[int] = []
+    for stars, beyond in map_in_order(read, enumerate(paths), workers):
         found.add(stars, counted=beyond)
-        rows[number] = len(stars) + beyond
-        done += rows[number]
-        progress(stage, done, None if manifest is None else manifest["kept"])
-    if manifest is not None:
+        rows.append(len(stars) + beyond)
+        progress(f"rows {source_name}", sum(rows), None if manifest is None else manifest["kept"])
+    if manifest is None:
+        files = _own_files(store, paths, rows)
+        problems, notes = [], ()
+    else:
         # What is beyond the limit of the store itself was only counted when it was made.
         found.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
-        _read_beside(store, options, found)
+        _read_beside(store, options, manifest, found)
         files = tuple(FileFacts(**file) for file in manifest["files"])
-    else:
-        files = _own_files(store, [path for _, path in partitions], rows)
-    stars, rejected = found.joined()
-    if manifest is None or manifest["epoch_jyear"] is None:
-        stars = _moved(stars, options.epoch_jyear)
-    malformed = rejected.filter(pc.equal(rejected["reason"], Reason.malformed_record.name))
-    malformed = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
-    problems = [
-        f"{files[row['source_file']].name} {row['detail']}"
-        for row in malformed.slice(0, NAMED_PROBLEMS).to_pylist()
-    ]
-    notes = (manifest or {}).get("notes", ())
-    return ingested(options, stars, rejected, found.counted, files, problems, notes)
+        problems, notes = _problems(found.rejected, files), manifest.get("notes", ())
+    return ingested(options, found, files, problems, notes, workers if neighbours else 0)
+
+
+def _problems(rejected: Sequence[pa.Table], files: Sequence[FileFacts]) -> list[str]:
+    """Return the first malformed records, in the order in which they were read."""
+    is_malformed = pc.field("reason") == Reason.malformed_record.name
+    schema = product_schema("rejected").arrow_schema
+    malformed = pa.concat_tables([schema.empty_table(), *rejected]).filter(is_malformed)
+    ordered = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
+    first = ordered.slice(0, NAMED_PROBLEMS).to_pylist()
+    return [f"{files[row['source_file']].name} {row['detail']}" for row in first]
 
 
 def read_manifest(store: Store) -> dict[str, Any] | None:
@@ -159,31 +154,22 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
         )
 
 
-def _paths(store: Store) -> list[Path]:
-    return [path for partition in store.catalog.partitions for path in partition.paths]
-
-
 def _bright_rows(
-    number: int, path: Path, options: IngestOptions, *, is_ours: bool
+    numbered: tuple[int, Path], options: IngestOptions, manifest: dict[str, Any] | None
 ) -> tuple[pa.Table, int]:
     """Return a file's stars within the limit, and how many are beyond it."""
+    number, path = numbered
     names = product_schema("stars").arrow_schema.names
-    try:
-        with pq.ParquetFile(path) as file:
-            has = file.schema_arrow.names
-            _check_columns(path, has)
-            columns = [name for name in names if name in has and not name.startswith("nearest_")]
-            groups = _groups_within(file, options.read_limit_mag)
-            table = file.read_row_groups(groups, columns, use_threads=False)
-            table = table.replace_schema_metadata(None)
-            total = file.metadata.num_rows
-    except (OSError, pa.ArrowException) as error:
-        raise ProductError(
-            f"{path}: cannot be read as Parquet ({error}); get the catalog again", path=path
-        ) from error
+    with parquet_file(path, ProductError, "get the catalog again") as file:
+        has = file.schema_arrow.names
+        check_has_columns(path, has, NEEDED, _HINT)
+        columns = [name for name in names if name in has and not name.startswith("nearest_")]
+        groups = _groups_within(file, options.read_limit_mag)
+        table = file.read_row_groups(groups, columns, use_threads=False)
+        total = file.metadata.num_rows
     if options.read_limit_mag is not None:
         table = table.filter(pc.less_equal(table["mag"], options.read_limit_mag))
-    return _as_stars(table, number, options, is_ours=is_ours), total - len(table)
+    return _as_stars(table, number, options, manifest), total - len(table)
 
 
 def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
@@ -201,81 +187,44 @@ def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
     return groups
 
 
-def _check_columns(path: Path, has: Sequence[str]) -> None:
-    lacking = [name for name in NEEDED if name not in has]
-    if lacking:
-        raise SchemaError(
-            f"{path}: no column {', '.join(lacking)}; a build reads {', '.join(NEEDED)} of a HATS "
-            "catalog, and what else the stars schema names",
-            product="stars",
-            field=lacking[0],
-            found=list(has),
-            expected=NEEDED,
-        )
-
-
-def _as_stars(table: pa.Table, number: int, options: IngestOptions, *, is_ours: bool) -> pa.Table:
+def _as_stars(
+    table: pa.Table, number: int, options: IngestOptions, manifest: dict[str, Any] | None
+) -> pa.Table:
     """Return rows as a table of the stars schema, with what a catalog of others lacks."""
-    schema = product_schema("stars").arrow_schema
     count = len(table)
-    given: dict[str, Any] = {
-        "catalog": pa.repeat(options.source_name, count),
-        "band": pa.repeat(options.band, count),
-        "source_file": pa.repeat(pa.scalar(number, pa.int32()), count),
-        "source_line": pa.array(np.arange(1, count + 1)),
-        "quality_flags": pa.repeat(pa.scalar(0, pa.int32()), count),
-        "is_flagged_double": pa.repeat(False, count),
-        "is_flagged_variable": pa.repeat(False, count),
-    }
-    if not is_ours:
-        table = table.drop_columns(
-            [
-                n
-                for n in ("catalog", "band", "source_file", "source_line")
-                if n in table.column_names
-            ]
-        )
-    columns = []
-    for wanted in schema:
-        if wanted.name in table.column_names:
-            columns.append(table[wanted.name].cast(wanted.type))
-        elif wanted.name == "designation":
-            words = table["star_id"].cast(pa.string())
-            columns.append(pc.binary_join_element_wise(options.source_name, words, " "))
-        elif wanted.name in ("x", "y", "z"):
-            columns.append(pa.array(np.zeros(count)))  # move_to_epoch fills them in
-        else:
-            columns.append(given.get(wanted.name, pa.nulls(count, wanted.type)))
-    return pa.Table.from_arrays(columns, schema=schema)
+    columns: Columns = dict(zip(table.column_names, table.columns, strict=True))
+    if manifest is None:
+        words = table["star_id"].cast(pa.string())
+        named = pc.binary_join_element_wise(options.source_name, words, " ")
+        columns = {"designation": named, "quality_flags": 0, **columns}
+        columns |= {"catalog": options.source_name, "band": options.band}
+        columns |= {"source_file": number, "source_line": np.arange(1, count + 1)}
+    if manifest is None or manifest["epoch_jyear"] is None:
+        place = {name: floats_of(table, name) for name in _PLACE if name in table.column_names}
+        place["quality_flags"] = np.asarray(columns["quality_flags"])
+        columns |= move_to_epoch(place, options.epoch_jyear)
+    return table_from_columns("stars", columns, count)
 
 
-def _moved(stars: pa.Table, epoch_jyear: float | None) -> pa.Table:
-    names = ("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
-    columns: dict[str, Any] = {name: floats_of(stars, name) for name in names}
-    columns["quality_flags"] = stars["quality_flags"].to_numpy()
-    return with_columns(stars, move_to_epoch(columns, epoch_jyear))
-
-
-def _read_beside(store: Store, options: IngestOptions, found: StarTables) -> None:
+def _read_beside(
+    store: Store, options: IngestOptions, manifest: dict[str, Any], found: StarTables
+) -> None:
     """Read rejected records, and those whose star was read before."""
-    limit = options.read_limit_mag
+    within = None
+    if options.read_limit_mag is not None:
+        within = pc.field("mag") <= options.read_limit_mag
     for path in sorted((store.folder / REPEATED).glob("*.parquet")):
         again = pq.read_table(path)
-        total = len(again)
-        if limit is not None:
-            again = again.filter(pc.less_equal(again["mag"], limit))
-        found.add(_as_stars(again, 0, options, is_ours=True), counted=total - len(again))
+        bright = again if within is None else again.filter(within)
+        found.add(_as_stars(bright, 0, options, manifest), counted=len(again) - len(bright))
     for path in sorted((store.folder / REJECTED).glob("*.parquet")):
         rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
-        total = len(rejected)
-        if limit is not None:
-            listed = pc.or_(
-                pc.fill_null(pc.less_equal(rejected["mag"], limit), False),
-                pc.equal(rejected["reason"], Reason.malformed_record.name),
-            )
-            rejected = rejected.filter(listed)
-        found.rejected.append(rejected)
-        found.counted += total - len(rejected)
+        listed = rejected
+        if within is not None:
+            is_malformed = pc.field("reason") == Reason.malformed_record.name
+            listed = rejected.filter(within | is_malformed)
+        found.rejected.append(listed)
+        found.counted += len(rejected) - len(listed)
 
 
 def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:

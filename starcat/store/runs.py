@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -58,7 +59,6 @@ class Run:
     stars: Path  # Arrow file
     places: Path  # file of `PLACES`, by bucket
     pixels: Pixels  # shape (B,): the coarse pixel of each batch
-    rows: NDArray[np.int64]  # shape (B,): its stars
     buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
 
 
@@ -84,11 +84,7 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     table = table.replace_schema_metadata({_CONSTANTS: json.dumps(constants).encode()})
     coarse, begins, rows = runs_of(pixels, order)
     path = folder / f"{name}.arrow"
-    with (
-        placed(path) as partial,
-        pa.OSFile(str(partial), "wb") as sink,
-        pa.ipc.new_file(sink, table.schema) as writer,
-    ):
+    with arrow_writer(path, table.schema) as writer:
         for begin, count in zip(begins.tolist(), rows.tolist(), strict=True):
             for batch in table.slice(begin, count).combine_chunks().to_batches():
                 writer.write_batch(batch)
@@ -96,7 +92,18 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     beside = folder / f"{name}.places"
     with placed(beside) as partial:
         partial.write_bytes(places.tobytes())
-    return Run(path, beside, coarse, rows, buckets), pixels
+    return Run(path, beside, coarse, buckets), pixels
+
+
+@contextmanager
+def arrow_writer(path: Path, schema: pa.Schema) -> Iterator[pa.RecordBatchWriter]:
+    """Open an Arrow file for batches, which gets its name at the end."""
+    with (
+        placed(path) as partial,
+        pa.OSFile(str(partial), "wb") as sink,
+        pa.ipc.new_file(sink, schema) as writer,
+    ):
+        yield writer
 
 
 def _without_constants(stars: pa.Table) -> tuple[pa.Table, dict[str, Any]]:
@@ -125,23 +132,6 @@ def _by_bucket(stars: pa.Table) -> tuple[NDArray[Any], NDArray[np.int64]]:
     places["place"] = places_of(stars)[order]
     counts = np.bincount(bucket, minlength=BUCKETS)
     return places, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
-
-def repeated_places(ranges: Sequence[tuple[Path, Sequence[int]]]) -> NDArray[np.int64]:
-    """Return the records whose star was read before."""
-    parts = []
-    for path, (begin, end) in ranges:
-        offset = begin * PLACES.itemsize
-        parts.append(np.fromfile(path, PLACES, end - begin, offset=offset))
-    all_places = np.concatenate(parts) if parts else np.empty(0, PLACES)
-    numbers = np.sort(all_places["star_id"])
-    twice = np.unique(numbers[1:][numbers[1:] == numbers[:-1]])
-    if not len(twice):
-        return np.empty(0, dtype=np.int64)
-    some = all_places[np.isin(all_places["star_id"], twice)]
-    some = some[np.lexsort((some["place"], some["star_id"]))]
-    again = some["star_id"][1:] == some["star_id"][:-1]
-    return np.sort(some["place"][1:][again])
 
 
 def read_shares(
@@ -252,7 +242,6 @@ def read_runs(path: Path, count: int) -> list[Run]:
                 path.with_name(f"{path.stem}-{k:04}.arrow"),
                 path.with_name(f"{path.stem}-{k:04}.places"),
                 held[f"batches{k}"],
-                held[f"rows{k}"],
                 held[f"buckets{k}"],
             )
             for k in range(count)
@@ -288,7 +277,14 @@ def read_index(path: Path) -> RunIndex:
 
 def find_repeated(asked: tuple[Path, int]) -> NDArray[np.int64]:
     """Return the records of a bucket of numbers whose star was read before."""
-    index = read_index(asked[0])
-    ranges = index.buckets[:, asked[1] : asked[1] + 2].tolist()
-    files = [path.with_suffix(".places") for path in index.paths]
-    return repeated_places(list(zip(files, ranges, strict=True)))
+    index, bucket = read_index(asked[0]), asked[1]
+    parts = [np.empty(0, PLACES)]
+    for path, (begin, end) in zip(index.paths, index.buckets[:, bucket : bucket + 2], strict=True):
+        file, offset = path.with_suffix(".places"), begin * PLACES.itemsize
+        parts.append(np.fromfile(file, PLACES, end - begin, offset=offset))
+    places = np.concatenate(parts)
+    numbers = np.sort(places["star_id"])
+    some = places[np.isin(places["star_id"], numbers[1:][numbers[1:] == numbers[:-1]])]
+    some = some[np.lexsort((some["place"], some["star_id"]))]
+    again = some["star_id"][1:] == some["star_id"][:-1]
+    return np.sort(some["place"][1:][again])

@@ -14,8 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.parts import FileReading, merged, parse_block, read_files
-from starcat.catalog.source import data_source
+from starcat.catalog.parts import merged, parse_block, read_files
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
@@ -34,6 +33,7 @@ class _Written:
     plan: StorePlan
     name: str  # of its files
     order: int  # of the coarse pixels of runs
+    kept: int = 0  # stars
     runs: list[Run] = field(default_factory=list)
     pixels: list[Any] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
@@ -45,6 +45,7 @@ class _Written:
         name = f"{self.name}-{len(self.runs):04}"
         run, pixels = write_run(stars, self.order, self.plan.runs, name)
         self.runs.append(run)
+        self.kept += len(stars)
         fine, _, counts = runs_of(pixels, HISTOGRAM_ORDER)
         self.pixels.append((fine, counts))
         self.files += [run.stars, run.places]
@@ -60,45 +61,37 @@ class _Written:
             self.files.append(path)
         self.writer.write_table(rejected.sort_by("source_line"))
 
-    def index(self) -> Path:
+    def index(self) -> None:
         """Write what the runs hold: batches, buckets and counts by pixel."""
         path = self.plan.runs / f"{self.name}.npz"
         pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
         counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
         fine, place = np.unique(pixels, return_inverse=True)
-        arrays = {
-            "pixels": fine,
-            "counts": np.bincount(place, counts, len(fine)).astype(np.int64),
-        }
+        arrays = {"pixels": fine, "counts": np.bincount(place, counts, len(fine)).astype(np.int64)}
         for k, run in enumerate(self.runs):
-            arrays |= {f"batches{k}": run.pixels, f"rows{k}": run.rows, f"buckets{k}": run.buckets}
+            arrays |= {f"batches{k}": run.pixels, f"buckets{k}": run.buckets}
         with placed(path) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
         self.files.append(path)
-        return path
 
 
-def split(
-    plan: StorePlan, number: int, file: InputFile, order: int
-) -> tuple[dict[str, Any], Digests]:
-    """Split the input with a number into runs, which have batches by pixels of an order."""
-    written = _Written(plan, split_name(number), order)
+def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any], Digests]:
+    """Split an input into runs, which have batches by pixels of an order."""
+    written = _Written(plan, split_name(file.number), order)
     (plan.rejected / f"{written.name}.parquet").unlink(missing_ok=True)
-    reading = FileReading(file, number, data_source(plan.ingest.source_name))
     parse = partial(parse_block, options=plan.ingest)
     counts: Counter[str] = Counter()
     with written.closing:
-        for _, parts in read_files([reading], parse):
-            for part in merged(parts, rows_of_a_run(plan.options)):
-                counts.update(count_by_reason(part.rejected, part.counted))
-                if len(part.stars):
-                    written.stars(part.stars)
-                if len(part.rejected):
-                    written.rejected(part.rejected)
-    kept = sum(int(run.rows.sum()) for run in written.runs)
+        reading, parts = next(read_files([file], parse))
+        for part in merged(parts, rows_of_a_run(plan.options)):
+            counts.update(count_by_reason(part.rejected, part.counted))
+            if len(part.stars):
+                written.stars(part.stars)
+            if len(part.rejected):
+                written.rejected(part.rejected)
     result = {
         "file": asdict(reading.facts),
-        "kept": kept,
+        "kept": written.kept,
         "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
         "problems": list(reading.named_problems),
         "runs": len(written.runs),
@@ -112,6 +105,6 @@ def split_name(number: int) -> str:
     return f"file-{number:05}"
 
 
-def is_unchanged(file: InputFile, result: dict[str, Any]) -> bool:
+def is_unchanged(result: dict[str, Any], _: StorePlan, file: InputFile, __: int) -> bool:
     """Return whether a file is still what it was when it was split."""
     return bool(file_sha256(file.path) == result["file"]["sha256"])

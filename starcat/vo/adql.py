@@ -8,18 +8,17 @@ arithmetic of geometry. What comes out is checked again by the session that runs
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain
 from typing import TYPE_CHECKING
 
 from sqlglot import exp
 
-from starcat.errors import QueryError, quoted, suggest
-from starcat.exchange.columns import described
+from starcat.errors import quoted, suggest
+from starcat.exchange.columns import begun, described
 from starcat.progress import Progress, no_progress
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.vo.adql_columns import Columns, Names
-from starcat.vo.adql_grammar import parse_adql, refuse
+from starcat.vo.adql_grammar import Refusal, parse_adql, refusals_of
 from starcat.vo.adql_shapes import (
     GEOMETRY,
     GeometryCalls,
@@ -44,16 +43,14 @@ class Function:
     # How many arguments it takes.
     least: int
     most: int
-    written: str  # SQL of DuckDB with {0}, {1} for the arguments; {all} for all of them
-    # The same where the last argument is left out; empty where that is no matter.
-    shortened: str = ""
+    # SQL of DuckDB with {0}, {1} for the arguments, 0 where one is left out; {all} for all of them.
+    written: str
     is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
 
     def sql(self, arguments: list[str]) -> str:
         """Return the call as DuckDB writes it."""
-        short = len(arguments) < self.most and self.shortened
-        text = self.shortened if short else self.written
-        return text.format(*arguments, all=", ".join(arguments))
+        left_out = ["0"] * (self.most - len(arguments))
+        return self.written.format(*arguments, *left_out, all=", ".join(arguments))
 
 
 def _same(name: str, count: int = 1) -> Function:
@@ -61,41 +58,27 @@ def _same(name: str, count: int = 1) -> Function:
     return Function(count, count, f"{name}({places})")
 
 
+_SAME = "ABS DEGREES EXP FLOOR LOG10 RADIANS SQRT ACOS ASIN ATAN COS COT SIN TAN LOWER UPPER"
+
 FUNCTIONS: dict[str, Function] = {
-    "ABS": _same("abs"),
+    **{name: _same(name.lower()) for name in _SAME.split()},
     "CEILING": _same("ceil"),
-    "DEGREES": _same("degrees"),
-    "EXP": _same("exp"),
-    "FLOOR": _same("floor"),
     "LOG": _same("ln"),
-    "LOG10": _same("log10"),
     # A remainder by 0 has no value; DuckDB would end the query.
     "MOD": Function(2, 2, "mod({0}, nullif({1}, 0))"),
     "PI": _same("pi", 0),
     "POWER": _same("power", 2),
-    "RADIANS": _same("radians"),
-    "SQRT": _same("sqrt"),
     # What a seed does depends on the service, ADQL says; here it does nothing.
     "RAND": Function(0, 1, "random()"),
-    "ROUND": Function(1, 2, "round(({0})::DOUBLE, {1})", "round(({0})::DOUBLE)"),
-    "TRUNCATE": Function(1, 2, "trunc(({0})::DOUBLE, {1})", "trunc(({0})::DOUBLE)"),
-    "ACOS": _same("acos"),
-    "ASIN": _same("asin"),
-    "ATAN": _same("atan"),
+    "ROUND": Function(1, 2, "round(({0})::DOUBLE, {1})"),
+    "TRUNCATE": Function(1, 2, "trunc(({0})::DOUBLE, {1})"),
     "ATAN2": _same("atan2", 2),
-    "COS": _same("cos"),
-    "COT": _same("cot"),
-    "SIN": _same("sin"),
-    "TAN": _same("tan"),
-    "LOWER": _same("lower"),
-    "UPPER": _same("upper"),
     "COALESCE": Function(1, 1000, "coalesce({all})"),
     "TIMESTAMP": Function(1, 1, "CAST({0} AS TIMESTAMP)"),
-    "COUNT": Function(1, 1, "count({0})", is_set=True),
-    "SUM": Function(1, 1, "sum({0})", is_set=True),
-    "AVG": Function(1, 1, "avg({0})", is_set=True),
-    "MIN": Function(1, 1, "min({0})", is_set=True),
-    "MAX": Function(1, 1, "max({0})", is_set=True),
+    **{
+        name: Function(1, 1, f"{name.lower()}({{0}})", is_set=True)
+        for name in ("COUNT", "SUM", "AVG", "MIN", "MAX")
+    },
     "IVO_HEALPIX_INDEX": Function(3, 3, "healpix({0}, {1}, {2})"),
 }
 """Functions by their names in ADQL. Logarithms are natural where the name does not say 10."""
@@ -122,12 +105,8 @@ class Translation:
 def translate(text: str, tables: Tables) -> Translation:
     """Return a query in ADQL as SQL."""
     tree = parse_adql(text)
-    try:
-        return _Translator(text, tables, tree).translation()
-    except RecursionError as error:
-        raise QueryError(
-            "the query is nested too deeply; write it with fewer parentheses within each other"
-        ) from error
+    with refusals_of(text):
+        return _Translator(tables, tree).translation()
 
 
 def ask(
@@ -141,10 +120,8 @@ def ask(
     One row more than `max_rows` is given, so that it shows that there are more. The first rows are
     there already, and no other query may be asked before the last.
     """
-    import pyarrow as pa
-
     with session.ask(asked.sql) as running:
-        found = list(zip(running.columns, running.types, strict=True))
+        found = running.columns
     columns = _known(asked.columns, [name for name, _ in found])
     chosen = ", ".join(
         f"{cast(f'#{k}', kind)} AS {quoted_name(column.name)}"
@@ -155,9 +132,7 @@ def ask(
         f"SELECT {chosen} FROM ({asked.sql}) AS found{limit}", progress=progress
     ) as it:
         batches = described(it.batches(), (column.facts for column in columns))
-    first = next(iter(batches), None)
-    begun = [] if first is None else [first]
-    return pa.RecordBatchReader.from_batches(batches.schema, chain(begun, batches))
+    return begun(batches)
 
 
 def _known(columns: tuple[Column, ...] | None, names: list[str]) -> list[Column]:
@@ -179,11 +154,10 @@ def _known(columns: tuple[Column, ...] | None, names: list[str]) -> list[Column]
 class _Translator:
     """The work of `translate`: parts of the tree are replaced from the leaves on."""
 
-    def __init__(self, text: str, tables: Tables, tree: exp.Expr) -> None:
-        self._text = text
+    def __init__(self, tables: Tables, tree: exp.Expr) -> None:
         self._tree = tree
-        self._names = Names(tables, text, tree)
-        self._geometry = GeometryCalls(text)
+        self._names = Names(tables, tree)
+        self._geometry = GeometryCalls()
 
     def translation(self) -> Translation:
         tree = self._tree
@@ -236,51 +210,48 @@ class _Translator:
 
     def _call(self, part: exp.Anonymous) -> None:
         name = part.this.upper() if isinstance(part.this, str) else ""
-        if self._geometry.read(name, part):
+        if self._geometry.read(part):
             return
         if name == "IN_UNIT":
             self._in_unit(part)
             return
         if name not in FUNCTIONS:
             known = sorted({*FUNCTIONS, *GEOMETRY, "IN_UNIT", "CAST"})
-            raise self._refusal(
+            raise Refusal(
                 f"no function {quoted(part.name)}; {suggest(name, known)}there are "
                 f"{', '.join(known)}",
                 part,
             )
         function = FUNCTIONS[name]
-        check_count(self._text, part, name, function.least, function.most)
+        check_count(part, function.least, function.most)
         arguments = part.expressions
         inner = arguments[0] if arguments else None
         if isinstance(inner, exp.Distinct) and not function.is_set:
-            raise self._refusal(f"{name} takes no DISTINCT", part)
+            raise Refusal(f"{name} takes no DISTINCT", part)
         if isinstance(inner, exp.Star) and name != "COUNT":
-            raise self._refusal(f"{name} takes no *", part)
+            raise Refusal(f"{name} takes no *", part)
         for argument in arguments:
             if shape_of(argument) is not None:
-                raise self._refusal(f"{name} takes numbers or texts, and no geometry", part)
+                raise Refusal(f"{name} takes numbers or texts, and no geometry", part)
         part.replace(raw(function.sql([sql_text(argument) for argument in arguments])))
 
     def _in_unit(self, part: exp.Anonymous) -> None:
         """Write the factor between the unit of a column and another."""
-        check_count(self._text, part, "IN_UNIT", 2, 2)
+        check_count(part, 2, 2)
         value, wanted = part.expressions
         if not isinstance(value, exp.Column) or not is_text(wanted):
-            raise self._refusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
+            raise Refusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
         found = self._names.column(value)
         if found is None or not found.unit:
-            raise self._refusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
+            raise Refusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
         from astropy import units
 
         try:
             factor = units.Unit(found.unit).to(units.Unit(wanted.name))
         except (ValueError, TypeError) as error:
-            raise self._refusal(
+            raise Refusal(
                 f"IN_UNIT: {quoted(found.unit)} of {value.name} is not to be had in "
                 f"{quoted(wanted.name)}",
                 part,
             ) from error
         part.replace(raw(f"({sql_text(value)} * {float(factor)!r}::DOUBLE)"))
-
-    def _refusal(self, message: str, part: exp.Expr) -> QueryError:
-        return refuse(message, part, self._text)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sqlglot import exp
 
 from starcat.errors import quoted, suggest
-from starcat.vo.adql_grammar import refuse
+from starcat.vo.adql_grammar import Refusal
 from starcat.vo.tables import Column, Tables
 
 Columns = tuple[Column, ...]
@@ -25,9 +25,8 @@ class Source:
 class Names:
     """What the names in a query mean."""
 
-    def __init__(self, tables: Tables, text: str, tree: exp.Expr) -> None:
+    def __init__(self, tables: Tables, tree: exp.Expr) -> None:
         self._tables = tables
-        self._text = text
         self._select: dict[int, exp.Select | None] = {}
         self._sources_of: dict[int, list[Source]] = {}
         # From the root on, so that no part has to look upwards through many others.
@@ -43,11 +42,10 @@ class Names:
         if found is None:
             given = f"{table.db}.{table.name}" if table.db else table.name
             known = self._tables.names()
-            raise refuse(
+            raise Refusal(
                 f"no table {quoted(given)}; {suggest(given, known)}TAP_SCHEMA.tables lists the "
                 f"{len(known)} that there are, each with its schema",
                 table,
-                self._text,
             )
         view = found.view or found.name
         if not table.alias and (not table.db or view != found.name):
@@ -101,11 +99,10 @@ class Names:
         if column.name.lower() in known:
             return
         where = f" in {quoted(column.table)}" if column.table else ""
-        raise refuse(
+        raise Refusal(
             f"no column {quoted(column.name)}{where}; {suggest(column.name.lower(), known)}"
             f"{'there are ' + ', '.join(sorted(known)[:12]) if known else 'no table has the name'}",
             column,
-            self._text,
         )
 
     def _around(self, part: exp.Expr) -> list[exp.Select]:
@@ -173,7 +170,6 @@ class Names:
         return None
 
     def _projected(self, query: exp.Select, part: exp.Expr, number: int) -> list[Column] | None:
-        """Return the columns that one part of a SELECT list gives."""
         if isinstance(part, exp.Star) or (isinstance(part, exp.Column) and part.name == "*"):
             joins = query.args.get("joins", ())
             if any(join.args.get("using") or join.args.get("method") for join in joins):
@@ -187,7 +183,7 @@ class Names:
                 found += source.columns
             return found
         value = part.this if isinstance(part, exp.Alias) else part
-        name = part.alias or default_name(value, number)
+        name = part.alias or _default_name(value, number)
         known = self._in(query, value) if isinstance(value, exp.Column) else None
         return [known.named(name) if known else Column.unknown(name)]
 
@@ -202,8 +198,7 @@ class Names:
         return None
 
 
-def default_name(value: exp.Expr, number: int) -> str:
-    """Return the name of a column of an answer that the query gives none."""
+def _default_name(value: exp.Expr, number: int) -> str:
     if isinstance(value, exp.Column):
         return value.name
     if isinstance(value, exp.Anonymous):

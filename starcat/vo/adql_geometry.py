@@ -3,7 +3,10 @@
 Separations are those of the macro ``separation`` (by the arc tangent, exact at all angles). Sides
 of polygons are arcs of great circles. A polygon is the smaller of the two parts of the sphere that
 its sides divide, whatever the order of its corners; its inside is found by the angle that its sides
-go round a place. What is known when the query is read is computed then.
+go round a place.
+
+Arithmetic is done when a query is read where its numbers are known, and is SQL elsewhere: a term is
+a number, or SQL that gives one.
 
 References
 ----------
@@ -13,33 +16,22 @@ ADQL 2.1, section 4.2. Todhunter 1886, Spherical Trigonometry, for the area.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-from starcat.vo.adql_terms import (
-    Term,
-    Vector,
-    added,
-    all_of,
-    any_of,
-    arctan,
-    compared,
-    cross,
-    dot,
-    number_in,
-    over,
-    plus,
-    root,
-    sign_of,
-    sql_of,
-    term_of,
-    times,
-)
-
 MARGIN_DEG = 1e-9  # by how much the band of declinations is wider that is looked at first
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
+
+
+Term = float | str  # a number, or SQL that gives one
+Vector = tuple[Term, Term, Term]
+
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "=": operator.eq,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,7 +45,7 @@ class Point:
     @cached_property
     def known(self) -> tuple[float, float] | None:
         """The place in degrees, if it does not depend on a row."""
-        lon, lat = number_in(self.lon), number_in(self.lat)
+        lon, lat = _number_in(self.lon), _number_in(self.lat)
         return (lon, lat) if lon is not None and lat is not None else None
 
     @cached_property
@@ -107,9 +99,9 @@ class Polygon:
         first, *others = (corner.vector for corner in self.corners)
         parts: list[Term] = []
         for a, b in pairwise(others):
-            whole = added(1.0, dot(first, a), dot(a, b), dot(b, first))
-            parts.append(times(2.0, arctan(dot(first, cross(a, b)), whole)))
-        return added(*parts)
+            whole = _added(1.0, _dot(first, a), _dot(a, b), _dot(b, first))
+            parts.append(_times(2.0, _arctan(_dot(first, _cross(a, b)), whole)))
+        return _added(*parts)
 
 
 Shape = Point | Circle | Polygon
@@ -118,23 +110,23 @@ Shape = Point | Circle | Polygon
 def contains(inner: Shape, outer: Shape) -> str:
     """Return SQL of whether a shape is within another."""
     if isinstance(outer, Point):
-        return compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
+        return _compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
     if isinstance(outer, Circle):
         if isinstance(inner, Point):
             return _in_circle(inner, outer)
         if isinstance(inner, Circle):
-            reach = plus(_apart(inner.centre, outer.centre), term_of(inner.radius))
-            return compared(reach, "<=", term_of(outer.radius))
-        return all_of(_in_circle(corner, outer) for corner in inner.corners)
+            reach = _plus(_apart(inner.centre, outer.centre), _term_of(inner.radius))
+            return _compared(reach, "<=", _term_of(outer.radius))
+        return _all_of(_in_circle(corner, outer) for corner in inner.corners)
     if isinstance(inner, Point):
         return _in_polygon(inner, outer)
     if isinstance(inner, Circle):
-        centre, radius = inner.centre, term_of(inner.radius)
-        edge = (compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
-        return all_of([_in_polygon(centre, outer), *edge])
+        centre, radius = inner.centre, _term_of(inner.radius)
+        edge = (_compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
+        return _all_of([_in_polygon(centre, outer), *edge])
     within = [_in_polygon(corner, outer) for corner in inner.corners]
     crossing = _sides_cross(inner, outer)
-    return all_of([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
+    return _all_of([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
 
 
 def intersects(one: Shape, other: Shape) -> str:
@@ -144,21 +136,21 @@ def intersects(one: Shape, other: Shape) -> str:
     if isinstance(other, Point):
         return contains(other, one)
     if isinstance(one, Circle) and isinstance(other, Circle):
-        reach = plus(term_of(one.radius), term_of(other.radius))
-        return compared(_apart(one.centre, other.centre), "<=", reach)
+        reach = _plus(_term_of(one.radius), _term_of(other.radius))
+        return _compared(_apart(one.centre, other.centre), "<=", reach)
     if isinstance(one, Circle) and isinstance(other, Polygon):
-        centre, radius = one.centre, term_of(one.radius)
-        near = (compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
-        return any_of([_in_polygon(centre, other), *near])
+        centre, radius = one.centre, _term_of(one.radius)
+        near = (_compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
+        return _any_of([_in_polygon(centre, other), *near])
     if isinstance(one, Polygon) and isinstance(other, Polygon):
         inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
-        return any_of([*inside, _sides_cross(one, other)])
+        return _any_of([*inside, _sides_cross(one, other)])
     return intersects(other, one)
 
 
 def distance(one: Point, other: Point) -> str:
     """Return SQL of the separation of two places, degrees."""
-    return sql_of(_apart(one, other))
+    return _sql_of(_apart(one, other))
 
 
 def area(shape: Shape) -> str:
@@ -169,31 +161,30 @@ def area(shape: Shape) -> str:
         # 1 - cos r with all its digits for small circles.
         half = f"sind(least({shape.radius}, 180) / 2e0)"
         return f"({4.0 * math.pi * SQUARE_DEGREES!r} * {half} * {half})"
-    return f"({SQUARE_DEGREES!r} * abs({sql_of(shape.turn)}))"
+    return f"({SQUARE_DEGREES!r} * abs({_sql_of(shape.turn)}))"
 
 
 def centroid(shape: Shape) -> Point:
     """Return the middle of a shape: of a polygon the direction of its mean place."""
     if isinstance(shape, Point):
         return shape
-    if isinstance(shape, Circle):
-        return shape.centre
     if shape.centre is not None:
         return shape.centre
     # The mean is half the sum of the normals of the sides, each as long as its side.
     total: Vector = (0.0, 0.0, 0.0)
     for a, b in shape.sides:
-        normal = cross(a.vector, b.vector)
-        length = root(dot(normal, normal))
-        factor = over(arctan(length, dot(a.vector, b.vector)), length)
-        x, y, z = (added(t, times(factor, n)) for t, n in zip(total, normal, strict=True))
+        normal = _cross(a.vector, b.vector)
+        length = _root(_dot(normal, normal))
+        factor = _over(_arctan(length, _dot(a.vector, b.vector)), length)
+        x, y, z = (_added(t, _times(factor, n)) for t, n in zip(total, normal, strict=True))
         total = (x, y, z)
-    sign = sign_of(shape.turn)
-    x, y, z = (times(sign, part) for part in total)
-    level = root(added(times(x, x), times(y, y)))
-    lon = f"degrees({sql_of(arctan(y, x))})"
+    sign = _sign_of(shape.turn)
+    x, y, z = (_times(sign, part) for part in total)
+    level = _root(_added(_times(x, x), _times(y, y)))
+    lon = f"degrees({_sql_of(_arctan(y, x))})"
     return Point(
-        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)", f"degrees({sql_of(arctan(z, level))})"
+        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)",
+        f"degrees({_sql_of(_arctan(z, level))})",
     )
 
 
@@ -201,7 +192,7 @@ def characters(shapes: Sequence[Shape]) -> int:
     """Return how much SQL it takes, roughly, to find something out about shapes."""
     parts = [_parts(shape) for shape in shapes]
     sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
-    unknown = [sum(len(text) for text in texts if number_in(text) is None) for texts in parts]
+    unknown = [sum(len(text) for text in texts if _number_in(text) is None) for texts in parts]
     both = sum(
         length * math.prod(sides) // side for length, side in zip(unknown, sides, strict=True)
     )
@@ -226,20 +217,20 @@ def box(centre: Point, width: str, height: str) -> Polygon:
 
 
 def _folded(middle: str, sign: str, width: str) -> str:
-    known = number_in(middle), number_in(width)
+    known = _number_in(middle), _number_in(width)
     if known[0] is not None and known[1] is not None:
         half = known[1] / 2.0
-        return sql_of(known[0] + half if sign == "+" else known[0] - half)
+        return _sql_of(known[0] + half if sign == "+" else known[0] - half)
     return f"({middle} {sign} ({width}) / 2e0)"
 
 
 def _in_circle(place: Point, circle: Circle) -> str:
-    near = compared(_apart(place, circle.centre), "<=", term_of(circle.radius))
+    near = _compared(_apart(place, circle.centre), "<=", _term_of(circle.radius))
     if place.known:
         return near
-    lat, radius = term_of(circle.centre.lat), term_of(circle.radius)
-    reach = plus(radius, MARGIN_DEG)
-    low, high = sql_of(plus(lat, times(-1.0, reach))), sql_of(plus(lat, reach))
+    lat, radius = _term_of(circle.centre.lat), _term_of(circle.radius)
+    reach = _plus(radius, MARGIN_DEG)
+    low, high = _sql_of(_plus(lat, _times(-1.0, reach))), _sql_of(_plus(lat, reach))
     # Declinations are looked at first: files tell which they have.
     return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
 
@@ -249,11 +240,11 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
     angles = []
     for a, b in polygon.sides:
         u, v = a.vector, b.vector
-        across = dot(p, cross(u, v))
-        along = added(dot(u, v), times(-1.0, times(dot(p, u), dot(p, v))))
-        angles.append(arctan(across, along))
-    round_ = times(sign_of(polygon.turn), added(*angles))
-    inside = compared(round_, ">", math.pi)
+        across = _dot(p, _cross(u, v))
+        along = _added(_dot(u, v), _times(-1.0, _times(_dot(p, u), _dot(p, v))))
+        angles.append(_arctan(across, along))
+    round_ = _times(_sign_of(polygon.turn), _added(*angles))
+    inside = _compared(round_, ">", math.pi)
     band = None if place.known else _band(polygon)
     return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
 
@@ -274,46 +265,145 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
     if reach >= 90.0:
         return None
     lat = math.degrees(math.asin(max(-1.0, min(1.0, middle[2]))))
-    return sql_of(lat - reach - 1e-6), sql_of(lat + reach + 1e-6)
+    return _sql_of(lat - reach - 1e-6), _sql_of(lat + reach + 1e-6)
 
 
 def _from_side(place: Point, a: Point, b: Point) -> Term:
     """Return the separation of a place from the arc between two others, degrees."""
     p, u, v = place.vector, a.vector, b.vector
-    normal = cross(u, v)
-    away = cross(p, normal)
-    height = arctan(dot(p, normal), root(dot(away, away)))
-    beside = dot(p, cross(normal, u)), dot(p, cross(v, normal))
+    normal = _cross(u, v)
+    away = _cross(p, normal)
+    height = _arctan(_dot(p, normal), _root(_dot(away, away)))
+    beside = _dot(p, _cross(normal, u)), _dot(p, _cross(v, normal))
     ends = _apart(place, a), _apart(place, b)
     if isinstance(height, float) and place.known and a.known and b.known:
         is_beside = min(map(float, beside)) >= 0.0
         return math.degrees(abs(height)) if is_beside else min(map(float, ends))
-    asked = " AND ".join(compared(one, ">=", 0.0) for one in beside)
-    nearest = f"least({sql_of(ends[0])}, {sql_of(ends[1])})"
-    return f"(CASE WHEN {asked} THEN abs(degrees({sql_of(height)})) ELSE {nearest} END)"
+    asked = " AND ".join(_compared(one, ">=", 0.0) for one in beside)
+    nearest = f"least({_sql_of(ends[0])}, {_sql_of(ends[1])})"
+    return f"(CASE WHEN {asked} THEN abs(degrees({_sql_of(height)})) ELSE {nearest} END)"
 
 
 def _sides_cross(one: Polygon, other: Polygon) -> str:
-    """Return SQL of whether a side of a polygon crosses one of another."""
     found = []
     for a, b in one.sides:
         for c, d in other.sides:
             u, v, w, t = a.vector, b.vector, c.vector, d.vector
             turns = (
-                dot(u, cross(w, v)), dot(w, cross(v, t)),
-                dot(v, cross(t, u)), dot(t, cross(u, w)),
+                _dot(u, _cross(w, v)), _dot(w, _cross(v, t)),
+                _dot(v, _cross(t, u)), _dot(t, _cross(u, w)),
             )  # fmt: skip
-            found += [all_of(compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
-    return any_of(found)
+            found += [_all_of(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
+    return _any_of(found)
 
 
 def _apart(one: Point, other: Point) -> Term:
-    """Return the separation of two places, degrees."""
     if one.known and other.known:
-        across = cross(one.vector, other.vector)
-        return math.degrees(float(arctan(root(dot(across, across)), dot(one.vector, other.vector))))
+        across = _cross(one.vector, other.vector)
+        return math.degrees(
+            float(_arctan(_root(_dot(across, across)), _dot(one.vector, other.vector)))
+        )
     return f"separation({one.lon}, {one.lat}, {other.lon}, {other.lat})"
 
 
 def _list(*numbers: str) -> str:
     return f"[{', '.join(f'({number})::DOUBLE' for number in numbers)}]"
+
+
+def _term_of(text: str) -> Term:
+    found = _number_in(text)
+    return f"({text})" if found is None else found
+
+
+def _number_in(text: str) -> float | None:
+    """Return the number that SQL says, if it is one."""
+    try:
+        found = float(text.strip("() ").replace("- ", "-"))
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else None
+
+
+def _sql_of(term: Term) -> str:
+    return term if isinstance(term, str) else f"({term!r}::DOUBLE)"
+
+
+def _times(a: Term, b: Term) -> Term:
+    if isinstance(a, float) and isinstance(b, float):
+        return a * b
+    if a == 1.0 or b == 1.0:
+        return b if a == 1.0 else a
+    return f"({_sql_of(a)} * {_sql_of(b)})"
+
+
+def _plus(a: Term, b: Term) -> Term:
+    if isinstance(a, float) and isinstance(b, float):
+        return a + b
+    if a == 0.0 or b == 0.0:
+        return b if a == 0.0 else a
+    return f"({_sql_of(a)} + {_sql_of(b)})"
+
+
+def _added(*terms: Term) -> Term:
+    total: Term = 0.0
+    for term in terms:
+        total = _plus(total, term)
+    return total
+
+
+def _over(a: Term, b: Term) -> Term:
+    """Return the quotient of two numbers; 1 where both are 0."""
+    if isinstance(a, float) and isinstance(b, float):
+        return a / b if b else 1.0
+    return f"({_sql_of(a)} / {_sql_of(b)})"
+
+
+def _arctan(y: Term, x: Term) -> Term:
+    if isinstance(y, float) and isinstance(x, float):
+        return math.atan2(y, x)
+    return f"atan2({_sql_of(y)}, {_sql_of(x)})"
+
+
+def _root(a: Term) -> Term:
+    return math.sqrt(a) if isinstance(a, float) else f"sqrt({a})"
+
+
+def _sign_of(a: Term) -> Term:
+    return math.copysign(1.0, a) if isinstance(a, float) else f"sign({a})"
+
+
+def _dot(a: Vector, b: Vector) -> Term:
+    return _added(*(_times(x, y) for x, y in zip(a, b, strict=True)))
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    def minus(p: Term, q: Term, r: Term, s: Term) -> Term:
+        return _plus(_times(p, q), _times(-1.0, _times(r, s)))
+
+    return (
+        minus(a[1], b[2], a[2], b[1]),
+        minus(a[2], b[0], a[0], b[2]),
+        minus(a[0], b[1], a[1], b[0]),
+    )
+
+
+def _compared(a: Term, sign: str, b: Term) -> str:
+    if isinstance(a, float) and isinstance(b, float):
+        return "true" if _COMPARISONS[sign](a, b) else "false"
+    return f"({_sql_of(a)} {sign} {_sql_of(b)})"
+
+
+def _all_of(conditions: Iterable[str]) -> str:
+    """Return SQL of whether all conditions hold; what is known is left out."""
+    left = [one for one in conditions if one != "true"]
+    return "false" if "false" in left else _joined(left, " AND ", "true")
+
+
+def _any_of(conditions: Iterable[str]) -> str:
+    """Return SQL of whether one of some conditions holds; what is known is left out."""
+    left = [one for one in conditions if one != "false"]
+    return "true" if "true" in left else _joined(left, " OR ", "false")
+
+
+def _joined(conditions: list[str], word: str, nothing: str) -> str:
+    return f"({word.join(conditions)})" if conditions else nothing

@@ -11,6 +11,9 @@ ADQL 2.1, IVOA Recommendation, December 2023.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 from sqlglot import exp, parser, tokens
 from sqlglot.dialects.dialect import Dialect
@@ -21,24 +24,15 @@ from starcat.errors import QueryError, quoted
 
 MAX_CHARACTERS = 50_000  # length of the longest query that is read
 POINTED_CHARACTERS = 160  # how much of a line with an error is shown
+_SAME = """
+ALL AND ASC BETWEEN CROSS DESC DISTINCT ELSE END ESCAPE EXCEPT EXISTS FALSE FROM FULL GROUP_BY
+HAVING ILIKE IN INNER INTERSECT INTO IS JOIN LEFT LIKE LIMIT NATURAL NOT NULL OFFSET ON OR
+ORDER_BY OUTER OVER RECURSIVE RIGHT SELECT THEN TOP TRUE UNION USING WHEN WHERE WITH
+"""
 _WORDS = {
-    "ALL": TokenType.ALL, "AND": TokenType.AND, "AS": TokenType.ALIAS, "ASC": TokenType.ASC,
-    "BETWEEN": TokenType.BETWEEN, "CROSS": TokenType.CROSS, "DESC": TokenType.DESC,
-    "DISTINCT": TokenType.DISTINCT, "ELSE": TokenType.ELSE, "END": TokenType.END,
-    "ESCAPE": TokenType.ESCAPE, "EXCEPT": TokenType.EXCEPT, "EXISTS": TokenType.EXISTS,
-    "FALSE": TokenType.FALSE, "FROM": TokenType.FROM, "FULL": TokenType.FULL,
-    "GROUP BY": TokenType.GROUP_BY, "HAVING": TokenType.HAVING, "ILIKE": TokenType.ILIKE,
-    "IN": TokenType.IN, "INNER": TokenType.INNER, "INTERSECT": TokenType.INTERSECT,
-    "INTO": TokenType.INTO, "IS": TokenType.IS, "JOIN": TokenType.JOIN, "LEFT": TokenType.LEFT,
-    "LIKE": TokenType.LIKE, "LIMIT": TokenType.LIMIT, "NATURAL": TokenType.NATURAL,
-    "NOT": TokenType.NOT, "NULL": TokenType.NULL, "OFFSET": TokenType.OFFSET, "ON": TokenType.ON,
-    "OR": TokenType.OR, "ORDER BY": TokenType.ORDER_BY, "OUTER": TokenType.OUTER,
-    "OVER": TokenType.OVER, "RECURSIVE": TokenType.RECURSIVE, "RIGHT": TokenType.RIGHT,
-    "SELECT": TokenType.SELECT, "THEN": TokenType.THEN, "TOP": TokenType.TOP,
-    "TRUE": TokenType.TRUE, "UNION": TokenType.UNION, "USING": TokenType.USING,
-    "WHEN": TokenType.WHEN, "WHERE": TokenType.WHERE, "WITH": TokenType.WITH,
-    "||": TokenType.DPIPE, ">=": TokenType.GTE, "<=": TokenType.LTE, "<>": TokenType.NEQ,
-    "!=": TokenType.NEQ,
+    **{word.replace("_", " "): TokenType[word] for word in _SAME.split()},
+    "AS": TokenType.ALIAS, "||": TokenType.DPIPE, ">=": TokenType.GTE, "<=": TokenType.LTE,
+    "<>": TokenType.NEQ, "!=": TokenType.NEQ,
 }  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -140,6 +134,18 @@ class _Parser(parser.Parser):
         return self.expression(exp.Cast(this=value, to=kind))
 
 
+@dataclass(eq=False, repr=False)
+class Refusal(QueryError):  # noqa: N818 - the name reads as the fact
+    """What is wrong with a part of a query."""
+
+    part: exp.Expr
+
+    def shown_in(self, text: str) -> QueryError:
+        """Return the error with the line of the part and a mark under it."""
+        places = (part.meta["start"] for part in self.part.walk() if "start" in part.meta)
+        return QueryError(f"{self.args[0]}{pointer(text, next(places, None))}")
+
+
 class Adql(Dialect):
     """ADQL 2.1 for sqlglot."""
 
@@ -149,13 +155,7 @@ class Adql(Dialect):
 
 
 def parse_adql(text: str) -> exp.Expr:
-    """Return the syntax tree of a query in ADQL.
-
-    Examples
-    --------
-    >>> parse_adql("SELECT TOP 3 ra FROM stars").sql()
-    'SELECT ra FROM stars LIMIT 3'
-    """
+    """Return the syntax tree of a query in ADQL."""
     if len(text) > MAX_CHARACTERS:
         raise QueryError(
             f"the query has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read. Upload "
@@ -164,7 +164,7 @@ def parse_adql(text: str) -> exp.Expr:
     if not text.strip():
         raise QueryError("the query is empty; try SELECT TOP 10 * FROM tap_schema.tables")
     dialect = Adql()
-    try:
+    with refusals_of(text):
         first = next(iter(dialect.tokenize(text)), None)
         if first is not None and first.text.upper() not in ("SELECT", "WITH", "("):
             raise QueryError(
@@ -178,7 +178,17 @@ def parse_adql(text: str) -> exp.Expr:
         if not isinstance(tree, (exp.Select, exp.SetOperation, exp.Subquery)):
             raise QueryError("no ADQL: a query begins with SELECT or WITH")
         for part in tree.walk():
-            _check_part(part, text)
+            _check_part(part)
+        return tree
+
+
+@contextmanager
+def refusals_of(text: str) -> Iterator[None]:
+    """Raise what is wrong with a query as QueryError, with its line and a mark at the place."""
+    try:
+        yield
+    except Refusal as error:
+        raise error.shown_in(text) from error
     except ParseError as error:
         raise _refusal(error, text) from error
     except TokenError as error:
@@ -191,15 +201,6 @@ def parse_adql(text: str) -> exp.Expr:
         raise QueryError(
             "the query is nested too deeply; write it with fewer parentheses within each other"
         ) from error
-    return tree
-
-
-def place_of(node: exp.Expr) -> int | None:
-    """Return where a part of a query begins."""
-    for part in node.walk():
-        if "start" in part.meta:
-            return int(part.meta["start"])
-    return None
 
 
 def pointer(text: str, place: int | None) -> str:
@@ -216,50 +217,44 @@ def pointer(text: str, place: int | None) -> str:
     return f"{where}\n  {shown}\n  {' ' * (column - start)}^"
 
 
-def refuse(message: str, node: exp.Expr, text: str) -> QueryError:
-    """Return the error that tells what is wrong with a part of a query."""
-    return QueryError(f"{message}{pointer(text, place_of(node))}")
-
-
-def _check_part(part: exp.Expr, text: str) -> None:
+def _check_part(part: exp.Expr) -> None:
     allowed = _ARGUMENTS.get(type(part))
     if allowed is None:
         told = _ADVICE.get(part.key, f"{part.key.upper()} is not ADQL 2.1")
-        raise refuse(f"no ADQL: {told}", part, text)
+        raise Refusal(f"no ADQL: {told}", part)
     for name, value in part.args.items():
         if value and name not in allowed:
             name = name.rstrip("_")
             told = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
-            raise refuse(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part, text)
+            raise Refusal(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part)
     if isinstance(part, exp.Limit) and not part.meta.get("top"):
-        raise refuse(f"no ADQL: {_ADVICE['limit']}", part, text)
+        raise Refusal(f"no ADQL: {_ADVICE['limit']}", part)
     if isinstance(part, (exp.Limit, exp.Offset)) and not _is_whole(part.expression):
-        raise refuse(f"{part.key.upper()} needs a whole number", part, text)
+        raise Refusal(f"{part.key.upper()} needs a whole number", part)
     if isinstance(part, exp.Select) and not part.args.get("from_"):
-        raise refuse("no ADQL: SELECT needs FROM and a table", part, text)
+        raise Refusal("no ADQL: SELECT needs FROM and a table", part)
     if isinstance(part, exp.Table) and not isinstance(part.this, exp.Identifier):
-        raise refuse("no ADQL: FROM takes tables and queries in parentheses", part, text)
+        raise Refusal("no ADQL: FROM takes tables and queries in parentheses", part)
     if isinstance(part, exp.Distinct) and len(part.expressions) > 1:
-        raise refuse("no ADQL: DISTINCT takes one value here", part, text)
+        raise Refusal("no ADQL: DISTINCT takes one value here", part)
     if isinstance(part, exp.Identifier) and not part.args.get("quoted"):
-        _check_name(part, text)
+        _check_name(part)
     if isinstance(part, exp.Join) and str(part.args.get("kind") or "").upper() not in (
         "", "INNER", "OUTER", "CROSS",
     ):  # fmt: skip
-        raise refuse(f"no ADQL: {part.args['kind']} JOIN", part, text)
+        raise Refusal(f"no ADQL: {part.args['kind']} JOIN", part)
 
 
 def _is_whole(node: exp.Expr) -> bool:
     return isinstance(node, exp.Literal) and not node.is_string and node.name.isdigit()
 
 
-def _check_name(part: exp.Identifier, text: str) -> None:
+def _check_name(part: exp.Identifier) -> None:
     if not _NAME.fullmatch(part.name):
-        raise refuse(
+        raise Refusal(
             f"no ADQL: {quoted(part.name)} is no name: it has letters, digits and underscores "
             'and begins with a letter; write others in double quotes, as "2mass"',
             part,
-            text,
         )
 
 

@@ -12,7 +12,7 @@ from sqlglot import exp
 from starcat.errors import quoted
 from starcat.vo import adql_geometry as geometry
 from starcat.vo.adql_geometry import Circle, Point, Polygon, Shape
-from starcat.vo.adql_grammar import refuse
+from starcat.vo.adql_grammar import Refusal
 
 MAX_CORNERS = 400  # corners of a polygon at most
 MAX_CHARACTERS = 1_000_000
@@ -23,6 +23,7 @@ FRAMES = ("", "ICRS", "UNKNOWNFRAME")
 
 _MAX_INTEGER = 2**63 - 1
 _SHAPE, _CONDITION = "shape", "condition"
+_FRAME_WORDS = {"ICRS", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
@@ -60,209 +61,164 @@ def number_sql(text: str) -> str:
     return text if "e" in text.lower() else f"{text}e0"
 
 
-def check_count(text: str, part: exp.Anonymous, name: str, least: int, most: int) -> None:
+def check_count(part: exp.Anonymous, least: int, most: int) -> None:
     """Refuse a call with another number of arguments."""
     found = len(part.expressions)
     if not least <= found <= most:
         many = str(least) if least == most else f"{least} to {most}"
-        raise refuse(f"{name} takes {many} arguments; found {found}", part, text)
+        raise Refusal(f"{part.name.upper()} takes {many} arguments; found {found}", part)
 
 
 class GeometryCalls:
-    """The calls of geometry in a query."""
+    """The calls of geometry in a query, and how much arithmetic they become."""
 
-    def __init__(self, text: str) -> None:
-        self._text = text
+    def __init__(self) -> None:
         self._characters = 0
 
-    def read(self, name: str, part: exp.Anonymous) -> bool:
+    def read(self, part: exp.Anonymous) -> bool:
         """Note the shape of a call, or write what it asks as SQL; False for other functions."""
+        name = part.name.upper()
         if name in _SHAPES:
-            part.meta[_SHAPE] = _SHAPES[name](self, part)
+            part.meta[_SHAPE] = _SHAPES[name](part)
+        elif name == "CENTROID":
+            part.meta[_SHAPE] = geometry.centroid(*self._shapes_of(part, 1))
+        elif name in _CONDITIONS:
+            asked = _CONDITIONS[name](*self._shapes_of(part, 2))
+            number = raw(f"CAST({asked} AS INTEGER)")
+            number.meta[_CONDITION] = asked
+            part.replace(number)
+        elif name == "DISTANCE" and len(part.expressions) == 4:
+            numbers = _numbers(part, 4)
+            part.replace(raw(geometry.distance(Point(*numbers[:2]), Point(*numbers[2:]))))
         elif name in _MEASURES:
-            _MEASURES[name](self, part)
+            shapes = self._shapes_of(part, 2 if name == "DISTANCE" else 1)
+            if name in _OF_POINTS and not all(isinstance(shape, Point) for shape in shapes):
+                raise Refusal(f"{name} takes a POINT", part)
+            part.replace(raw(_MEASURES[name](*shapes)))
         return name in GEOMETRY
 
-    def _point(self, part: exp.Anonymous) -> Point:
-        numbers = self._numbers(part, "POINT", 2, 2)
-        return Point(*numbers)
-
-    def _circle(self, part: exp.Anonymous) -> Circle:
-        centre, *others = self._centred(part, "CIRCLE", 1)
-        return Circle(centre, others[0])
-
-    def _box(self, part: exp.Anonymous) -> Polygon:
-        centre, *others = self._centred(part, "BOX", 2)
-        return geometry.box(centre, *others)
-
-    def _polygon(self, part: exp.Anonymous) -> Polygon:
-        arguments = self._without_frame(part)
-        shapes = [shape_of(argument) for argument in arguments]
-        if any(shapes):
-            corners = [shape for shape in shapes if isinstance(shape, Point)]
-            if len(corners) < len(shapes):
-                raise refuse("POLYGON takes places or numbers, and not both", part, self._text)
-        else:
-            numbers = [_operand(argument) for argument in arguments]
-            if len(numbers) % 2:
-                raise refuse("POLYGON takes pairs of numbers", part, self._text)
-            corners = [Point(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-        if not 3 <= len(corners) <= MAX_CORNERS:
-            raise refuse(
-                f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(corners)}", part, self._text
-            )
-        return Polygon(tuple(corners))
-
-    def _region(self, part: exp.Anonymous) -> Shape:
-        """Read a shape that is written as a text of STC-S."""
-        check_count(self._text, part, "REGION", 1, 1)
-        [argument] = part.expressions
-        words = argument.name.upper().split() if is_text(argument) else []
-        numbers = [word for word in words[1:] if _is_number(word)]
-        others = words[1 : len(words) - len(numbers)]
-        known = set(others) <= {"ICRS", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
-        kind = words[0] if words and known and words[len(others) + 1 :] == numbers else ""
-        numbers = [number_sql(number) for number in numbers]
-        if kind in ("POSITION", "POINT") and len(numbers) == 2:
-            return Point(*numbers)
-        if kind == "CIRCLE" and len(numbers) == 3:
-            return Circle(Point(*numbers[:2]), numbers[2])
-        if kind == "BOX" and len(numbers) == 4:
-            return geometry.box(Point(*numbers[:2]), *numbers[2:])
-        if kind == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
-            pairs = zip(numbers[::2], numbers[1::2], strict=True)
-            return Polygon(tuple(Point(*pair) for pair in pairs))
-        raise refuse(
-            "REGION takes a text such as 'CIRCLE ICRS 10.5 -20 0.1', with POSITION, CIRCLE, BOX or "
-            "POLYGON",
-            part,
-            self._text,
-        )
-
-    def _centroid(self, part: exp.Anonymous) -> Point:
-        return geometry.centroid(self._shapes_of(part, "CENTROID", 1)[0])
-
-    def _contains(self, part: exp.Anonymous) -> None:
-        inner, outer = self._shapes_of(part, "CONTAINS", 2)
-        self._answer(part, geometry.contains(inner, outer))
-
-    def _intersects(self, part: exp.Anonymous) -> None:
-        self._answer(part, geometry.intersects(*self._shapes_of(part, "INTERSECTS", 2)))
-
-    def _answer(self, part: exp.Anonymous, asked: str) -> None:
-        number = raw(f"CAST({asked} AS INTEGER)")
-        number.meta[_CONDITION] = asked
-        part.replace(number)
-
-    def _distance(self, part: exp.Anonymous) -> None:
-        if len(part.expressions) == 4:
-            numbers = self._numbers(part, "DISTANCE", 4, 4)
-            one, other = Point(*numbers[:2]), Point(*numbers[2:])
-        else:
-            one, other = (
-                self._as_point(shape, part) for shape in self._shapes_of(part, "DISTANCE", 2)
-            )
-        part.replace(raw(geometry.distance(one, other)))
-
-    def _area(self, part: exp.Anonymous) -> None:
-        part.replace(raw(geometry.area(self._shapes_of(part, "AREA", 1)[0])))
-
-    def _coordinate(self, part: exp.Anonymous) -> None:
+    def _shapes_of(self, part: exp.Anonymous, count: int) -> list[Shape]:
         name = part.name.upper()
-        [shape] = self._shapes_of(part, name, 1)
-        place = self._as_point(shape, part)
-        part.replace(raw(f"(({place.lon if name == 'COORD1' else place.lat})::DOUBLE)"))
-
-    def _frame(self, part: exp.Anonymous) -> None:
-        self._shapes_of(part, "COORDSYS", 1)
-        part.replace(raw("'ICRS'"))
-
-    def _as_point(self, shape: Shape, part: exp.Expr) -> Point:
-        if not isinstance(shape, Point):
-            raise refuse(f"{part.name.upper()} takes a POINT", part, self._text)
-        return shape
-
-    def _shapes_of(self, part: exp.Anonymous, name: str, count: int) -> list[Shape]:
-        check_count(self._text, part, name, count, count)
+        check_count(part, count, count)
         found = [shape_of(argument) for argument in part.expressions]
         shapes = [shape for shape in found if shape is not None]
         if len(shapes) < count:
-            raise refuse(
+            raise Refusal(
                 f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, REGION, CENTROID, written "
                 "out as its arguments",
                 part,
-                self._text,
             )
         self._characters += geometry.characters(shapes)
         if self._characters > MAX_CHARACTERS:
-            raise refuse(
+            raise Refusal(
                 f"{name} takes too much arithmetic; give polygons fewer corners, or numbers "
                 "instead of columns, and work middles out in a query in parentheses",
                 part,
-                self._text,
             )
         return shapes
 
-    def _centred(
-        self, part: exp.Anonymous, name: str, count: int
-    ) -> tuple[Point, *tuple[str, ...]]:
-        """Return the middle of a shape, given as a place or as two numbers, and its sizes."""
-        arguments = self._without_frame(part)
-        first = shape_of(arguments[0]) if arguments else None
-        if isinstance(first, Point) and len(arguments) == 1 + count:
-            return first, *map(_operand, arguments[1:])
-        if first is not None or len(arguments) != 2 + count:
-            raise refuse(
-                f"{name} takes a place, as POINT or two numbers, and {count} more "
-                f"number{'s' if count > 1 else ''}",
-                part,
-                self._text,
-            )
-        numbers = [_operand(argument) for argument in arguments]
-        return Point(*numbers[:2]), *numbers[2:]
 
-    def _numbers(self, part: exp.Anonymous, name: str, least: int, most: int) -> list[str]:
-        arguments = self._without_frame(part)
-        if not least <= len(arguments) <= most or any(map(shape_of, arguments)):
-            raise refuse(f"{name} takes {least} numbers, degrees", part, self._text)
-        return [_operand(argument) for argument in arguments]
-
-    def _without_frame(self, part: exp.Anonymous) -> list[exp.Expr]:
-        """Return the arguments of a shape without the frame that may stand before them."""
-        arguments = list(part.expressions)
-        if arguments and is_text(arguments[0]):
-            frame = arguments.pop(0).name.upper()
-            if frame.split(" ")[0] not in FRAMES:
-                raise refuse(
-                    f"the frame {quoted(frame)} is not known here; all places are ICRS",
-                    part,
-                    self._text,
-                )
-        if any(is_text(argument) for argument in arguments):
-            raise refuse(f"{part.name.upper()} takes numbers, degrees", part, self._text)
-        return arguments
+def _point(part: exp.Anonymous) -> Point:
+    return Point(*_numbers(part, 2))
 
 
-_SHAPES: dict[str, Callable[[GeometryCalls, exp.Anonymous], Shape]] = {
-    "POINT": GeometryCalls._point,
-    "CIRCLE": GeometryCalls._circle,
-    "BOX": GeometryCalls._box,
-    "POLYGON": GeometryCalls._polygon,
-    "REGION": GeometryCalls._region,
-    "CENTROID": GeometryCalls._centroid,
+def _centred(part: exp.Anonymous) -> Shape:
+    """Return a circle or a box, whose middle is given as a place or as two numbers."""
+    first, *others = _without_frame(part) or [part]
+    name = part.name.upper()
+    made = _made(name, [*_place_or_number(first), *map(_operand, others)])
+    if made is None or isinstance(shape_of(first), (Circle, Polygon)):
+        many = "1 more number" if name == "CIRCLE" else "2 more numbers"
+        raise Refusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
+    return made
+
+
+def _polygon(part: exp.Anonymous) -> Shape:
+    arguments = _without_frame(part)
+    shapes = [shape_of(argument) for argument in arguments]
+    if any(shapes) and not all(isinstance(shape, Point) for shape in shapes):
+        raise Refusal("POLYGON takes places or numbers, and not both", part)
+    numbers = [number for argument in arguments for number in _place_or_number(argument)]
+    if len(numbers) % 2:
+        raise Refusal("POLYGON takes pairs of numbers", part)
+    made = _made("POLYGON", numbers)
+    if made is None:
+        raise Refusal(f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part)
+    return made
+
+
+def _region(part: exp.Anonymous) -> Shape:
+    check_count(part, 1, 1)
+    [argument] = part.expressions
+    words = argument.name.upper().split() if is_text(argument) else []
+    numbers = [number_sql(word) for word in words if _is_number(word)]
+    name, *frame = words[: len(words) - len(numbers)] or [""]
+    is_read = set(frame) <= _FRAME_WORDS and not any(map(_is_number, frame))
+    made = _made("POINT" if name == "POSITION" else name, numbers) if is_read else None
+    if made is None:
+        raise Refusal(
+            "REGION takes a text such as 'CIRCLE ICRS 10.5 -20 0.1', with POSITION, CIRCLE, BOX or "
+            "POLYGON",
+            part,
+        )
+    return made
+
+
+def _made(name: str, numbers: list[str]) -> Shape | None:
+    """Return the shape that some numbers make; None where it takes another number of them."""
+    if name == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
+        pairs = zip(numbers[::2], numbers[1::2], strict=True)
+        return Polygon(tuple(Point(*pair) for pair in pairs))
+    match name, len(numbers):
+        case "POINT", 2:
+            return Point(*numbers)
+        case "CIRCLE", 3:
+            return Circle(Point(*numbers[:2]), numbers[2])
+        case "BOX", 4:
+            return geometry.box(Point(*numbers[:2]), *numbers[2:])
+    return None
+
+
+def _numbers(part: exp.Anonymous, count: int) -> list[str]:
+    arguments = _without_frame(part)
+    if len(arguments) != count or any(map(shape_of, arguments)):
+        raise Refusal(f"{part.name.upper()} takes {count} numbers, degrees", part)
+    return [_operand(argument) for argument in arguments]
+
+
+def _without_frame(part: exp.Anonymous) -> list[exp.Expr]:
+    """Return the arguments of a shape without the frame that may stand before them."""
+    arguments = list(part.expressions)
+    if arguments and is_text(arguments[0]):
+        frame = arguments.pop(0).name.upper()
+        if frame.split(" ")[0] not in FRAMES:
+            raise Refusal(f"the frame {quoted(frame)} is not known here; all places are ICRS", part)
+    if any(is_text(argument) for argument in arguments):
+        raise Refusal(f"{part.name.upper()} takes numbers, degrees", part)
+    return arguments
+
+
+_SHAPES: dict[str, Callable[[exp.Anonymous], Shape]] = {
+    "POINT": _point, "CIRCLE": _centred, "BOX": _centred, "POLYGON": _polygon, "REGION": _region,
+}  # fmt: skip
+
+_CONDITIONS = {"CONTAINS": geometry.contains, "INTERSECTS": geometry.intersects}
+
+_MEASURES: dict[str, Callable[..., str]] = {
+    "DISTANCE": geometry.distance,
+    "AREA": geometry.area,
+    "COORD1": lambda place: f"(({place.lon})::DOUBLE)",
+    "COORD2": lambda place: f"(({place.lat})::DOUBLE)",
+    "COORDSYS": lambda _: "'ICRS'",
 }
+_OF_POINTS = ("DISTANCE", "COORD1", "COORD2")
 
-_MEASURES: dict[str, Callable[[GeometryCalls, exp.Anonymous], None]] = {
-    "CONTAINS": GeometryCalls._contains,
-    "INTERSECTS": GeometryCalls._intersects,
-    "DISTANCE": GeometryCalls._distance,
-    "AREA": GeometryCalls._area,
-    "COORD1": GeometryCalls._coordinate,
-    "COORD2": GeometryCalls._coordinate,
-    "COORDSYS": GeometryCalls._frame,
-}
+GEOMETRY = (*_SHAPES, "CENTROID", *_CONDITIONS, *_MEASURES)  # the functions of geometry
 
-GEOMETRY = (*_SHAPES, *_MEASURES)  # the functions of geometry that there are
+
+def _place_or_number(part: exp.Expr) -> tuple[str, ...]:
+    shape = shape_of(part)
+    return (shape.lon, shape.lat) if isinstance(shape, Point) else (_operand(part),)
 
 
 def _operand(part: exp.Expr) -> str:

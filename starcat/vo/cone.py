@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 from starcat.errors import ConfigError, TargetMissing
 from starcat.exchange.columns import described, field_facts
 from starcat.exchange.formats import Format, response_format
-from starcat.exchange.votable_fields import error_document
 from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
-from starcat.query.targets import POSITION, View
+from starcat.query.targets import View
 from starcat.vo.parameters import parameter_error
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
 
 def star_view(session: Session) -> View:
     """Return the view of a session that has the stars."""
-    placed = [view for view in session.views if set(view.position or POSITION) <= set(view.columns)]
+    placed = [view for view in session.views if set(view.position) <= set(view.columns)]
     for view in sorted(placed, key=lambda view: view.name != "stars"):
         return view
     raise TargetMissing("there is no table with ra_deg and dec_deg in it to search")
@@ -95,7 +94,7 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
     """Return rows whose columns have the UCDs that the standard asks for."""
-    ra, dec = view.position or POSITION
+    ra, dec = view.position
     ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
     facts = (
         {**field_facts(field), "ucd": ucds[field.name]} if field.name in ucds else None
@@ -104,15 +103,10 @@ def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader
     return described(batches, facts)
 
 
-def cone_error(text: str) -> bytes:
-    """Return the document that tells why a search has no answer."""
-    return error_document(text).encode()
-
-
 def _columns(view: View, verbosity: int) -> list[str]:
     """Return the columns of an answer, of which identity and place come first."""
-    first = [_name_of(view), *(view.position or POSITION)]
-    known = {column.name: column.ucd for column in view.schema.columns} if view.schema else {}
+    first = [_name_of(view), *(view.position)]
+    known = {column.name: column.ucd for column in view.described}
     wanted = {
         _BRIEF: [],
         _USUAL: [name for name in view.columns if known.get(name) or name in _BESIDE],

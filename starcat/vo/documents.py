@@ -16,7 +16,6 @@ from typing import Any, Literal, TypeVar
 from xml.sax.saxutils import escape
 
 from pydantic import AnyUrl, field_validator
-from pydantic_xml import BaseXmlModel
 from vo_models.tapregext.models import (
     DataLimit,
     DataLimits,
@@ -41,9 +40,8 @@ from starcat.exchange.formats import TAP_FORMATS
 from starcat.query.targets import POSITION
 from starcat.vo.adql import USER_FUNCTIONS
 from starcat.vo.adql_shapes import GEOMETRY
-from starcat.vo.tables import Column, Schema, Table, Tables, adql_name, full_name
-from starcat.vo.tap_schema import NAME
-from starcat.vo.uws import xml_text
+from starcat.vo.tables import NAME, Column, Schema, Table, Tables, adql_name, full_name
+from starcat.vo.uws import document, xml_text
 
 MEDIA_TYPE = "application/xml"
 VOTABLE_TYPE = "application/x-votable+xml"
@@ -65,6 +63,33 @@ LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
 )
 """What ADQL leaves to services, and is there. COALESCE is there too, but clients that check what
 they read know no name for it yet."""
+
+
+_EXAMPLES = (
+    (
+        "tables",
+        "All tables, with what a row of each is",
+        f"SELECT table_name, description FROM {NAME}.tables ORDER BY table_name",
+    ),
+    (
+        "cone",
+        "Stars within 10 degrees of a place, the brightest first",
+        "SELECT *, DISTANCE({place}, POINT('ICRS', 83.6, -5.4)) AS separation_deg FROM {stars} "
+        "WHERE 1 = CONTAINS({place}, CIRCLE('ICRS', 83.6, -5.4, 10)) ORDER BY mag",
+    ),
+    (
+        "polygon",
+        "Stars within a polygon",
+        "SELECT TOP 100 * FROM {stars} "
+        "WHERE 1 = CONTAINS({place}, POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
+    ),
+    (
+        "counts",
+        "Stars by whole magnitudes",
+        "SELECT magnitude, COUNT(*) AS stars FROM (SELECT FLOOR(mag) AS magnitude FROM {stars}) "
+        "AS m GROUP BY magnitude ORDER BY magnitude",
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -101,7 +126,8 @@ def capabilities(base_url: str, limits: ServiceLimits) -> bytes:
         )
         for name, path, version in others
     ]
-    return _document(VOSICapabilities(capability=[_table_access(base_url, limits), *found]))
+    made = VOSICapabilities(capability=[_table_access(base_url, limits), *found])
+    return document(made, skip_empty=True)
 
 
 def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
@@ -155,27 +181,27 @@ def _interface(
 
 def availability(up_since: datetime) -> bytes:
     """Return that the service is there."""
-    return _document(
-        Availability(available=True, up_since=UTCTimestamp.fromisoformat(_utc(up_since)))
-    )
+    since = UTCTimestamp.fromisoformat(up_since.strftime("%Y-%m-%dT%H:%M:%SZ"))
+    return document(Availability(available=True, up_since=since), skip_empty=True)
 
 
 def tableset(tables: Tables, with_columns: bool = True) -> bytes:
     """Return all schemas and tables."""
     schemas = [_schema(schema, with_columns) for schema in tables.schemas]
-    return _document(VOSITableSet(tableset_schema=schemas))
+    return document(VOSITableSet(tableset_schema=schemas), skip_empty=True)
 
 
-def for_tap_plus(document: bytes) -> bytes:
+def for_tap_plus(tables: bytes) -> bytes:
     """Return a document of tables as TapPlus of astroquery reads it."""
     space = b'<vosi:tableset xmlns:esatapplus="http://esa.int/xml/EsaTapPlus" '
-    named = document.replace(b"<vosi:tableset ", space, 1)
+    named = tables.replace(b"<vosi:tableset ", space, 1)
     return named.replace(b"<column>", b'<column esatapplus:flags="0">')
 
 
 def table_document(table: Table) -> bytes:
     """Return a table with its columns."""
-    return _document(_described(VOSITable(**_about(table, True)), table.description))
+    made = _described(VOSITable(**_about(table, True)), table.description)
+    return document(made, skip_empty=True)
 
 
 def _schema(schema: Schema, with_columns: bool) -> TableSchema:
@@ -194,10 +220,7 @@ def _described(element: Element, text: str) -> Element:
 
 
 def _about(table: Table, with_columns: bool) -> dict[str, Any]:
-    about: dict[str, Any] = {
-        "table_type": "table",
-        "table_name": full_name(table),
-    }
+    about: dict[str, Any] = {"table_type": "table", "table_name": full_name(table)}
     if not with_columns:
         return about
     columns = [
@@ -208,7 +231,7 @@ def _about(table: Table, with_columns: bool) -> dict[str, Any]:
             ucd=one.ucd or None,
             xtype=one.xtype or None,
             datatype=DataType(value=one.datatype, arraysize=one.arraysize or None),
-            flag=[name for name, is_so in _flags(one) if is_so],
+            flag=_flags(one),
         )
         for one in table.columns
     ]
@@ -224,12 +247,9 @@ def _about(table: Table, with_columns: bool) -> dict[str, Any]:
     return {**about, "column": columns, "foreign_key": keys}
 
 
-def _flags(column: Column) -> tuple[tuple[str, bool], ...]:
-    return (
-        ("principal", column.is_principal),
-        ("indexed", column.is_indexed),
-        ("std", column.is_standard),
-    )
+def _flags(column: Column) -> list[str]:
+    flags = {"principal": column.is_principal, "indexed": column.is_indexed}
+    return [name for name, is_so in {**flags, "std": column.is_standard}.items() if is_so]
 
 
 def error_votable(message: str) -> bytes:
@@ -243,54 +263,15 @@ def error_votable(message: str) -> bytes:
     ).encode()
 
 
-def _utc(time: datetime) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _document(model: BaseXmlModel) -> bytes:
-    found = model.to_xml(skip_empty=True, encoding="UTF-8", xml_declaration=True)
-    return found if isinstance(found, bytes) else found.encode()
-
-
 def examples(tables: Tables) -> list[tuple[str, str, str]]:
-    """Return queries that run on the tables that there are."""
-    found = [
-        (
-            "tables",
-            "All tables, with what a row of each is",
-            f"SELECT table_name, description FROM {NAME}.tables ORDER BY table_name",
-        )
-    ]
+    """Return queries that run on the tables that there are: names, titles and texts."""
     with_places = [table for table in tables if _has(table, *POSITION, "mag")]
     # What was rejected has places too.
     stars = min(with_places, key=lambda table: table.name != "stars", default=None)
-    if stars is not None:
-        name = full_name(stars)
-        place = ", ".join(map(adql_name, POSITION))
-        found += [
-            (
-                "cone",
-                "Stars within 10 degrees of a place, the brightest first",
-                f"SELECT *, DISTANCE(POINT('ICRS', {place}), POINT('ICRS', 83.6, -5.4)) "
-                f"AS separation_deg FROM {name} "
-                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), CIRCLE('ICRS', 83.6, -5.4, 10)) "
-                "ORDER BY mag",
-            ),
-            (
-                "polygon",
-                "Stars within a polygon",
-                f"SELECT TOP 100 * FROM {name} "
-                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), "
-                "POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
-            ),
-            (
-                "counts",
-                "Stars by whole magnitudes",
-                f"SELECT magnitude, COUNT(*) AS stars FROM (SELECT FLOOR(mag) AS magnitude "
-                f"FROM {name}) AS m GROUP BY magnitude ORDER BY magnitude",
-            ),
-        ]
-    return found
+    place = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
+    chosen = [one for one in _EXAMPLES if stars is not None or "{stars}" not in one[2]]
+    name = full_name(stars) if stars is not None else ""
+    return [(word, told, query.format(stars=name, place=place)) for word, told, query in chosen]
 
 
 def examples_page(tables: Tables) -> str:

@@ -1,13 +1,30 @@
-"""What is known of tables that ADQL may ask: schemas, tables, columns and keys."""
+"""What is known of tables that ADQL may ask: schemas, tables, columns and keys, and TAP_SCHEMA.
+
+TAP_SCHEMA is the tables that say which tables there are, out of the views of a session.
+
+References
+----------
+TAP 1.1, section 4.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from starcat.query.result import column_facts
-from starcat.storage.parquet import DUCKDB_DATATYPES
+from starcat.errors import SchemaError
+from starcat.exchange.columns import unit_text
+from starcat.query.names import identifier
+from starcat.query.result import column_facts, facts_by_name
+from starcat.query.session import Session
+from starcat.query.targets import View
+from starcat.storage.parquet import DUCKDB_DATATYPES, write_parquet
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _CASTS = {
     "TINYINT": "SMALLINT",
@@ -34,11 +51,11 @@ class Column:
     # VOTable's name of the type, and the size where it is an array or a text; else empty.
     datatype: str = "double"
     arraysize: str = ""
+    xtype: str = ""  # what values of that type mean, as DALI calls it; else empty
     # Empty where there is none.
     unit: str = ""
     ucd: str = ""
     description: str = ""
-    xtype: str = ""
     # Whether asking for it is fast, whether it is one to look at first, and whether a standard
     # defines it.
     is_indexed: bool = False
@@ -63,7 +80,7 @@ class Column:
     @classmethod
     def unknown(cls, name: str) -> Column:
         """Return a column of which its name is known: the unit is that which it ends with."""
-        return cls(name, unit=column_facts(name, {}).unit)
+        return cls(name, unit=column_facts(name, {}).get("unit", ""))
 
 
 @dataclass(frozen=True)
@@ -138,13 +155,7 @@ class Tables:
 
 
 def full_name(table: Table) -> str:
-    """Return the name of a table as ADQL writes it.
-
-    Examples
-    --------
-    >>> full_name(Table("_2mass", "stars", ()))
-    '"_2mass".stars'
-    """
+    """Return the name of a table as ADQL writes it."""
     return f"{adql_name(table.schema)}.{adql_name(table.name)}"
 
 
@@ -158,45 +169,217 @@ def adql_name(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def votable_type(kind: str) -> tuple[str, str]:
-    """Return what VOTable calls a type of DuckDB after `cast`.
+def votable_type(kind: str) -> tuple[str, str, str]:
+    """Return datatype, arraysize and xtype of VOTable for a type of DuckDB after `cast`.
 
     Examples
     --------
     >>> votable_type("INTEGER[]"), votable_type("DECIMAL(4,1)"), votable_type("DATE")
-    (('int', '*'), ('double', ''), ('char', '*'))
+    (('int', '*', ''), ('double', '', ''), ('char', '*', 'timestamp'))
     """
-    found = _LIST.fullmatch(kind)
-    if found:
-        item = _plain(found[1])
-        return ("unicodeChar" if item == "VARCHAR" else DUCKDB_DATATYPES[item]), "*"
     if kind in _TIMES:
-        return "char", "*"
-    name = DUCKDB_DATATYPES[_plain(kind)]
-    return name, "*" if kind == "VARCHAR" or name == "unicodeChar" else ""
-
-
-def is_time(kind: str) -> bool:
-    """Return whether a type of DuckDB is a time that is written as a text."""
-    return kind in _TIMES
+        return "char", "*", "timestamp"
+    plain = _plain(kind)
+    name = DUCKDB_DATATYPES[plain.removesuffix("[]")]
+    return name, "*" if plain.endswith("[]") or name == "unicodeChar" else "", ""
 
 
 def cast(value: str, kind: str) -> str:
     """Return SQL of a value in a type that VOTable has."""
-    found = _LIST.fullmatch(kind)
-    if found:
-        item = _plain(found[1])
-        wanted = f"{item}[]" if item in DUCKDB_DATATYPES and item != "VARCHAR" else "VARCHAR"
-        return value if wanted == kind else f"CAST({value} AS {wanted})"
-    if kind in _TIMES:
-        return value
-    plain = _plain(kind)
+    plain = kind if kind in _TIMES else _plain(kind)
     return value if plain == kind else f"CAST({value} AS {plain})"
 
 
 def _plain(kind: str) -> str:
     if kind in DUCKDB_DATATYPES:
         return kind
-    if kind.startswith("DECIMAL"):
-        return "DOUBLE"
-    return _CASTS.get(kind, "VARCHAR")
+    if items := _LIST.fullmatch(kind):
+        item = _plain(items[1])
+        return "VARCHAR" if item == "VARCHAR" or item.endswith("[]") else f"{item}[]"
+    return "DOUBLE" if kind.startswith("DECIMAL") else _CASTS.get(kind, "VARCHAR")
+
+
+NAME = "tap_schema"
+UPLOADS = "tap_upload"
+
+_TEXT = ("unicodeChar", "*")
+_INT = ("int", "")
+
+_COLUMNS: dict[str, dict[str, tuple[tuple[str, str], str]]] = {
+    "schemas": {
+        "schema_name": (_TEXT, "Name of the schema, as ADQL writes it"),
+        "utype": (_TEXT, "Concept of a data model; empty here"),
+        "description": (_TEXT, "What the schema holds"),
+        "schema_index": (_INT, "Place in the list of schemas"),
+    },
+    "tables": {
+        "schema_name": (_TEXT, "Schema of the table"),
+        "table_name": (_TEXT, "Name of the table with its schema, as ADQL writes it"),
+        "table_type": (_TEXT, "table or view"),
+        "utype": (_TEXT, "Concept of a data model; empty here"),
+        "description": (_TEXT, "What a row is"),
+        "table_index": (_INT, "Place in the list of tables"),
+    },
+    "columns": {
+        "table_name": (_TEXT, "Table of the column"),
+        "column_name": (_TEXT, "Name of the column, as ADQL writes it"),
+        "datatype": (_TEXT, "Type of the values, as VOTable calls it"),
+        "arraysize": (_TEXT, "Size of arrays and texts, as VOTable writes it"),
+        "xtype": (_TEXT, "What a value of that type means, as DALI calls it"),
+        "size": (_INT, "Fixed length of a text, where it has one"),
+        "description": (_TEXT, "Meaning of the column"),
+        "utype": (_TEXT, "Concept of a data model; empty here"),
+        "unit": (_TEXT, "Unit of the values, as VOUnit writes it"),
+        "ucd": (_TEXT, "Unified content descriptor"),
+        "indexed": (_INT, "1 where files tell which values they have, else 0"),
+        "principal": (_INT, "1 for columns to look at first, else 0"),
+        "std": (_INT, "1 for columns that a standard defines, else 0"),
+        "column_index": (_INT, "Place in the table"),
+    },
+    "keys": {
+        "key_id": (_TEXT, "Name of the reference"),
+        "from_table": (_TEXT, "Table that refers"),
+        "target_table": (_TEXT, "Table that is referred to"),
+        "utype": (_TEXT, "Concept of a data model; empty here"),
+        "description": (_TEXT, "What the reference means"),
+    },
+    "key_columns": {
+        "key_id": (_TEXT, "Name of the reference"),
+        "from_column": (_TEXT, "Column that refers"),
+        "target_column": (_TEXT, "Column that is referred to"),
+    },
+}
+
+_ABOUT = {
+    "schemas": "The schemas that there are",
+    "tables": "The tables that there are",
+    "columns": "The columns of all tables",
+    "keys": "References between tables",
+    "key_columns": "The columns of these references",
+}
+
+_KEYS = {
+    "tables": (Key("schema_name", f"{NAME}.schemas", "schema_name"),),
+    "columns": (Key("table_name", f"{NAME}.tables", "table_name"),),
+    "keys": (
+        Key("from_table", f"{NAME}.tables", "table_name"),
+        Key("target_table", f"{NAME}.tables", "table_name"),
+    ),
+    "key_columns": (Key("key_id", f"{NAME}.keys", "key_id"),),
+}
+
+
+def own_schema() -> Schema:
+    """Return TAP_SCHEMA itself, as it says of itself."""
+    tables = tuple(
+        Table(
+            NAME,
+            name,
+            tuple(
+                Column(column, *kind, description=told, is_standard=True)
+                for column, (kind, told) in columns.items()
+            ),
+            _ABOUT[name],
+            _KEYS.get(name, ()),
+            view=identifier(name),
+        )
+        for name, columns in _COLUMNS.items()
+    )
+    return Schema(NAME, "The tables that say which tables there are", tables)
+
+
+def session_schemas(session: Session, about: Mapping[str, str]) -> tuple[Schema, ...]:
+    """Return the schemas of the targets of a session."""
+    return tuple(
+        Schema(
+            target.name,
+            about.get(target.name, ""),
+            tuple(_table(session, target.name, view) for view in target.views),
+        )
+        for target in session.targets
+    )
+
+
+def _table(session: Session, schema: str, view: View) -> Table:
+    with session.ask(f'SELECT * FROM "{schema}"."{view.name}"') as asked:
+        found = asked.columns
+    known = facts_by_name([view])
+    first = view.schema.order[:1] if view.schema else ()
+    columns = []
+    for name, kind in found:
+        facts = column_facts(name, known)
+        columns.append(
+            Column(
+                name,
+                *votable_type(kind),
+                unit=_unit(name, facts.get("unit", "")),
+                is_indexed=name in first,
+                ucd=facts.get("ucd", ""),
+                description=facts.get("description", ""),
+                is_principal=name in (*first, *view.position, "mag", "designation"),
+            )
+        )
+    return Table(schema, view.name, tuple(columns), view.schema.description if view.schema else "")
+
+
+def _unit(column: str, text: str) -> str:
+    """Return a unit as VOTable writes it, which clients compare with answers."""
+    try:
+        return unit_text(column, text, "vounit") or ""
+    except SchemaError:
+        return ""
+
+
+def write_tap_schema(tables: Tables, folder: Path) -> None:
+    """Write the tables of TAP_SCHEMA as Parquet files."""
+    import pyarrow as pa
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, rows in _rows(tables).items():
+        write_parquet(
+            pa.Table.from_pylist(rows, schema=_arrow_schema(name)), folder / f"{name}.parquet"
+        )
+
+
+def _arrow_schema(name: str) -> pa.Schema:
+    import pyarrow as pa
+
+    kinds = {_TEXT: pa.string(), _INT: pa.int32()}
+    return pa.schema([(column, kinds[kind]) for column, (kind, _) in _COLUMNS[name].items()])
+
+
+def _rows(tables: Tables) -> dict[str, list[dict[str, object]]]:
+    rows: dict[str, list[dict[str, object]]] = {name: [] for name in _COLUMNS}
+    for number, schema in enumerate(tables.schemas):
+        name = adql_name(schema.name)
+        rows["schemas"].append(_row(schema, schema_name=name, schema_index=number))
+        for place, table in enumerate(schema.tables):
+            own = full_name(table)
+            facts = {"schema_name": name, "table_name": own, "table_type": "table"}
+            rows["tables"].append(_row(table, **facts, table_index=place))
+            rows["columns"] += _column_rows(table)
+            for one, key in enumerate(table.keys):
+                named = {"key_id": f"{table.schema}.{table.name}.{one}", "from_column": key.column}
+                rows["keys"].append(_row(key, **named, from_table=own, target_table=key.target))
+                rows["key_columns"].append(_row(key, **named))
+    return rows
+
+
+def _column_rows(table: Table) -> list[dict[str, object]]:
+    return [
+        _row(
+            column,
+            table_name=full_name(table),
+            column_name=adql_name(column.name),
+            indexed=int(column.is_indexed),
+            principal=int(column.is_principal),
+            std=int(column.is_standard),
+            column_index=place,
+        )
+        for place, column in enumerate(table.columns)
+    ]
+
+
+def _row(about: Schema | Table | Column | Key, **more: object) -> dict[str, object]:
+    """Return a row; of its values those are written that the table has a column for."""
+    return {**{key: value or None for key, value in vars(about).items()}, **more}

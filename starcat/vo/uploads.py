@@ -18,8 +18,7 @@ import pyarrow.parquet as pq
 from starcat.errors import ConfigError, quoted
 from starcat.query.names import identifier
 from starcat.storage.parquet import ARROW_DATATYPES
-from starcat.vo.tables import Column, Table
-from starcat.vo.tap_schema import UPLOADS
+from starcat.vo.tables import UPLOADS, Column, Table
 
 MAX_COLUMNS = 1000
 
@@ -32,13 +31,13 @@ _BYTES = {
 }  # fmt: skip
 
 
-def read_upload(path: Path, name: str, folder: Path) -> Table:
-    """Write an uploaded table as a Parquet file."""
-    _Inspection(path, name).check()
-    table = _parsed(path, name)
+def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
+    """Write an uploaded table as a Parquet file, and describe it in values that JSON has."""
+    _Inspection(Path(path), name).check()
+    table = _parsed(Path(path), name)
     arrays, columns = [], []
-    for field, column in zip(table.fields, _columns(table), strict=True):
-        values = _arrow(column, field.name, name)
+    for place, field in zip(table.array.dtype.names, table.fields, strict=True):
+        values = _arrow(table.array[place], field.name, name)
         if field.xtype == "timestamp":
             values = _times(values)
         kind = values.type
@@ -49,17 +48,13 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
         told = " ".join(str(field.description or "").split())
         unit = str(field.unit) if field.unit is not None else ""
         columns.append(
-            Column(field.name, datatype, size, unit, field.ucd or "", told, field.xtype or "")
+            Column(field.name, datatype, size, field.xtype or "", unit, field.ucd or "", told)
         )
-    _check_names([column.name for column in columns], name)
     names = [column.name for column in columns]
-    pq.write_table(pa.table(arrays, names=names), folder / f"{name}.parquet")
-    return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}", view=identifier(name))
-
-
-def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
-    """Write an uploaded table as `read_upload` does, where values have to be those of JSON."""
-    return asdict(read_upload(Path(path), name, Path(folder)))
+    _check_names(names, name)
+    pq.write_table(pa.table(arrays, names=names), Path(folder) / f"{name}.parquet")
+    told = f"The uploaded table {name}"
+    return asdict(Table(UPLOADS, name, tuple(columns), told, view=identifier(name)))
 
 
 def table_of_facts(facts: dict[str, Any]) -> Table:
@@ -87,23 +82,13 @@ def _parsed(path: Path, name: str) -> Any:
     return table
 
 
-def _columns(table: Any) -> list[Any]:
-    array = table.array
-    return [array[place] for place in array.dtype.names]
-
-
 def _arrow(values: Any, field: str, name: str) -> pa.Array:
-    """Return a masked array of numpy as a column of Arrow."""
     data = np.asarray(values.data if isinstance(values, np.ma.MaskedArray) else values)
     mask = np.ma.getmaskarray(values)
     if data.dtype.kind in "SUO" and not _is_list(data):
-        return pa.array(
-            [
-                None if gone or one is None else _text(one)
-                for one, gone in zip(data, _flat(mask), strict=True)
-            ],
-            pa.string(),
-        )
+        is_null = mask if mask.ndim == 1 else mask.reshape(len(mask), -1).all(axis=1)
+        texts = (None if one is None else _text(one) for one in data)
+        return pa.array(texts, pa.string(), mask=is_null)
     if data.dtype.kind not in "biufO":
         raise _refusal(name, f"column {quoted(field)} has values of type {data.dtype}")
     if data.ndim > 1 or data.dtype.kind == "O":
@@ -115,7 +100,6 @@ def _arrow(values: Any, field: str, name: str) -> pa.Array:
 
 
 def _times(values: pa.Array) -> pa.Array:
-    """Return texts as times, if they are."""
     try:
         return values.cast(pa.timestamp("us"))
     except pa.ArrowInvalid:
@@ -125,10 +109,6 @@ def _times(values: pa.Array) -> pa.Array:
 def _item(kind: pa.DataType) -> pa.DataType:
     wider = {pa.int8(): pa.int16(), pa.uint16(): pa.int32(), pa.uint32(): pa.int64()}
     return wider.get(kind, kind)
-
-
-def _flat(mask: Any) -> Any:
-    return mask if mask.ndim == 1 else mask.reshape(len(mask), -1).all(axis=1)
 
 
 def _is_list(data: Any) -> bool:

@@ -70,19 +70,14 @@ def xml_text(text: str) -> str:
 
 
 def iso_time(seconds: float) -> str:
-    """Return a time as UWS writes it.
-
-    Examples
-    --------
-    >>> iso_time(0.5)
-    '1970-01-01T00:00:00.500Z'
-    """
+    """Return a time as UWS writes it."""
     moment = datetime.fromtimestamp(seconds, UTC)
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 
 def job_document(job: JobFacts, url: str) -> bytes:
     """Return all that is known of a job."""
+    error = ErrorSummary(message=xml_text(job.error), type=ErrorType.FATAL, has_detail=True)
     summary = JobSummary[_Parameters](
         job_id=job.job_id,
         run_id=xml_text(job.run_id) or None,
@@ -95,19 +90,19 @@ def job_document(job: JobFacts, url: str) -> bytes:
         destruction=_time(job.destroyed_s),
         parameters=_parameters(job),
         results=_results(job, url),
-        error_summary=_error(job),
+        error_summary=error if job.error else None,
     )
-    return _document(summary)
+    return document(summary)
 
 
 def parameters_document(job: JobFacts) -> bytes:
     """Return the parameters of a job as XML."""
-    return _document(_parameters(job))
+    return document(_parameters(job))
 
 
 def results_document(job: JobFacts, url: str) -> bytes:
     """Return where the results of a job are as XML."""
-    return _document(_results(job, url))
+    return document(_results(job, url))
 
 
 def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
@@ -123,7 +118,7 @@ def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
         )
         for job in jobs
     ]
-    return _document(Jobs(jobref=found))
+    return document(Jobs(jobref=found))
 
 
 def _parameters(job: JobFacts) -> _Parameters:
@@ -143,18 +138,11 @@ def _results(job: JobFacts, url: str) -> Results:
     return Results(results=[reference])
 
 
-def _error(job: JobFacts) -> ErrorSummary | None:
-    if not job.error:
-        return None
-    return ErrorSummary(message=xml_text(job.error), type=ErrorType.FATAL, has_detail=True)
-
-
 def _time(seconds: float | None) -> UTCTimestamp | None:
     return None if seconds is None else UTCTimestamp.fromtimestamp(seconds, UTC)
 
 
-def _document(model: BaseXmlModel) -> bytes:
-    found = model.to_xml(
-        exclude_none=False, skip_empty=False, encoding="UTF-8", xml_declaration=True
-    )
+def document(model: BaseXmlModel, skip_empty: bool = False) -> bytes:
+    """Return a document of vo-models as XML."""
+    found = model.to_xml(skip_empty=skip_empty, encoding="UTF-8", xml_declaration=True)
     return found if isinstance(found, bytes) else found.encode()

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-from starcat.catalog.ingest import CATALOGS
+from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import RecordFile, data_source
 
 BLANKS = [" " * width for width in range(14)]
@@ -21,7 +21,7 @@ BLANKS = [" " * width for width in range(14)]
 def numpy_slices(paths: list[Path], source: str) -> int:
     """Slice fixed-width records as bytes and let numpy convert each column."""
     layout = data_source(source).files[0]
-    wanted = [layout.column(name) for name in CATALOGS[source].columns[layout.name]]
+    wanted = [layout.column(name) for name in CATALOGS[source].COLUMNS[layout.name]]
     rows = 0
     for path in paths:
         data = np.frombuffer(read_bytes(path), dtype=np.uint8).reshape(-1, layout.record_bytes + 1)
@@ -37,10 +37,10 @@ def numpy_slices(paths: list[Path], source: str) -> int:
     return rows
 
 
-def pyarrow_csv(paths: list[Path], source: str, *, all_fields: bool = True) -> int:
-    """Split delimited records with pyarrow and convert each field."""
+def pyarrow_csv(paths: list[Path], source: str) -> int:
+    """Split delimited records with pyarrow and convert the fields that ingest uses."""
     layout = data_source(source).files[0]
-    names, kinds = bar_fields(layout, all_fields=all_fields)
+    names, kinds = bar_fields(layout)
     rows = 0
     for path in paths:
         table = csv.read_csv(
@@ -55,17 +55,12 @@ def pyarrow_csv(paths: list[Path], source: str, *, all_fields: bool = True) -> i
     return rows
 
 
-def pyarrow_csv_used(paths: list[Path], source: str) -> int:
-    """Split delimited records with pyarrow and convert only the fields that ingest uses."""
-    return pyarrow_csv(paths, source, all_fields=False)
-
-
-def bar_fields(layout: RecordFile, *, all_fields: bool) -> tuple[list[str], dict[str, pa.DataType]]:
+def bar_fields(layout: RecordFile) -> tuple[list[str], dict[str, pa.DataType]]:
     """Return the names of the fields between bars, and the types of those to convert.
 
     A field that holds several columns of the table (TYC1-3, HIP and CCDM) stays text.
     """
-    wanted = set(CATALOGS["tycho2"].columns[layout.name])
+    wanted = set(CATALOGS["tycho2"].COLUMNS[layout.name])
     ends = [*sorted(int(place) for place in layout.literals), layout.record_bytes + 1]
     names, kinds, start = [], {}, 1
     for number, end in enumerate(ends):
@@ -73,7 +68,7 @@ def bar_fields(layout: RecordFile, *, all_fields: bool) -> tuple[list[str], dict
         single = len(inside) == 1
         name = inside[0].name if single else f"field_{number}"
         names.append(name)
-        if all_fields or wanted & {column.name for column in inside}:
+        if wanted & {column.name for column in inside}:
             is_number = single and not inside[0].is_text
             kinds[name] = pa.float64() if is_number else pa.string()
         start = end + 1

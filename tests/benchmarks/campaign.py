@@ -33,7 +33,8 @@ from synthetic import catalogs_folder
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.selftest import answers_rightly
+from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.reading import preset
 
 FILES: dict[str, dict[str, str]] = {
@@ -77,25 +78,12 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     for frame, answer in zip(frames, found, strict=True):
         counted["too few"] += frame.n_stars < MIN_STARS
         if answer.status == "identified":
-            is_right = error_px(answer.q_body_from_icrs, frame, matcher) <= 2.0
+            is_right = frame.n_stars > 0 and answers_rightly(answer, frame, matcher)
             counted["right" if is_right else "wrong"] += 1
         else:
             counted["none"] += 1
     counted["microseconds"] += round(1e6 * float(np.sum(found.seconds)))
     return counted
-
-
-def error_px(quaternion: np.ndarray, frame: Frame, matcher: Matcher) -> float:
-    """Return how far an attitude puts the stars of a frame from their true places, at most."""
-    from starcat.geometry.attitude import matrix_from_quaternion
-
-    camera = matcher.database.camera
-    star = frame.star_index[frame.star_index >= 0]
-    u = matcher.database.directions[star]
-    truth = camera.pixels_from_directions(u @ frame.matrix.T)
-    there = camera.pixels_from_directions(u @ matrix_from_quaternion(quaternion).T)
-    apart = np.hypot(*(there - truth).T) if len(star) else np.full(1, np.inf)
-    return float(np.nan_to_num(apart, nan=np.inf).max())
 
 
 def main() -> None:

@@ -75,34 +75,29 @@ def median_ms(matcher: Matcher, *, is_bright: bool) -> float:
     return 1e3 * float(np.median(times[10:]))
 
 
-def print_row(fov_deg: float, row: dict[str, float]) -> None:
-    """Print a row of the table as Markdown has it."""
-    cells = [
-        f"{fov_deg:g}", f"{row['limit']:g}", f"{row['stars']:,.0f}", f"{row['a field']:.0f}",
-        f"{row['boresights']:,.0f}", f"{row['triangles']:,.0f}", f"{row['products']:.0f}",
-        f"{row['s']:.0f}", f"{row['GiB']:.1f}", f"{row['clean']:.1f}", f"{row['hard']:.1f}",
-        f"{row['numpy ms']:.1f}", f"{row.get('c ms', np.nan):.2f}",
-        f"{row['clean, no magnitudes']:.1f}", f"{row['hard, no magnitudes']:.1f}",
-        f"{row['numpy bare ms']:.1f}", f"{row.get('c bare ms', np.nan):.2f}",
-        f"{row['wrong']:.0f}",
-    ]  # fmt: skip
-    print(f"| {' | '.join(cells)} |", flush=True)
+COLUMNS = (
+    ("field, deg", "{field:g}"), ("limit, G", "{limit:g}"), ("guide stars", "{stars:,.0f}"),
+    ("a field", "{a field:.0f}"), ("boresights", "{boresights:,.0f}"),
+    ("triangles", "{triangles:,.0f}"), ("products", "{products:.0f}"), ("build, s", "{s:.0f}"),
+    ("GiB", "{GiB:.1f}"), ("clean, %", "{clean:.1f}"), ("hard, %", "{hard:.1f}"),
+    ("numpy, ms", "{numpy ms:.1f}"), ("C, ms", "{c ms:.2f}"),
+    ("clean, no mag.", "{clean, no magnitudes:.1f}"),
+    ("hard, no mag.", "{hard, no magnitudes:.1f}"), ("numpy, ms", "{numpy bare ms:.1f}"),
+    ("C, ms", "{c bare ms:.2f}"), ("wrong", "{wrong:.0f}"),
+)  # fmt: skip
+"""Heading and text of each column of the table, which is Markdown."""
 
 
 def main() -> None:
     """Print the table."""
-    heads = (
-        "field, deg", "limit, G", "guide stars", "a field", "boresights", "triangles", "products",
-        "build, s", "GiB", "clean, %", "hard, %", "numpy, ms", "C, ms", "clean, no mag.",
-        "hard, no mag.", "numpy, ms", "C, ms", "wrong",
-    )  # fmt: skip
     print("\nFields of view, each with what `starcat init` chooses (1280 x 960 px)")
-    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    print(f"| {' | '.join(head for head, _ in COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for fov_deg in FIELDS_DEG:
         done = subprocess.run(
             [sys.executable, __file__, str(fov_deg)], capture_output=True, text=True, check=True
         )
-        print_row(fov_deg, json.loads(done.stdout))
+        row = {"field": fov_deg, "c ms": np.nan, "c bare ms": np.nan} | json.loads(done.stdout)
+        print(f"| {' | '.join(text.format_map(row) for _, text in COLUMNS)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
 Grids, lines, clusters, mirror images, scales beyond what is allowed and false spots, half of them
 with an error of 2 % allowed in the focal length. Every answer is a wrong one. Run with
-``make bench``, or ``--frames 20000 --engine auto`` by hand; the catalog is sought in
-$STARCAT_CATALOGS.
+``make bench``, or ``--frames 20000`` by hand; the catalog is sought in $STARCAT_CATALOGS.
 """
 
 from __future__ import annotations

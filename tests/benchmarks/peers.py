@@ -43,6 +43,9 @@ REQUIREMENTS = {
 }
 """What pip installs for each peer."""
 
+DISTRIBUTIONS = {"starcat": "starcat-guide-stars"}
+"""Names of packages that pip knows by another one."""
+
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "RAYON")}
 
 
@@ -123,11 +126,8 @@ def drive_starcat(
 
     def solve(given: Any) -> Any:
         px, mag, prior, camera = given
-        if track:
-            return matcher.identify(
-                px, camera, magnitudes=mag, fov_error=off, prior=prior, prior_error_deg=PRIOR_DEG
-            )
-        return matcher.identify(px, camera, magnitudes=mag, fov_error=off)
+        near = {"prior": prior, "prior_error_deg": PRIOR_DEG} if track else {}
+        return matcher.identify(px, camera, magnitudes=mag, fov_error=off, **near)
 
     def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray, part: float) -> Any:
         own = matcher.database.camera
@@ -141,7 +141,7 @@ def drive_starcat(
         px, mag, prior, _ = given
         near = prior_of(prior, PRIOR_DEG) if track else None
         frame = as_frame(px, matcher.database.camera, mag)
-        found = library.identify([frame], matcher, near)
+        found = library.identify([frame], matcher._settings, near)
         return float(found.seconds[0])
 
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
@@ -353,7 +353,8 @@ def main(name: str, frames: str, answers: str, options: str) -> None:
     for kind in KINDS:
         written |= solve_frames(driver, given, kind)
     facts = {"build_s": driver.build_s, "database_mb": driver.database_bytes / 1e6}
-    np.savez(answers, version=version(name), peak_mib=peak_memory_mib(), **facts, **written)
+    own = version(DISTRIBUTIONS.get(name, name))
+    np.savez(answers, version=own, peak_mib=peak_memory_mib(), **facts, **written)
 
 
 if __name__ == "__main__":

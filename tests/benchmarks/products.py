@@ -97,7 +97,7 @@ def print_products(found: dict[str, dict[str, float]]) -> None:
 
 
 def main() -> None:
-    """Print the products of gaia-12deg, then their growth; plot it into dist/."""
+    """Print the products of gaia-12deg, then their growth."""
     print("\nProducts of gaia-12deg, one process")
     print_products(measure(preset("gaia-12deg")))
     growth = {}
@@ -115,25 +115,6 @@ def main() -> None:
     for name in RECIPES:
         each = [g[name]["seconds"] / max(1.0, g[name]["rows"]) * 1e9 for g in growth.values()]
         print(f"  {name:<18}{min(each):>8.0f}{max(each):>8.0f}{max(each) / min(each):>7.2f} x")
-    plot(growth)
-
-
-def plot(growth: dict[float, dict[str, dict[str, float]]]) -> None:
-    """Draw time and bytes against stars."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    stars = [g["memory"]["stars"] for g in growth.values()]
-    for name in RECIPES:
-        left.loglog(stars, [g[name]["seconds"] for g in growth.values()], "o-", label=name)
-        right.loglog(stars, [g[name]["hdf5"] / 1e6 for g in growth.values()], "o-", label=name)
-    left.set(xlabel="guide stars", ylabel="seconds")
-    right.set(xlabel="guide stars", ylabel="MB in HDF5")
-    left.legend(fontsize=7)
-    Path("dist").mkdir(exist_ok=True)
-    figure.savefig("dist/growth.png", dpi=110)
-    print("\nplot: dist/growth.png")
 
 
 if __name__ == "__main__":

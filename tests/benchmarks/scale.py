@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -132,51 +131,29 @@ class Given:
     workers: int
 
 
-Case = Callable[[Given], list[str]]
+def commands(given: Given) -> dict[str, list[str]]:
+    """Return the commands, by name; each is compared with the first that is run.
 
-
-def bare_case(given: Given) -> list[str]:
-    """The fastest bare parse."""
-    parts, workers = str(given.parts), str(given.workers)
-    return [sys.executable, __file__, "--bare", "--parts", parts, "--workers", workers]
-
-
-def store_case(given: Given) -> list[str]:
-    """A store of the preset's band."""
-    return [
-        *(sys.executable, "-m", "starcat", "ingest", "2mass", "--to", "hats", "--band", "(J+H)/2"),
-        *("--input", str(given.parts), "-o", str(given.store), "--replace"),
-        *("--workers", str(given.workers)),
-    ]
-
-
-def from_store_case(given: Given) -> list[str]:
-    """The build from the store."""
-    asked = build_case(given)
-    asked[asked.index(f"2mass={given.parts}")] = f"2mass={given.store}"
-    return asked
-
-
-def build_case(given: Given) -> list[str]:
-    """A build of the preset from the parts, with as many guide stars as from the whole archive."""
+    A store is of the preset's band; a build has as many guide stars as from the whole archive.
+    """
     faint_limit_mag = 4.4 + 2.5 * math.log10(ARCHIVE_ROWS / given.rows)
-    return [
-        *(sys.executable, "-m", "starcat", "build", "--preset", "2mass-8x6"),
-        *("--set", "self_test.min_identified=0"),
+    starcat, workers = [sys.executable, "-m", "starcat"], ["--workers", str(given.workers)]
+    ingest = [*starcat, "ingest", "2mass", "--to", "hats", "--band", "(J+H)/2", "--replace"]
+    build = [
+        *(*starcat, "build", "--preset", "2mass-8x6", "--set", "self_test.min_identified=0"),
         *("--set", f"selection.faint_limit_mag={faint_limit_mag:.2f}"),
         *("--set", f"catalog.read_limit_mag={max(8.0, faint_limit_mag + 1.0):.2f}"),
-        *("--input", f"2mass={given.parts}", "-o", str(given.scratch / "built"), "--replace"),
-        *("--workers", str(given.workers)),
+        *("-o", str(given.scratch / "built"), "--replace", *workers, "--input"),
     ]
+    return {
+        "bare": [sys.executable, __file__, "--bare", "--parts", str(given.parts), *workers],
+        "store": [*ingest, "--input", str(given.parts), "-o", str(given.store), *workers],
+        "build": [*build, f"2mass={given.parts}"],
+        "from-store": [*build, f"2mass={given.store}"],
+    }
 
 
-CASES: dict[str, Case] = {
-    "bare": bare_case,
-    "store": store_case,
-    "build": build_case,
-    "from-store": from_store_case,
-}
-"""The commands, by name; each is compared with the first that is run."""
+CASES = ("bare", "store", "build", "from-store")
 
 
 def main() -> None:
@@ -205,7 +182,7 @@ def main() -> None:
         print(f"{rows:,} rows in {len(list(parts.glob('psc_*.gz')))} parts")
         first: Measured | None = None
         for name in given.cases * given.runs:
-            took = measure(CASES[name](Given(parts, rows, scratch, store, given.workers)))
+            took = measure(commands(Given(parts, rows, scratch, store, given.workers))[name])
             first = first or took
             times = took.seconds / first.seconds, took.cpu_s / first.cpu_s
             print(

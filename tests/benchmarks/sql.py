@@ -144,11 +144,7 @@ def main() -> None:
         with open_session([str(stars), str(pairs)]) as session, duckdb.connect() as connection:
 
             def ours(text: str) -> Callable[[], object]:
-                def run() -> object:
-                    with session.ask(text) as answer:
-                        return answer.rows(1 << 30)
-
-                return run
+                return lambda: rows_of(session, text)
 
             def plain(text: str) -> Callable[[], object]:
                 return lambda: connection.execute(text).fetchall()

@@ -14,15 +14,15 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
 
-from slew import slew
+from slew import is_near, slew, wrong_by
 
-from starcat.geometry.attitude import after_turn, quaternion_from_matrix, turn_between
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Engine, Matcher
 from starcat.matcher.result import MatchResult
@@ -30,41 +30,34 @@ from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame, Noise
 
 NOISE = Noise(0.5, drop_probability=0.1, false_stars=3)
-BORESIGHT_DEG, ROLL_DEG = 0.05, 0.5
-"""An answer is right if its attitude is within both."""
-
 PRIORS_DEG = (0.1, 0.5, 2.0, 5.0, 20.0)
 FEW = 1_000
 """Frames that are asked with a prior attitude, or none."""
 
 
-def is_right(answer: MatchResult, frame: Frame) -> bool:
-    """Return whether an answer is that of its frame."""
-    truth = quaternion_from_matrix(frame.matrix).tolist()
-    x, y, z = np.degrees(turn_between(truth, answer.q_body_from_icrs.tolist()))
-    return bool(np.hypot(x, y) <= BORESIGHT_DEG and abs(z) <= ROLL_DEG)
+Ask = Callable[[Frame], Callable[[np.ndarray], MatchResult]]
+"""Returns for a frame what is to be timed, given its centroids."""
 
 
-def wrong_by(frame: Frame, most_deg: float, generator: np.random.Generator) -> np.ndarray:
-    """Return an attitude that is wrong by up to an angle."""
-    turn = generator.normal(size=3)
-    turn *= np.radians(most_deg) * generator.uniform() ** (1.0 / 3.0) / np.linalg.norm(turn)
-    x, y, z = turn.tolist()
-    return np.array(after_turn(quaternion_from_matrix(frame.matrix).tolist(), (x, y, z)))
+def near_prior(
+    matcher: Matcher, most_deg: float, generator: np.random.Generator, frame: Frame
+) -> Callable[[np.ndarray], MatchResult]:
+    """Return the call of a matcher with a prior that is wrong by up to an angle."""
+    angle_rad = np.radians(most_deg) * generator.uniform() ** (1.0 / 3.0)
+    prior = wrong_by(frame.matrix, angle_rad, generator)
+    return partial(matcher.identify, prior=prior, prior_error_deg=most_deg)
 
 
-def report(
-    name: str, frames: Iterable[Frame], ask: Callable[[Frame], Callable[[], MatchResult]]
-) -> list[MatchResult]:
+def report(name: str, frames: Iterable[Frame], ask: Ask) -> list[MatchResult]:
     """Print one line: right, wrong and no answers, how many were tracked, and milliseconds."""
     answers, ms, right = [], [], 0
     for frame in frames:
         call = ask(frame)
         start = time.process_time()
-        found = call()
+        found = call(frame.centroids_px)
         ms.append(1e3 * (time.process_time() - start))
         answers.append(found)
-        right += found.ok and is_right(found, frame)
+        right += found.ok and is_near(found.q_body_from_icrs, frame.matrix)
     ok = sum(found.ok for found in answers)
     tracked = sum(found.ok and found.origin == "tracking" for found in answers)
     counts = f"{right}/{ok - right}/{len(answers) - ok}"
@@ -90,31 +83,13 @@ def main() -> None:
         frames = list(slew(database, count, NOISE, 7, jumps))
         tracker = Tracker(matcher)
 
-        def lost(frame: Frame, matcher: Matcher = matcher) -> Callable[[], MatchResult]:
-            return lambda: matcher.identify(frame.centroids_px)
-
-        def follow(frame: Frame, tracker: Tracker = tracker) -> Callable[[], MatchResult]:
-            return lambda: tracker.identify(frame.centroids_px)
-
-        answers = report(f"{engine} tracked", frames, follow)
+        answers = report(f"{engine} tracked", frames, lambda _, t=tracker: t.identify)
         after = sum(answers[jump].ok for jump in jumps)
         print(f"{'':<18}{after} of {len(jumps)} jumps recovered in their own frame")
         for most_deg in PRIORS_DEG:
-            generator = np.random.default_rng(5)
-
-            def near(
-                frame: Frame,
-                matcher: Matcher = matcher,
-                most_deg: float = most_deg,
-                generator: np.random.Generator = generator,
-            ) -> Callable[[], MatchResult]:
-                prior = wrong_by(frame, most_deg, generator)
-                return lambda: matcher.identify(
-                    frame.centroids_px, prior=prior, prior_error_deg=most_deg
-                )
-
+            near = partial(near_prior, matcher, most_deg, np.random.default_rng(5))
             report(f"{engine} prior {most_deg:g} deg", frames[:FEW], near)
-        report(f"{engine} lost", frames[:FEW], lost)
+        report(f"{engine} lost", frames[:FEW], lambda _, m=matcher: m.identify)
 
 
 if __name__ == "__main__":

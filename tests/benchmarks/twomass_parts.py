@@ -139,17 +139,11 @@ def _block(stars: dict[str, np.ndarray]) -> bytes:
     key, dec = stars["key"], stars["dec"]
     records = np.tile(np.frombuffer(TEMPLATE.encode(), dtype=np.uint8), (len(key), 1))
     fields: list[tuple[str, np.ndarray, int]] = [
-        ("R" * 10, stars["ra"], 6),
-        ("D" * 10, dec, 6),
-        ("J" * 6, stars["j"], 3),
-        ("H" * 6, stars["h"], 3),
-        ("K" * 6, stars["ks"], 3),
-        ("P" * 6, stars["prox"], 1),
-        ("N" * 3, key % 360, 0),
-        ("C" * 10, key + 1, 0),
-        ("E" * 10, key, 0),
+        ("R" * 10, stars["ra"], 6), ("D" * 10, dec, 6), ("J" * 6, stars["j"], 3),
+        ("H" * 6, stars["h"], 3), ("K" * 6, stars["ks"], 3), ("P" * 6, stars["prox"], 1),
+        ("N" * 3, key % 360, 0), ("C" * 10, key + 1, 0), ("E" * 10, key, 0),
         ("T" * 12, stars["jdate"], 4),
-    ]
+    ]  # fmt: skip
     for name, values, decimals in fields:
         width = len(name)
         first, *others = _places(name)

@@ -1,18 +1,14 @@
-"""Small archives of stars that do not exist, in the true layout of all seven sources.
+"""Archives of stars that do not exist, in the true layout of all seven sources.
 
-``synthetic_sky`` draws one sky: as many bright stars as the real one has, with proper motions,
-colours, close pairs and variables. ``archive_records`` writes its stars as the records of an
-archive, field by field from the layout in ``data_sources``, and ``write_archives`` writes files
-with the archives' own names. The same star has the same HIP and HD number in every archive, so
+``archive_records`` writes the stars of a sky as the records of an archive, field by field from
+the layout in ``data_sources``. The same star has the same HIP and HD number in every archive, so
 that catalogs can be joined and compared. Positions are right to the digits of each archive.
 """
 
 from __future__ import annotations
 
-import gzip
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import erfa
@@ -21,20 +17,6 @@ import numpy as np
 from starcat.catalog.source import RecordFile, data_source
 
 Fields = Mapping[str, str | float | int]
-
-FILE_NAMES = {
-    "sao": "sao.dat",
-    "hip_main": "hip_main.dat",
-    "tyc_main": "tyc_main.dat",
-    "tyc2": "tyc2.dat",
-    "suppl_1": "suppl_1.dat",
-    "psc": "psc_aaa",
-    "gaia_merged": "gaia_merged.bin",
-    "gcvs": "gcvs.tsv",
-}
-"""The name of the one file that is written for each layout."""
-
-SOURCES = ("sao", "hipparcos", "tycho1", "tycho2", "2mass", "gaia", "gcvs")
 
 
 @dataclass(frozen=True)
@@ -76,46 +58,6 @@ class Sky:
     def where(self, rows: np.ndarray) -> Sky:
         """Return some of the stars: a mask or row numbers."""
         return Sky(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
-
-
-def stars_to(faint_limit_mag: float) -> int:
-    """Return how many stars the real sky has to a magnitude, roughly: 5,000 to V 6."""
-    return round(5045 * 10.0 ** (0.5 * (faint_limit_mag - 6.0)))
-
-
-def synthetic_sky(count: int | None = None, faint_limit_mag: float = 7.0, seed: int = 1) -> Sky:
-    """Draw a sky of so many stars down to a magnitude; by default as many as the real one has."""
-    generator = np.random.default_rng(seed)
-    count = stars_to(faint_limit_mag) if count is None else count
-    ra = generator.uniform(0.0, 360.0, count)
-    # The proper motions of SAO have no cos(dec): nearer to a pole they outgrow their field.
-    dec = np.degrees(np.arcsin(generator.uniform(-0.99999, 0.99999, count)))
-    pairs = count // 50
-    # Every 25th star has a companion with a record of its own, 2 to 600 arcsec away.
-    distance = 2.0 * 300.0 ** generator.random(pairs) / 3600.0
-    angle = generator.uniform(0.0, 2.0 * np.pi, pairs)
-    dec[:pairs] = np.clip(dec[pairs : 2 * pairs] + distance * np.cos(angle), -89.7, 89.7)
-    shift = distance * np.sin(angle) / np.cos(np.radians(dec[:pairs]))
-    ra[:pairs] = (ra[pairs : 2 * pairs] + shift) % 360.0
-    order = np.argsort(ra)
-    mag = faint_limit_mag + 2.0 * np.log10(1.0 - generator.random(count))
-    row = np.arange(count)
-    return Sky(
-        ra_deg=ra[order],
-        dec_deg=dec[order],
-        pm_ra_cosdec_mas_yr=np.round(generator.laplace(0.0, 40.0, count), 1),
-        pm_dec_mas_yr=np.round(generator.laplace(0.0, 40.0, count), 1),
-        v_mag=np.maximum(mag, -1.4),
-        b_v=np.clip(generator.normal(0.6, 0.5, count), -0.3, 2.0),
-        rho_arcsec=np.where(generator.random(count) < 0.06, generator.uniform(0.1, 9.0, count), 0),
-        amplitude_mag=np.where(
-            generator.random(count) < 0.05, generator.exponential(0.3, count), 0
-        ),
-        hip=1 + row * 118_000 // max(count, 118_000),
-        hd=generator.permutation(np.arange(1, max(count, 350_000) + 1))[:count],
-        sao=1 + generator.permutation(max(count, 258_996))[:count],
-        gaia_id=10**17 + row * 40_009 * 10**9 // 7,
-    )
 
 
 def record(layout: RecordFile, values: Fields) -> bytes:
@@ -172,6 +114,11 @@ def _rows(columns: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         yield {name: value for name, value in row.items() if value is not None}
 
 
+def _full(count: int, **values: Any) -> dict[str, list[Any]]:
+    """Return columns that have one value in all rows."""
+    return {name: [value] * count for name, value in values.items()}
+
+
 def _given(where: np.ndarray, values: Any) -> list[Any]:
     """Return values where they are given, None elsewhere."""
     values = np.broadcast_to(values, len(where)).tolist()
@@ -182,20 +129,37 @@ def _sign(value: float) -> str:
     return "-" if value < 0 else "+"
 
 
-def _hms(ra_deg: np.ndarray, dec_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def hms(ra_deg: np.ndarray, dec_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return whole thousandths of a second of time and hundredths of an arcsecond."""
     ms = np.rint(ra_deg * 240_000.0).astype(np.int64) % 86_400_000
     return ms, np.rint(np.abs(dec_deg) * 360_000.0).astype(np.int64)
 
 
+def _sexagesimal(ra: np.ndarray, dec: np.ndarray, year: str) -> dict[str, list[str]]:
+    """Return the fields of SAO for positions, given in radians."""
+    ms, cas = hms(np.degrees(ra), np.degrees(dec))
+    return {
+        f"ra{year}_h": [f"{n // 3_600_000:02d}" for n in ms],
+        f"ra{year}_m": [f"{n // 60_000 % 60:02d}" for n in ms],
+        f"ra{year}_s": [f"{n % 60_000 / 1000:06.3f}" for n in ms],
+        f"de{year}_sign": [_sign(d) for d in dec],
+        f"de{year}_d": [f"{n // 360_000:02d}" for n in cas],
+        f"de{year}_m": [f"{n // 6_000 % 60:02d}" for n in cas],
+        f"de{year}_s": [f"{n % 6_000 / 100:05.2f}" for n in cas],
+        f"de{year}_rad": [f"{d:11.8f}" for d in dec],
+    }
+
+
 def _sao(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """Positions of FK4, B1950, whose radians run from -pi to pi, and of FK5, J2000."""
     rad_yr = np.radians(1.0 / 3.6e6)
     ra, dec = np.radians(sky.ra_deg), np.radians(sky.dec_deg)
     pm_ra, pm_dec = sky.pm_ra_cosdec_mas_yr * rad_yr / np.cos(dec), sky.pm_dec_mas_yr * rad_yr
+    old_ra, old_dec, *_ = erfa.fk524(ra, dec, pm_ra, pm_dec, 0.0, 0.0)
+    turned = (old_ra + np.pi) % (2.0 * np.pi) - np.pi
     # A parallax of 0 would put the stars so far away that their motion exceeds that of light.
     ra, dec, pm_ra, pm_dec, _, _ = erfa.h2fk5(ra, dec, pm_ra, pm_dec, 0.1, 0.0)
     ra = np.minimum(ra % (2.0 * np.pi), 6.28318530)
-    ms, cas = _hms(np.degrees(ra), np.degrees(dec))
     is_double, is_variable = sky.rho_arcsec > 0, sky.amplitude_mag > 0
     rem = np.where(is_double, np.where(is_variable, 7, 1), np.where(is_variable, 4, 0))
     columns = {
@@ -206,17 +170,12 @@ def _sao(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
         "rem": rem,
         "hd": sky.hd,
         "m_hd": [0] * len(sky),
-        "ra2000_h": [f"{n // 3_600_000:02d}" for n in ms],
-        "ra2000_m": [f"{n // 60_000 % 60:02d}" for n in ms],
-        "ra2000_s": [f"{n % 60_000 / 1000:06.3f}" for n in ms],
+        **_sexagesimal(old_ra, old_dec, ""),
+        "ra_rad": [f"{a:10.7f}" if a < 0 else f"{a:10.8f}" for a in turned],
+        **_sexagesimal(ra, dec, "2000"),
         "pm_ra2000": pm_ra / np.radians(15.0 / 3600.0),
-        "de2000_sign": ["-" if d < 0 else "+" for d in dec],
-        "de2000_d": [f"{n // 360_000:02d}" for n in cas],
-        "de2000_m": [f"{n // 6_000 % 60:02d}" for n in cas],
-        "de2000_s": [f"{n % 6_000 / 100:05.2f}" for n in cas],
         "pm_de2000": pm_dec / np.radians(1.0 / 3600.0),
         "ra2000_rad": ra,
-        "de2000_rad": [f"{d:11.8f}" for d in dec],
     }
     order = np.argsort(sky.sao)
     rows = list(_rows(columns))
@@ -226,15 +185,16 @@ def _sao(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
 def _hip_fields(sky: Sky) -> dict[str, Any]:
     """Return what hip_main and tyc_main have in common, at J1991.25."""
     then = sky.at(1991.25)
-    ms, cas = _hms(then.ra_deg, then.dec_deg)
+    ms, _ = hms(then.ra_deg, then.dec_deg)
+    tenths = np.rint(np.abs(then.dec_deg) * 36_000.0).astype(np.int64)
     bt_vt = sky.b_v / 0.85
     return {
         "ra_hms": [
             f"{n // 3_600_000:02d} {n // 60_000 % 60:02d} {n % 60_000 / 1000:05.2f}" for n in ms
         ],
         "de_dms": [
-            f"{_sign(d)}{n // 360_000:02d} {n // 6_000 % 60:02d} {n % 6_000 // 10 / 10:04.1f}"
-            for n, d in zip(cas, then.dec_deg, strict=True)
+            f"{_sign(d)}{n // 36_000:02d} {n // 600 % 60:02d} {n % 600 / 10:04.1f}"
+            for n, d in zip(tenths, then.dec_deg, strict=True)
         ],
         "v_mag": sky.v_mag,
         "ra_deg": [f"{a % 360.0:012.8f}" for a in np.minimum(then.ra_deg, 359.999999985)],
@@ -308,13 +268,9 @@ def _tycho2(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
     seen = sky.at(1991.5)
     then = sky.at(1991.25)
     both = {
-        **_tycho_numbers(sky),
-        "bt_mag": vt + bt_vt,
-        "vt_mag": vt,
-        "prox": [999] * len(sky),
-        "hip": _given(sky.hip % 5 > 0, sky.hip),
-        "ccdm": _given(is_double, "A"),
-    }
+        **_tycho_numbers(sky), "bt_mag": vt + bt_vt, "vt_mag": vt, "prox": [999] * len(sky),
+        "hip": _given(sky.hip % 5 > 0, sky.hip), "ccdm": _given(is_double, "A"),
+    }  # fmt: skip
     main = {
         **both,
         "pflag": _given(is_x, "X"),
@@ -345,15 +301,12 @@ def _tycho2(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
 
 
 def _twomass(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
-    ms, cas = _hms(sky.ra_deg, sky.dec_deg)
+    ms, cas = hms(sky.ra_deg, sky.dec_deg)
     k_mag = sky.v_mag - 2.2 * sky.b_v
     is_saturated = k_mag < 4.0
     columns = {
         "ra": [f"{a:.6f}" for a in np.minimum(sky.ra_deg, 359.999999)],
         "dec": [f"{d:.6f}" for d in sky.dec_deg],
-        "err_maj": ["0.10"] * len(sky),
-        "err_min": ["0.10"] * len(sky),
-        "err_ang": [90] * len(sky),
         "designation": [
             f"{a // 3_600_000:02d}{a // 60_000 % 60:02d}{a % 60_000 // 10:04d}{_sign(s)}"
             f"{d // 360_000:02d}{d // 6_000 % 60:02d}{d % 6_000 // 10:03d} "
@@ -365,14 +318,11 @@ def _twomass(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
         "ph_qual": np.where(is_saturated, "DDD", "AAA").tolist(),
         "rd_flg": np.where(is_saturated, "333", "222").tolist(),
         "bl_flg": np.where(sky.rho_arcsec > 5.0, "222", "111").tolist(),
-        "cc_flg": ["000"] * len(sky),
-        "gal_contam": ["0"] * len(sky),
-        "mp_flg": ["0"] * len(sky),
         "pts_key": _given(sky.hip % 10 > 0, 1_000_000 + np.arange(len(sky))),
         "hemis": np.where(sky.dec_deg < 12.0, "s", "n").tolist(),
-        "date": ["2000-01-01"] * len(sky),
-        "jdate": ["2451545.0000"] * len(sky),
-        "use_src": ["1"] * len(sky),
+        **_full(len(sky), err_maj="0.10", err_min="0.10", err_ang=90, cc_flg="000"),
+        **_full(len(sky), gal_contam="0", mp_flg="0", use_src="1"),
+        **_full(len(sky), date="2000-01-01", jdate="2451545.0000"),
     }
     return {"psc": _rows(columns)}
 
@@ -413,14 +363,9 @@ def _gcvs(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
 
 
 _WRITERS: dict[str, Callable[[Sky], dict[str, Iterator[dict[str, Any]]]]] = {
-    "sao": _sao,
-    "hipparcos": _hipparcos,
-    "tycho1": _tycho1,
-    "tycho2": _tycho2,
-    "2mass": _twomass,
-    "gaia": _gaia,
-    "gcvs": _gcvs,
-}
+    "sao": _sao, "hipparcos": _hipparcos, "tycho1": _tycho1, "tycho2": _tycho2,
+    "2mass": _twomass, "gaia": _gaia, "gcvs": _gcvs,
+}  # fmt: skip
 
 
 def archive_records(source_name: str, sky: Sky) -> dict[str, list[bytes]]:
@@ -443,25 +388,3 @@ def file_header(layout: RecordFile, count: int) -> bytes:
         header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
         return header.ljust(layout.header_bytes, b"\0")
     return b"# Variable stars that do not exist\n" if layout.comment else b""
-
-
-def write_archive(
-    source_name: str, folder: Path, sky: Sky, *, compress: bool = False
-) -> list[Path]:
-    """Write the files of an archive into a folder, plain or as ``.gz``; return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    layouts = {layout.name: layout for layout in data_source(source_name).files}
-    written = []
-    for name, records in archive_records(source_name, sky).items():
-        data = file_header(layouts[name], len(records)) + b"".join(records)
-        path = folder / (FILE_NAMES[name] + ".gz" * compress)
-        path.write_bytes(gzip.compress(data, 6, mtime=0) if compress else data)
-        written.append(path)
-    return written
-
-
-def write_archives(
-    folder: Path, sky: Sky, sources: Sequence[str] = SOURCES, *, compress: bool = False
-) -> dict[str, list[Path]]:
-    """Write the files of several archives into one folder; return their paths by source."""
-    return {name: write_archive(name, folder, sky, compress=compress) for name in sources}

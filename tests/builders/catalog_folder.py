@@ -9,13 +9,13 @@ SKY2000 files name the same stars, so that they can be identified with each othe
 from __future__ import annotations
 
 import gzip
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
 
 import erfa
 import numpy as np
-from archives import Sky, archive_records, file_header
+from archives import Sky, archive_records, file_header, hms
 from genuine_records import PSC, SUPPL_1, TYC2, TYC_MAIN
 
 from starcat.catalog.archives.gaia import embedded_sky
@@ -30,6 +30,8 @@ FAST_STARS, FAST_MAS_YR = 60, 1500.0
 
 NO_POSITION = 5
 """Stars of Hipparcos without an astrometric solution; the first one has no magnitude either."""
+
+SOLUTION = ("ra_deg", "de_deg", "pm_ra", "pm_de")
 
 PRINTED_ONLY = (208759, 208795, 212470)
 """SAO numbers whose proper motion is only in the printed catalog."""
@@ -84,8 +86,8 @@ def write_catalog_folder(folder: Path) -> None:
     sky = bright_sky()
     bright_in_k = sky.where(np.flatnonzero(sky.v_mag - 2.2 * sky.b_v <= 4.4))
     files = {
-        "sao.dat.gz": _with_b1950(archive_records("sao", sky)["sao"], sky),
-        "hip_main.dat.gz": _hipparcos(archive_records("hipparcos", sky)["hip_main"], sky),
+        "sao.dat.gz": archive_records("sao", sky)["sao"],
+        "hip_main.dat.gz": _without_solution(archive_records("hipparcos", sky)["hip_main"]),
         "tyc_main.dat.gz": archive_records("tycho1", sky)["tyc_main"],
         "tyc2.dat.gz": archive_records("tycho2", sky)["tyc2"],
         "psc_estimated.gz": archive_records("2mass", sky)["psc"],
@@ -117,53 +119,13 @@ def _patched(line: bytes, layout: RecordFile, fields: Mapping[str, str]) -> byte
     return bytes(edited)
 
 
-def _with_b1950(lines: Iterable[bytes], sky: Sky) -> list[bytes]:
-    """Put the older half of SAO's positions in: FK4, B1950, whose radians run from -pi to pi."""
-    layout, stars = data_source("sao").files[0], sky.where(np.argsort(sky.sao))
-    rad_yr = np.radians(1.0 / 3.6e6)
-    ra, dec = np.radians(stars.ra_deg), np.radians(stars.dec_deg)
-    motion = stars.pm_ra_cosdec_mas_yr * rad_yr / np.cos(dec), stars.pm_dec_mas_yr * rad_yr
-    ra, dec, *_ = erfa.fk524(ra, dec, *motion, 0.0, 0.0)
-    return [
-        _patched(line, layout, _b1950(*place))
-        for line, *place in zip(lines, ra.tolist(), dec.tolist(), strict=True)
-    ]
-
-
-def _b1950(ra_rad: float, dec_rad: float) -> dict[str, str]:
-    ms, cas = _clock(ra_rad, dec_rad)
-    turned = (ra_rad + np.pi) % (2.0 * np.pi) - np.pi
-    return {
-        "ra_h": f"{ms // 3_600_000:02d}",
-        "ra_m": f"{ms // 60_000 % 60:02d}",
-        "ra_s": f"{ms % 60_000 / 1000:06.3f}",
-        "ra_rad": f"{turned:10.7f}" if turned < 0 else f"{turned:10.8f}",
-        "de_sign": "-" if dec_rad < 0 else "+",
-        "de_d": f"{cas // 360_000:02d}",
-        "de_m": f"{cas // 6_000 % 60:02d}",
-        "de_s": f"{cas % 6_000 / 100:05.2f}",
-        "de_rad": f"{dec_rad:11.8f}",
-    }
-
-
-def _clock(ra_rad: float, dec_rad: float) -> tuple[int, int]:
-    """Return whole thousandths of a second of time and hundredths of an arcsecond."""
-    ms = round(np.degrees(ra_rad) * 240_000.0) % 86_400_000
-    return ms, round(abs(np.degrees(dec_rad)) * 360_000.0)
-
-
-def _hipparcos(lines: list[bytes], sky: Sky) -> list[bytes]:
-    """Round the declinations in text, and leave a few stars without a solution."""
-    layout, nothing = data_source("hipparcos").files[0], {"ra_deg": "", "de_deg": ""}
-    for row, dec_deg in enumerate(sky.at(1991.25).dec_deg.tolist()):
-        tenths = round(abs(dec_deg) * 36_000.0)
-        text = f"{tenths // 36_000:02d} {tenths // 600 % 60:02d} {tenths % 600 / 10:04.1f}"
-        fields = {"de_dms": f"{'-' if dec_deg < 0 else '+'}{text}"}
-        lines[row] = _patched(lines[row], layout, fields)
-    without = [{**nothing, "v_mag": ""}] + [nothing] * (NO_POSITION - 1)
+def _without_solution(lines: list[bytes]) -> list[bytes]:
+    """Leave a few stars of Hipparcos without a solution."""
+    layout, nothing = data_source("hipparcos").files[0], dict.fromkeys(SOLUTION, "")
     rows = range(len(lines) // 20, len(lines), len(lines) // NO_POSITION)
-    for row, fields in zip(islice(rows, NO_POSITION), without, strict=True):
-        lines[row] = _patched(lines[row], layout, {**fields, "pm_ra": "", "pm_de": ""})
+    for number, row in enumerate(islice(rows, NO_POSITION)):
+        fields = nothing if number else {**nothing, "v_mag": ""}
+        lines[row] = _patched(lines[row], layout, fields)
     return lines
 
 
@@ -174,8 +136,8 @@ def _fk5_index(sky: Sky) -> list[bytes]:
     motion = sky.pm_ra_cosdec_mas_yr * rad_yr / np.cos(dec), sky.pm_dec_mas_yr * rad_yr
     ra, dec, *_ = erfa.h2fk5(ra, dec, *motion, 0.1, 0.0)
     lines = []
-    for row, (a, d) in enumerate(zip(ra.tolist(), dec.tolist(), strict=True)):
-        ms, cas = _clock(a, d)
+    places = zip(*(values.tolist() for values in hms(*np.degrees([ra, dec]))), dec, strict=True)
+    for row, (ms, cas, d) in enumerate(places):
         text = (
             f"{row + 1:4d}{ms // 3_600_000:4d}{ms // 60_000 % 60:3d}{ms % 60_000 / 1000:7.3f}"
             f"         {'-' if d < 0 else '+'}{cas // 360_000:2d}{cas // 6_000 % 60:3d}"

@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike
 
 from starcat.geometry.camera import Camera
 from starcat.matcher import observation
+from starcat.matcher.database import Database
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 
 def observe(
@@ -26,6 +28,14 @@ def observe(
     frame = observation.as_frame(centroids_px, camera, magnitudes)
     chosen = Settings(tolerance_px=tolerance_px, **settings)
     return observation.observe(frame, chosen, fov_error=fov_error, budget=budget)
+
+
+def frames_of(
+    database: Database, count: int, noise: Noise | None = None, seed: int = 3
+) -> list[Frame]:
+    """Return frames of the stars of a database, with its camera."""
+    u, camera = database.directions, database.camera
+    return list(simulate_frames(u, camera, count, noise or Noise(), seed, database.mag))
 
 
 def with_selection(seen: observation.Observation, **order: Any) -> observation.Observation:

@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote_plus, urlencode
@@ -142,6 +141,10 @@ token-revoke: token revoke anna --root service
 FIRST = ("ingest", "simulate", "export", "publish", "token-create")
 """Commands whose files others read: those go before the rest."""
 
+EXPORTED = {
+    "pyramid.img": "onboard --method pyramid", "big.img": "onboard --endian big",
+    "onboard.c": "c", "hats": "hats --product stars",
+}  # fmt: skip
 BAD_FILES = {
     "few.csv": "x_px,y_px,mag\n100,100,2\n500,400,3\n",
     "letters.csv": "x_px,y_px\n1,2\n3,abc\n",
@@ -244,10 +247,8 @@ class Freezer:
             return f"{len(cleaned)} characters, sha256 {sha256(cleaned.encode())}"
         return cleaned
 
-    def run(self, words: Iterable[str] | str) -> subprocess.CompletedProcess[str]:
-        """Run a command to its end."""
-        words = shlex.split(words) if isinstance(words, str) else words
-        command = [sys.executable, "-m", "starcat", *words]
+    def run(self, line: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "starcat", *shlex.split(line)]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=500)
 
     def tell(self, name: str, line: str, *, is_for_people: bool = True) -> None:
@@ -298,12 +299,9 @@ def json_text(value: Any) -> str:
 def digests(folder: Path) -> str:
     """Return a line for each file of a folder: its digest, its size and its path."""
     found = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.is_file())
-    lines = []
-    for path in found:
-        content = path.read_bytes()
-        name = path.name if path == folder else path.relative_to(folder).as_posix()
-        lines.append(f"{sha256(content)} {len(content):>10} {name}")
-    return "\n".join(lines)
+    root = folder.parent if folder.is_file() else folder
+    read = ((path.read_bytes(), path.relative_to(root).as_posix()) for path in found)
+    return "\n".join(f"{sha256(content)} {len(content):>10} {name}" for content, name in read)
 
 
 def frame_of(path: Path) -> dict[str, Any]:
@@ -316,8 +314,7 @@ def frame_of(path: Path) -> dict[str, Any]:
 def freeze_help(freezer: Freezer) -> None:
     """Write the help of the program, of its commands, and of those of its groups."""
     waiting = [""]
-    while waiting:
-        words = waiting.pop()
+    for words in waiting:
         text = freezer.run(f"{words} --help").stdout
         freezer.write(f"help/starcat{words.replace(' ', '-')}.txt", freezer.clean(text))
         listed = text.partition("Commands:\n")[2]
@@ -354,10 +351,7 @@ def freeze_commands(freezer: Freezer) -> None:
         more[f"export-{form}"] = f"export {ALL} --to {form} {products} -o files/{form} --replace"
         more[f"sql-{form}"] = f'sql {MINE} "{NORTH}" -o files/answers/north.{form}'
         more[f"sql-{form}-shown"] = f'sql {MINE} "{NORTH}" --format {form}'
-    for name, to in (
-        ("pyramid.img", "onboard --method pyramid"), ("big.img", "onboard --endian big"),
-        ("onboard.c", "c"), ("hats", "hats --product stars"),
-    ):  # fmt: skip
+    for name, to in EXPORTED.items():
         line = f"export {MINE} --to {to} -o files/{name} --replace"
         more[f"export-{name.replace('.', '-')}"] = line
     both = told | more
@@ -439,8 +433,8 @@ def parameters(one: Any) -> str:
 def facts(result: Any) -> dict[str, Any]:
     """Return what a result says of itself; where it refuses, what it says then."""
     values = {}
-    for name in dir(result):
-        if not name.startswith("_") and name != "asked":
+    for name in {*dir(result)} - {"asked"}:
+        if not name.startswith("_"):
             try:
                 values[name] = getattr(result, name)
             except Exception as error:
@@ -450,8 +444,8 @@ def facts(result: Any) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """Return a value as JSON has it: specs by their keys, arrays as lists, others as they print."""
-    value = value.model_dump() if hasattr(value, "model_dump") else value
-    value = value.tolist() if hasattr(value, "tolist") else value
+    for method in ("model_dump", "tolist"):
+        value = getattr(value, method)() if hasattr(value, method) else value
     if isinstance(value, dict):
         return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -555,8 +549,6 @@ LINE = re.compile(
     r"(?: as (?P<who>\w+))?(?: with (?P<header>[\w-]+): (?P<value>\S+))?"
 )
 TYPES = {
-    "json": "application/json",
-    "toml": "application/toml",
     "text": "text/plain",
     "form": "application/x-www-form-urlencoded",
     "multipart": "multipart/form-data; boundary=freeze",
@@ -584,7 +576,7 @@ class Asker:
         if found["header"]:
             headers[found["header"]] = found["value"]
         if found["kind"]:
-            headers["Content-Type"] = TYPES[found["kind"]]
+            headers["Content-Type"] = TYPES.get(found["kind"], f"application/{found['kind']}")
             body = found["body"].encode()
             body = b"#" * int(body[1:]) if body.startswith(b"*") else body
         if found["kind"] == "multipart":

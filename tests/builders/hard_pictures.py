@@ -1,15 +1,11 @@
 """Rendered pictures that are hard to measure, of the embedded sky: twenty of each kind.
 
 Every picture is of 1024 x 1024 px over 12 deg, of all stars to G = 10; the guide stars of the
-preset gaia-12deg are those to 6. Run as a program it prints how many are identified:
-
-    python tests/builders/hard_pictures.py <artifact> [<pictures of a kind>] [<kind> ...]
+preset gaia-12deg are those to 6.
 """
 
 from __future__ import annotations
 
-import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -122,11 +118,7 @@ def _gradient(rng: Rng) -> Picture:
 def _moon(rng: Rng) -> Picture:
     place = rng.uniform(-80.0, 1104.0, 2)
     glow = 10.0 ** rng.uniform(2.7, 4.0)
-    moon = Scene(
-        moon_px=(place[0], place[1]),
-        glow_e=glow,
-        glow_px=rng.uniform(40.0, 120.0),
-    )
+    moon = Scene(moon_px=(place[0], place[1]), glow_e=glow, glow_px=rng.uniform(40.0, 120.0))
     return Picture(_optics(rng), moon)
 
 
@@ -230,32 +222,3 @@ def verdicts(
             taken = take(kind, number, matcher.database.camera, folder)
             yield taken, verdict(matcher, taken)
             taken.path.unlink()
-
-
-def main(artifact: str, count: str = "20", *kinds: str) -> None:
-    from starcat.images.centroiding import find_spots
-    from starcat.images.image_file import read_image
-
-    matcher, tally = Matcher.open(artifact), {}
-    with tempfile.TemporaryDirectory() as folder:
-        for kind in kinds or (*KINDS, *MORE_KINDS):
-            for number in range(int(count)):
-                taken = take(kind, number, matcher.database.camera, Path(folder))
-                try:
-                    said = verdict(matcher, taken)
-                except Exception as error:
-                    said = str(error)[:150]
-                tally.setdefault(kind, []).append(said)
-                if said == "right":
-                    continue
-                try:
-                    spots = find_spots(read_image(taken.path))
-                    seen = f"sigma {spots.psf_sigma_px:.2f}, {len(spots)} spots"
-                except Exception:
-                    seen = ""
-                print(f"  {kind} {number}: {said}; {taken.picture.optics.psf_sigma_px:.2f} {seen}")
-            print(f"{kind}: {tally[kind].count('right')} of {count}", flush=True)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -37,14 +37,9 @@ def write_facts(folder: Path, pixels: tuple[Pixel, ...], rows: int) -> None:
     lines = [f"{pixel.order},{pixel.number}" for pixel in pixels]
     (folder / "partition_info.csv").write_text("\n".join(["Norder,Npix", *lines]) + "\n")
     facts = {
-        "obs_collection": folder.name,
-        "dataproduct_type": "object",
-        "hats_nrows": rows,
-        "hats_col_ra": "ra_deg",
-        "hats_col_dec": "dec_deg",
-        "hats_col_healpix": HEALPIX_COLUMN,
-        "hats_col_healpix_order": MAX_ORDER,
-        "hats_npix_suffix": ".parquet",
-    }
+        "obs_collection": folder.name, "dataproduct_type": "object", "hats_nrows": rows,
+        "hats_col_ra": "ra_deg", "hats_col_dec": "dec_deg", "hats_col_healpix": HEALPIX_COLUMN,
+        "hats_col_healpix_order": MAX_ORDER, "hats_npix_suffix": ".parquet",
+    }  # fmt: skip
     text = "".join(f"{key}={value}\n" for key, value in facts.items())
     (folder / "hats.properties").write_text(text)

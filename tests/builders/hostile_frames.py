@@ -93,25 +93,10 @@ KINDS: dict[str, Make] = {
 
 
 def hostile_frame(number: int, database: Database) -> tuple[str, Array, Array | None, float]:
-    """Return a frame that no answer belongs to.
+    """Return a frame that no answer belongs to: its kind, spots, magnitudes and allowed error.
 
-    Parameters
-    ----------
-    number : int
-        Its seed; the kinds take turns.
-    database : Database
-        The stars, and the camera.
-
-    Returns
-    -------
-    kind : str
-        A key of `KINDS`.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Spots, some of them off the detector.
-    magnitudes : ndarray of float64, shape (N,), or None
-        Their magnitudes.
-    fov_error : float
-        Error of the focal length to allow, 0 or `ALLOWED`.
+    The kinds take turns with the number. Some spots are off the detector; the error of the focal
+    length that is allowed is 0 or `ALLOWED`.
     """
     generator = np.random.default_rng(number)
     kind = list(KINDS)[number % len(KINDS)]

@@ -40,13 +40,7 @@ def broken(folder: Path) -> list[str]:
 
 
 def release(folder: Path) -> list[str]:
-    """Append the files that are not listed, and return their names.
-
-    Raises
-    ------
-    ValueError
-        If a released file is changed or missing; nothing is written then.
-    """
+    """Append the files that are not listed, and return their names, if no released one changed."""
     problems = broken(folder)
     if problems:
         raise ValueError("; ".join(problems))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.evaluation.run import write_reproduction
+from starcat.evaluation.report.files import RESULTS, write_reproduction
 
 ROOT = Path(__file__).resolve().parents[2]
 
 if __name__ == "__main__":
-    page = write_reproduction(ROOT / "dist" / "evaluation", ROOT / "docs")
+    page = write_reproduction(ROOT / "dist" / "evaluation" / "all" / RESULTS, ROOT / "docs")
     print(f"wrote {page.relative_to(ROOT)}")

@@ -18,16 +18,12 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from starcat.geometry.sphere import directions_from_radec
+
 PACKAGE = Path(__file__).parents[2] / "starcat" / "sky"
 FAINT_LIMIT_MAG = 6.6
 GREEK = "αβγδεζηθικλμνξοπρστυφχψω"
-IAU = {
-    3179: "Schedar",
-    13209: "Bharani",
-    69974: "Khambalia",
-    79219: "Kamuy",
-    95771: "Anser",
-}
+IAU = {3179: "Schedar", 13209: "Bharani", 69974: "Khambalia", 79219: "Kamuy", 95771: "Anser"}
 """Where the two packages differ in spelling, or one has another star: as the IAU's list has it."""
 
 NAMES_HEAD = """\
@@ -98,14 +94,16 @@ def write_lines(stars: dict[int, dict[str, float]], d3_folder: Path) -> None:
     """Write one row a line."""
     content = json.loads((d3_folder / "data/constellations.lines.json").read_text(encoding="utf-8"))
     hips = np.array(list(stars))
-    u = directions([star["ra"] for star in stars.values()], [s["dec"] for s in stars.values()])
+    u = directions_from_radec(
+        [star["ra"] for star in stars.values()], [s["dec"] for s in stars.values()]
+    )
     mag = np.array([star["mag"] for star in stars.values()])
     rows = []
     for feature in content["features"]:
         for line in feature["geometry"]["coordinates"]:
             names = []
             for ra_deg, dec_deg in line:
-                chord = np.sqrt(((u - directions([ra_deg], [dec_deg])) ** 2).sum(axis=1))
+                chord = np.sqrt(((u - directions_from_radec(ra_deg, dec_deg)) ** 2).sum(axis=1))
                 near = np.flatnonzero(chord < np.radians(30.0 / 3600.0))
                 names.append(str(hips[near[mag[near].argmin()]]))
             rows.append(f"{feature['id']},{' '.join(names)}\n")
@@ -116,12 +114,6 @@ def write_lines(stars: dict[int, dict[str, float]], d3_folder: Path) -> None:
     (PACKAGE / "constellation_lines.csv").write_text(
         LINES_HEAD + licence + "constellation,hips\n" + "".join(rows), encoding="utf-8"
     )
-
-
-def directions(ra_deg: Any, dec_deg: Any) -> Any:
-    """Return unit vectors."""
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
 
 
 if __name__ == "__main__":

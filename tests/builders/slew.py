@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Iterator
 
 import numpy as np
 
-from starcat.geometry.attitude import after_turn, matrix_from_quaternion
+from starcat.geometry.attitude import (
+    after_turn,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    turn_between,
+)
 from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
@@ -18,6 +24,25 @@ RATES_DEG = (0.1, 2.0)
 
 SHARE = 0.02
 """Largest change of the rate from a frame to the next, as a share of it."""
+
+
+def wrong_by(matrix: np.ndarray, angle_rad: float, generator: np.random.Generator) -> np.ndarray:
+    """Return an attitude, as a quaternion, that is wrong by an angle about a random axis."""
+    x, y, z = generator.normal(size=3)
+    scale = angle_rad / math.hypot(x, y, z)
+    q = quaternion_from_matrix(matrix).tolist()
+    return np.array(after_turn(q, (x * scale, y * scale, z * scale)))
+
+
+BORESIGHT_DEG, ROLL_DEG = 0.05, 0.5
+"""An attitude is right if it is within both."""
+
+
+def is_near(quaternion: np.ndarray, matrix: np.ndarray) -> bool:
+    """Return whether an attitude is as near to the true one as a right answer."""
+    truth = quaternion_from_matrix(matrix).tolist()
+    x, y, z = np.degrees(turn_between(truth, quaternion.tolist()))
+    return bool(np.hypot(x, y) <= BORESIGHT_DEG and abs(z) <= ROLL_DEG)
 
 
 def slew(

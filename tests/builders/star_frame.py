@@ -20,7 +20,6 @@ from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import triangle
-from starcat.matcher.methods.order import select_triangles
 from starcat.matcher.settings import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
 from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
@@ -63,7 +62,7 @@ def _triangle_rows(shot: Shot) -> tuple[int, list[tuple[str, object]]]:
     """The first triangle with Polaris: its rank, and how it is looked up."""
     frame, matcher = shot.frame, shot.matcher
     seen = observe(frame.centroids_px, matcher.database.camera, matcher.tolerance_px, frame.mag)
-    chosen = select_triangles(seen)
+    chosen = triangle.select_triangles(seen)
     polaris = int(np.flatnonzero(seen.rows == shot.polaris)[0])
     rank = int(np.flatnonzero((chosen == polaris).any(axis=1))[0])
     i, j, k = (int(n) for n in chosen[rank])

@@ -187,7 +187,8 @@ def _nearest_rejected(story: Story) -> dict[str, Any]:
     with open_session([str(story.built.folder)]) as session:
         query = named_query("rejected-near")
         with session.ask(query.text, query.with_values({})) as answer:
-            return dict(zip(answer.columns, answer.rows(1)[0], strict=True))
+            names = [name for name, _ in answer.columns]
+            return dict(zip(names, answer.rows(1)[0], strict=True))
 
 
 def verdict_section(story: Story) -> str:

@@ -32,6 +32,22 @@ def magnitudes(records: Records, band: str) -> Array:
     return records[_MAGNITUDES[band]]
 
 
+def shared_columns(records: Records, mag: Array, second_mag: Array) -> Columns:
+    """Return the star-table columns that the records of both catalogs of I/239 have."""
+    return {
+        "ra_deg": records["ra_deg"],
+        "dec_deg": records["de_deg"],
+        "epoch_jyear": 1991.25,
+        "pm_ra_cosdec_mas_yr": records["pm_ra"],
+        "pm_dec_mas_yr": records["pm_de"],
+        "mag": mag,
+        "second_mag": second_mag,
+        "colour_mag": records["b_v"],
+        "colour_bands": "B-V",
+        "hd_number": records["hd"],
+    }
+
+
 def stars(records: Records, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Hipparcos records."""
     number = records.integers("hip")
@@ -42,19 +58,11 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
     is_class, is_type = ~records.is_blank("var_flag"), np.isin(records["hvar_type"], [b"P", b"U"])
     amplitude = amplitudes(records)
     return {
+        **shared_columns(records, magnitudes(records, band), magnitudes(records, second)),
         "star_id": number,
         "designation": numbered("HIP", number),
-        "ra_deg": records["ra_deg"],
-        "dec_deg": records["de_deg"],
-        "epoch_jyear": 1991.25,
-        "pm_ra_cosdec_mas_yr": records["pm_ra"],
-        "pm_dec_mas_yr": records["pm_de"],
-        "mag": records[_MAGNITUDES[band]],
         "band": band,
-        "second_mag": records[_MAGNITUDES[second]],
         "second_band": second,
-        "colour_mag": records["b_v"],
-        "colour_bands": "B-V",
         "double_flag": join_flags(
             {
                 "CCDM": (in_ccdm, records["ccdm"]),
@@ -72,7 +80,6 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
         "amplitude_mag": amplitude,
         "amplitude_source": where_known(amplitude, "hipparcos"),
         "hip_number": number,
-        "hd_number": records["hd"],
     }
 
 

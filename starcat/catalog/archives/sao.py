@@ -72,8 +72,6 @@ def icrs_from_fk5(
 ) -> tuple[Array, Array, Array, Array]:
     """Turn FK5 positions and proper motions at J2000 into ICRS ones.
 
-    Notes
-    -----
     The rotation is that of the IAU SOFA routine FK5HIP, at most 32 mas; the spin of the FK5
     frame against Hipparcos (below 1 mas/yr) is removed from the proper motions.
     """

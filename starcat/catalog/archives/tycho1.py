@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.catalog.archives.hipparcos import shared_columns
 from starcat.catalog.archives.tycho2 import tycho_identity
 from starcat.catalog.readers.records import Records
 from starcat.catalog.stars import Columns, join_flags, where_known
@@ -39,23 +40,14 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     quality = records["q"]
     second = "VT" if band != "VT" else "BT"
     return {
+        **shared_columns(records, magnitudes(records, band), magnitudes(records, second)),
         "star_id": number,
         "designation": designation,
-        "ra_deg": records["ra_deg"],
-        "dec_deg": records["de_deg"],
-        "epoch_jyear": 1991.25,
-        "pm_ra_cosdec_mas_yr": records["pm_ra"],
-        "pm_dec_mas_yr": records["pm_de"],
-        "mag": records[_MAGNITUDES[band]],
         "band": band,
-        "second_mag": records[_MAGNITUDES[second]],
         "second_band": second,
-        "colour_mag": records["b_v"],
-        "colour_bands": "B-V",
         **_duplicity(records),
         **_variability(records),
         "hip_number": records["hip"],
-        "hd_number": records["hd"],
         "quality_flags": quality_flags(
             len(records),
             {

@@ -20,13 +20,11 @@ from starcat.catalog.readers.records import (
     Problem,
     Records,
     apply_nulls,
+    check_fields,
     line_ends,
-    number_from_text,
-    reject_impossible_numbers,
-    reject_required_blanks,
+    read_fields,
 )
 from starcat.catalog.source import Column, RecordFile
-from starcat.errors import quoted
 
 
 def parse_delimited(
@@ -37,7 +35,7 @@ def parse_delimited(
     records = _parse_regular(data, layout, chosen, first_line)
     if records is None:
         records = _parse_lines(data, layout, chosen, first_line)
-    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
+    return check_fields(records, layout)
 
 
 def _parse_regular(
@@ -149,13 +147,7 @@ def _array_by_field(
     if column.is_text:
         return _text_array(values)
     numbers = np.full(len(values), np.nan)
-    for i, text in enumerate(values.to_pylist()):
-        try:
-            numbers[i] = np.nan if text is None else number_from_text(text)
-        except ValueError:
-            if not bad[i]:
-                found, kind = quoted(text), f"a number like {column.format}"
-                problems.append(Problem(int(line[i]), column.name, None, found, kind))
-            bad[i] = True
+    texts = enumerate(text or b"" for text in values.to_pylist())
+    problems += read_fields(numbers, texts, column, line, bad)
     apply_nulls(numbers, column)
     return numbers

@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.readers.records import (
-    Problem,
-    Records,
-    apply_nulls,
-    number_from_text,
-    reject_impossible_numbers,
-    reject_required_blanks,
-)
+from starcat.catalog.readers.records import Problem, Records, apply_nulls, check_fields, read_fields
 from starcat.catalog.source import Column, RecordFile
 from starcat.errors import quoted
 
@@ -32,16 +25,7 @@ _NEWLINE, _RETURN, _SPACE, _PLUS, _MINUS, _POINT = b"\n\r +-."
 def parse_fixed_width(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
 ) -> Records:
-    """Parse a block of fixed-width lines.
-
-    Examples
-    --------
-    >>> from starcat.catalog.source import data_source
-    >>> layout = data_source("sao").files[0]
-    >>> line = b"   106".ljust(80) + b" 6.4".ljust(124)
-    >>> parse_fixed_width(line, layout, ["sao", "v_mag"])["v_mag"]
-    array([6.4])
-    """
+    """Parse a block of fixed-width lines."""
     chars, line, problems = _split_lines(data, layout, first_line)
     columns: dict[str, NDArray[Any]] = {}
     bad = np.zeros(len(chars), dtype=bool)
@@ -53,9 +37,13 @@ def parse_fixed_width(
         if column.is_text:
             columns[name] = np.ascontiguousarray(field).view(f"S{last - first + 1}")[:, 0]
         else:
-            columns[name] = _parse_numbers(field, column, line, bad, problems)
+            values, odd = _fixed_point(np.ascontiguousarray(field.T), column.decimals)
+            texts = ((i, field[i].tobytes()) for i in np.flatnonzero(odd).tolist())
+            problems += read_fields(values, texts, column, line, bad)
+            apply_nulls(values, column)
+            columns[name] = values
     records = Records(layout.name, line, columns).without(bad, problems)
-    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
+    return check_fields(records, layout)
 
 
 def parse_binary(
@@ -85,7 +73,7 @@ def parse_binary(
         problems.append(
             Problem(first_line + count, "record", None, f"{rest} bytes", f"{size} bytes")
         )
-    return reject_impossible_numbers(Records(layout.name, line, values, problems), layout)
+    return check_fields(Records(layout.name, line, values, problems), layout)
 
 
 def _byte_range(column: Column) -> tuple[int, int]:
@@ -152,31 +140,6 @@ def _check_literals(
     return problems
 
 
-def _parse_numbers(
-    field: NDArray[np.uint8],
-    column: Column,
-    line: NDArray[np.int64],
-    bad: Mask,
-    problems: list[Problem],
-) -> Array:
-    """Parse one numeric column; mark and report the records that it cannot read."""
-    chars = np.ascontiguousarray(field.T)
-    values, odd = _fixed_point(chars, column.decimals)
-    for i in np.flatnonzero(odd):
-        text = field[i].tobytes()
-        try:
-            values[i] = np.nan if text.strip().decode() in column.null else number_from_text(text)
-            if column.is_integer and values[i] % 1.0 > 0.0:
-                raise ValueError(text)
-        except ValueError:
-            if not bad[i]:
-                found, kind = quoted(text), f"a number like {column.format}"
-                problems.append(Problem(int(line[i]), column.name, column.bytes, found, kind))
-            bad[i] = True
-    apply_nulls(values, column)
-    return values
-
-
 def _fixed_point(chars: NDArray[np.uint8], decimals: int | None) -> tuple[Array, Mask]:
     """Read fields whose point, if they have one, is where the format puts it.
 
@@ -210,10 +173,7 @@ def _fixed_point(chars: NDArray[np.uint8], decimals: int | None) -> tuple[Array,
 
 
 def _integer_part_is_regular(
-    chars: NDArray[np.uint8],
-    is_digit: Mask,
-    space: Mask,
-    point: int,
+    chars: NDArray[np.uint8], is_digit: Mask, space: Mask, point: int
 ) -> Mask:
     """Return which fields have spaces, then at most one sign, then digits up to the point."""
     good = np.ones(chars.shape[1], dtype=bool)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.source import Column, RecordFile
+from starcat.errors import quoted
 
 _NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
+_A_VALUE = "a value"
 
 
 def line_ends(data: bytes) -> int:
@@ -87,27 +90,63 @@ class Records:
         return replace(self.where(~bad), problems=merged)
 
 
-def reject_impossible_numbers(records: Records, layout: RecordFile) -> Records:
-    """Leave out the records with a number that its column cannot hold."""
+def check_fields(records: Records, layout: RecordFile) -> Records:
+    """Leave out the records that lack a required field, or have a number that cannot be."""
+    columns = [column for column in layout.columns if column.name in records.columns]
     bad = np.zeros(len(records), dtype=bool)
     problems: list[Problem] = []
-    for column in layout.columns:
-        values = records.columns.get(column.name)
-        if values is None or values.dtype.kind == "S":
-            continue
-        least, greatest = column.range or (-np.inf, np.inf)
-        wrong = (values < least) | (values > greatest) | np.isinf(values)
-        expected = f"{least:.10g} to {greatest:.10g}" if column.range else "a finite number"
-        if column.is_integer and values.dtype.kind == "f":
-            wrong |= ~np.isnan(values) & (np.trunc(values) != values)
-            expected = f"a whole number, {expected}"
-        for i in np.flatnonzero(wrong & ~bad):
-            found = f"{values[i]:.10g}"
+    for column, is_wrong, expected in chain(_blanks(records, columns), _outside(records, columns)):
+        for i in np.flatnonzero(is_wrong & ~bad):
+            is_blank = expected == _A_VALUE
+            found = "a blank field" if is_blank else f"{records[column.name][i]:.10g}"
             problems.append(
                 Problem(int(records.line[i]), column.name, column.bytes, found, expected)
             )
-        bad |= wrong
+        bad |= is_wrong
     return records.without(bad, problems)
+
+
+def _blanks(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Column, Mask, str]]:
+    for column in columns:
+        values = records[column.name]
+        if column.required and values.dtype.kind == "f":
+            yield column, np.isnan(values), _A_VALUE
+        elif column.required and values.dtype.kind == "S":
+            yield column, records.is_blank(column.name), _A_VALUE
+
+
+def _outside(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Column, Mask, str]]:
+    for column in columns:
+        values = records[column.name]
+        if values.dtype.kind == "S":
+            continue
+        least, greatest = column.range or (-np.inf, np.inf)
+        is_wrong = (values < least) | (values > greatest) | np.isinf(values)
+        expected = f"{least:.10g} to {greatest:.10g}" if column.range else "a finite number"
+        if column.is_integer and values.dtype.kind == "f":
+            is_wrong |= ~np.isnan(values) & (np.trunc(values) != values)
+            expected = f"a whole number, {expected}"
+        yield column, is_wrong, expected
+
+
+def read_fields(
+    values: Array,
+    texts: Iterable[tuple[int, bytes]],
+    column: Column,
+    line: NDArray[np.int64],
+    bad: Mask,
+) -> list[Problem]:
+    """Read the fields of some rows one by one; mark and report those that are no numbers."""
+    problems = []
+    for i, text in texts:
+        try:
+            values[i] = np.nan if text.strip().decode() in column.null else number_from_text(text)
+        except ValueError:
+            if not bad[i]:
+                found, expected = quoted(text), f"a number like {column.format}"
+                problems.append(Problem(int(line[i]), column.name, column.bytes, found, expected))
+            bad[i] = True
+    return problems
 
 
 def number_from_text(text: bytes) -> float:
@@ -128,25 +167,3 @@ def apply_nulls(values: Array, column: Column) -> None:
     for text in column.null:
         if _NUMBER.fullmatch(text.encode()):
             values[values == float(text)] = np.nan
-
-
-def reject_required_blanks(records: Records, layout: RecordFile) -> Records:
-    """Leave out the records in which a required field is blank."""
-    bad = np.zeros(len(records), dtype=bool)
-    problems: list[Problem] = []
-    for column in layout.columns:
-        if not column.required or column.name not in records.columns:
-            continue
-        values = records[column.name]
-        if values.dtype.kind == "f":
-            blank = np.isnan(values)
-        elif values.dtype.kind == "S":
-            blank = records.is_blank(column.name)
-        else:
-            continue
-        problems += [
-            Problem(int(line), column.name, column.bytes, "a blank field", "a value")
-            for line in records.line[blank & ~bad]
-        ]
-        bad |= blank
-    return records.without(bad, problems)

@@ -10,8 +10,8 @@ from starcat.evaluation.experiment import (
     Paper,
     Row,
     Statistic,
+    paper_experiment,
     product_mib,
-    tolerance_for,
 )
 from starcat.geometry.camera import Camera
 from starcat.simulation.simulate import Noise
@@ -44,31 +44,16 @@ def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
 def rows(quick: bool) -> list[Row]:
     """Return the rows of S1."""
     count = 20 if quick else 200
+    points = [("Roll", roll_deg, f"{roll_deg:g} deg", roll_deg, 1.0) for roll_deg in ROLLS_DEG]
+    points += [("Scale", scale, f"{scale:g}", 0.0, scale) for scale in SCALES]
     made = []
-    for roll_deg in ROLLS_DEG:
+    for group, x, text, roll_deg, scale in points:
+        stars = Attitudes("stars", count, roll_deg=roll_deg)
+        cameras = camera_of_scale(scale) if group == "Scale" else (None, None)
         for label, (method, answer) in WAYS.items():
-            stars = Attitudes("stars", count, roll_deg=roll_deg)
-            experiment = _experiment(f"roll-{roll_deg:g}-{label}", method, answer, stars, NOISE)
-            made.append(
-                Row(
-                    "Roll",
-                    f"{label}, {roll_deg:g} deg",
-                    PRESET,
-                    experiment,
-                    "reference",
-                    x=roll_deg,
-                )
-            )
-    for scale in SCALES:
-        for label, (method, answer) in WAYS.items():
-            camera, assumed = camera_of_scale(scale)
-            stars = Attitudes("stars", count, roll_deg=0.0)
-            experiment = _experiment(
-                f"scale-{scale:g}-{label}", method, answer, stars, NOISE, camera, assumed
-            )
-            made.append(
-                Row("Scale", f"{label}, {scale:g}", PRESET, experiment, "reference", x=scale)
-            )
+            name = f"s1-{group}-{x:g}-{label}"
+            experiment = _experiment(name, method, answer, stars, NOISE, *cameras)
+            made.append(Row(group, f"{label}, {text}", PRESET, experiment, "reference", x=x))
     return made + _whole_library(5 * count)
 
 
@@ -82,12 +67,10 @@ def _whole_library(count: int) -> list[Row]:
             ("L2 with starcat, centred on a star", "stars", "matcher"),
             ("L2 with starcat, anywhere", "random", "matcher"),
         ):
-            experiment = _experiment(
-                f"library-{value:g}-{label}", "hausdorff_l2", answer, Attitudes(kind, count), noise
-            )
-            made.append(
-                Row(group, f"{label}, {value:g} px", PRESET, experiment, "reference", x=value)
-            )
+            name, attitudes = f"s1-library-{value:g}-{label}", Attitudes(kind, count)
+            experiment = _experiment(name, "hausdorff_l2", answer, attitudes, noise)
+            label = f"{label}, {value:g} px"
+            made.append(Row(group, label, PRESET, experiment, "reference", x=value))
     return made
 
 
@@ -100,17 +83,8 @@ def _experiment(
     camera: Camera | None = None,
     assumed: Camera | None = None,
 ) -> Experiment:
-    return Experiment(
-        f"s1-{name}".lower().replace(" ", "-").replace(",", ""),
-        method,
-        attitudes,
-        noise,
-        camera=camera,
-        assumed=assumed,
-        tolerance_px=tolerance_for(noise.noise_px),
-        max_false_match_probability=1e-3,
-        answer=answer,
-        seed=2020,
+    return paper_experiment(
+        name, method, attitudes, noise, camera=camera, assumed=assumed, answer=answer, seed=2020
     )
 
 

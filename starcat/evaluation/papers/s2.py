@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from starcat.evaluation.experiment import Attitudes, Experiment, Paper, Row, tolerance_for
+from starcat.evaluation.experiment import Attitudes, Experiment, Paper, Row, paper_experiment
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.simulation.simulate import Noise
@@ -59,15 +59,7 @@ def rows(quick: bool) -> list[Row]:
 
 
 def _experiment(name: str, method: str, attitudes: Attitudes, noise: Noise) -> Experiment:
-    return Experiment(
-        f"s2-{name}-{method}",
-        method,
-        attitudes,
-        noise,
-        tolerance_px=tolerance_for(noise.noise_px),
-        max_false_match_probability=1e-3,
-        seed=2021,
-    )
+    return paper_experiment(f"s2-{name}-{method}", method, attitudes, noise, seed=2021)
 
 
 def _ideal(grid: Attitudes) -> list[Row]:
@@ -103,13 +95,11 @@ def _curve(
         for method in ("dynamic_angle", "triangle"):
             is_own = method == "dynamic_angle"
             attitudes = grid if is_last and is_own else fewer
-            noise = _noise(group, value)
-            slug = f"{group.lower().replace(' ', '-')}-{value:g}"
+            experiment = _experiment(f"{group}-{value:g}", method, attitudes, _noise(group, value))
             published, wanted = (percent, goal) if is_last and is_own else (None, None)
             made.append(
                 Row(group, f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
-                    PRESET, _experiment(slug, method, attitudes, noise), "reference",
-                    published, None, wanted, x=value)
+                    PRESET, experiment, "reference", published, None, wanted, x=value)
             )  # fmt: skip
     return made
 
@@ -154,16 +144,11 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
     made = []
     for method, (label, _, _, percent) in PUBLISHED.items():
         is_own = method == "dynamic_angle"
-        experiment = Experiment(
-            f"s2-barrel-{method}",
-            method,
-            grid if is_own else fewer,
-            Noise(limit_mag=LIMIT_MAG),
-            camera=lens,
-            assumed=told,
-            tolerance_px=BARREL_TOLERANCE_PX,
-            max_false_match_probability=1e-3,
-            seed=2021,
+        undistorted = _experiment(
+            "barrel", method, grid if is_own else fewer, Noise(limit_mag=LIMIT_MAG)
+        )
+        experiment = replace(
+            undistorted, camera=lens, assumed=told, tolerance_px=BARREL_TOLERANCE_PX
         )
         made.append(
             Row("Barrel distortion (table 4)", label, PRESET, experiment, "reference", percent,

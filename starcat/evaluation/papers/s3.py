@@ -12,7 +12,7 @@ from starcat.arrays import Array
 from starcat.evaluation.experiment import Paper, Statistic, catalog_of_artifact
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.order import is_well_shaped
+from starcat.matcher.methods.triangle import is_well_shaped
 
 PRESET = "sao-12deg-512"
 
@@ -104,15 +104,9 @@ def optimised_triangle(
     Distances between the centroids, shape (N, N), are brightest first, and both limits, S3's d_min
     and theta_min, have to be exceeded. Rows ascend; None if no triangle passes.
 
-    Notes
-    -----
-    Start from stars N, N + 1, N + 2. Where a side is too short, its fainter star is dropped,
-    where an angle is too narrow, the faintest of the three; the next star takes its place.
-    When the stars run out, N moves on by one.
-
-    References
-    ----------
-    Li et al. 2015 (S3), the flow chart's 13 steps.
+    The flow chart's 13 steps: start from stars N, N + 1, N + 2. Where a side is too short, its
+    fainter star is dropped, where an angle is too narrow, the faintest of the three; the next star
+    takes its place. When the stars run out, N moves on by one.
     """
     count = len(separation_px)
     for start in range(count - 2):

@@ -11,8 +11,8 @@ from starcat.evaluation.experiment import (
     Paper,
     Row,
     Statistic,
+    paper_experiment,
     product_mib,
-    tolerance_for,
 )
 from starcat.simulation.simulate import Noise
 
@@ -38,15 +38,10 @@ def rows(quick: bool) -> list[Row]:
 
 
 def _experiment(name: str, method: str, count: int, noise: Noise) -> Experiment:
-    return Experiment(
-        f"s4-{name}-{method}",
-        method,
-        Attitudes("random", count),
-        noise,
-        tolerance_px=tolerance_for(noise.noise_px),
-        max_false_match_probability=1.0,
-        seed=2024,
-    )
+    return paper_experiment(
+        f"s4-{name}-{method}", method, Attitudes("random", count), noise,
+        max_false_match_probability=1.0, seed=2024,
+    )  # fmt: skip
 
 
 def _curve(
@@ -61,10 +56,10 @@ def _curve(
     for value in values:
         is_last = value == values[-1]
         for (method, label), percent in zip(METHODS.items(), published, strict=True):
-            slug = f"{group.lower().replace(' ', '-')}-{value:g}"
             made.append(
                 Row(group, f"{label}, {value:g} {unit}", PRESET,
-                    _experiment(slug, method, count, _noise(group, value)), "attitude",
+                    _experiment(f"{group}-{value:g}", method, count, _noise(group, value)),
+                    "attitude",
                     percent if is_last else None, None,
                     goal if is_last and method == "triangle" else None, goal_over="4+", x=value)
             )  # fmt: skip

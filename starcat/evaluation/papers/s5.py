@@ -6,12 +6,11 @@ from pathlib import Path
 
 from starcat.evaluation.experiment import (
     Attitudes,
-    Experiment,
     Paper,
     Row,
     Statistic,
+    paper_experiment,
     product_mib,
-    tolerance_for,
 )
 from starcat.simulation.simulate import Noise
 
@@ -56,19 +55,10 @@ def _point(
 ) -> list[Row]:
     made = []
     for label, (method, answer) in WAYS.items():
-        slug = f"{group}-{value:g}-{label}".lower().replace(",", "").replace(" ", "-")
         # The bare method meets every reference set with every separation.
         frames = count if label != "mean of minima" else max(40, count // 4)
-        experiment = Experiment(
-            f"s5-{slug}",
-            method,
-            Attitudes("random", frames),
-            noise,
-            tolerance_px=tolerance_for(noise.noise_px),
-            max_false_match_probability=1e-3,
-            answer=answer,
-            seed=2005,
-        )
+        name, attitudes = f"s5-{group}-{value:g}-{label}", Attitudes("random", frames)
+        experiment = paper_experiment(name, method, attitudes, noise, answer=answer, seed=2005)
         here = published is not None and value == published[0]
         is_method = label in ("starcat", "mean of minima")
         percent = published[1] if published and here and is_method else None

@@ -5,7 +5,6 @@ Times are part of it, so two evaluations differ; two reports of one evaluation d
 
 from __future__ import annotations
 
-import base64
 import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,7 +27,7 @@ from starcat.evaluation.report.tables import (
     statistic_tables,
     summary_table,
 )
-from starcat.report.page import STYLE, table
+from starcat.report.page import figure, html_page, table
 from starcat.report.plots import save_plot
 
 SHARES = ("by_rule", "by_rule_enough", "starcat", "starcat_enough", "ceiling")
@@ -123,12 +122,6 @@ def write_reproduction(results: Path, docs: Path) -> Path:
     return page
 
 
-def reproduction_page(results: Path) -> str:
-    """Return the page of the documentation from a stored evaluation."""
-    stored = json.loads(results.read_bytes())
-    return reproduction_markdown(stored["evaluations"], stored["machine"], "figures")
-
-
 def _slim(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return an evaluation without what no table shows of its experiments."""
     rows = [
@@ -166,13 +159,7 @@ def evaluation_page(
     ]
     for content in contents:
         parts += _paper_html(content, plots)
-    body = "\n".join(parts)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}{_MORE_STYLE}</style>\n</head>\n"
-        f"<body>\n{body}\n</body>\n</html>\n"
-    )
+    return html_page(title, parts, _MORE_STYLE)
 
 
 def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
@@ -210,9 +197,8 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
         yield f"<h3>{escape(_capital(one.title))}</h3>"
         yield _html(one)
         if one.title in names:
-            data = base64.b64encode(plots[names[one.title]]).decode()
-            alt = escape(f"Curve: {one.title}, rate of identification with intervals")
-            yield f'<figure><img alt="{alt}" src="data:image/svg+xml;base64,{data}"></figure>'
+            alt = f"Curve: {one.title}, rate of identification with intervals"
+            yield figure(alt, plots[names[one.title]])
     for one in _other_tables(content):
         yield f"<h3>{escape(_capital(one.title))}</h3>"
         yield _html(one)
@@ -223,29 +209,31 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
 
 
 def _html(one: Table) -> str:
-    notes = "".join(f"<br>{escape(note)}" for note in one.notes)
-    below = f'<p class="notes">{notes[4:]}</p>' if notes else ""
+    notes = "<br>".join(map(escape, one.notes))
+    below = f'<p class="notes">{notes}</p>' if notes else ""
     return f'<div class="rates">{table("", one.heads, one.rows, one.numbers)}</div>{below}'
 
 
-def reproduction_markdown(contents: Sequence[Content], machine: str, figures: str) -> str:
-    """Return an evaluation as Markdown."""
+def reproduction_page(results: Path) -> str:
+    """Return the page of the documentation, Markdown, from a stored evaluation."""
+    stored = json.loads(results.read_bytes())
+    contents = stored["evaluations"]
     summary = summary_table(contents)
     parts = [
         "<!-- Generated from reproduction.json by `make docs`; no figure is typed by hand. -->",
         "# Reproduction\n\nWhat the papers print, what starcat measures, and the difference. "
-        f"`starcat evaluate --paper all`\nmakes all of it. Times: {machine}.",
+        f"`starcat evaluate --paper all`\nmakes all of it. Times: {stored['machine']}.",
         *([_markdown(summary)] if summary else []),
         "## What the columns mean",
         _grid(("column", "meaning"), legend(contents), ()),
         _grid(("rule", "a frame is a success if"), rules_of(contents), ()),
     ]
     for content in contents:
-        parts += _paper_markdown(content, figures)
+        parts += _paper_markdown(content)
     return "\n\n".join(parts) + "\n"
 
 
-def _paper_markdown(content: Content, figures: str) -> Iterator[str]:
+def _paper_markdown(content: Content) -> Iterator[str]:
     yield f"## {_heading(content)}"
     if content["citation"]:
         yield content["citation"]
@@ -254,7 +242,7 @@ def _paper_markdown(content: Content, figures: str) -> Iterator[str]:
         yield f"### {_capital(one.title)}"
         yield _markdown(one)
         if one.title in names:
-            yield f"![{_capital(one.title)}]({figures}/{names[one.title]}.svg)"
+            yield f"![{_capital(one.title)}](figures/{names[one.title]}.svg)"
     for one in _other_tables(content):
         yield f"### {_capital(one.title)}"
         yield _markdown(one)

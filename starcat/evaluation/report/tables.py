@@ -31,13 +31,7 @@ def percent(value: float | None) -> str:
 
 
 def milliseconds(value: float | None) -> str:
-    """Return a time as text: two digits, as a second run would not agree in the third.
-
-    Examples
-    --------
-    >>> [milliseconds(value) for value in (0.0434, 7.21, 68.45, 367.4, None)]
-    ['0.043', '7.2', '68', '370', '']
-    """
+    """Return a time as text: two digits, as a second run would not agree in the third."""
     if value is None:
         return ""
     if value <= 0.0:

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
+from starcat.matcher.star_cells import rows_between
 
 BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
@@ -194,16 +194,13 @@ RANKS = (1, 5, 20)
 class Surroundings:
     """The centroids around one of them, the nearest first."""
 
-    # Rows of the observation.
-    centroids: Rows
-    # Separation from the reference star, radians; shape (n,).
-    separation_rad: Array
+    centroids: Rows  # rows of the observation
+    separation_rad: Array  # separation from the reference star, radians; shape (n,)
     # Position angle at the reference star, radians, -pi to pi. It runs counter-clockwise on the
     # sky as seen, from an arbitrary axis: only differences have a meaning; shape (n,).
     position_angle_rad: Array
 
     def __len__(self) -> int:
-        """Return the number of centroids around."""
         return len(self.centroids)
 
 
@@ -255,18 +252,3 @@ def by_reference(
                 np.concatenate([part.centroids for part in batch]),
                 np.concatenate([part.stars for part in batch]),
             )
-
-
-def rows_between(
-    start: NDArray[np.integer[Any]], stop: NDArray[np.integer[Any]]
-) -> tuple[Rows, Rows]:
-    """Return run and row of each entry of several runs of rows, given their starts and stops.
-
-    Examples
-    --------
-    >>> rows_between(np.array([5, 2, 9]), np.array([7, 2, 10]))
-    (array([0, 0, 2]), array([5, 6, 9]))
-    """
-    count = stop - start
-    run = np.repeat(np.arange(len(count)), count)
-    return run, np.arange(len(run)) + np.repeat(start - np.cumsum(count) + count, count)

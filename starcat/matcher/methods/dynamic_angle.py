@@ -1,24 +1,30 @@
-"""Identification by dynamic angles (S2): neighbours in counter-clockwise order.
+"""Identification by dynamic angles (S2): neighbours in counter-clockwise order, then pair voting.
 
 The angle from one neighbour of a reference star to the next, and that neighbour's separation,
 lead to stars that have the same. With the two neighbours laid upon each other, the neighbours
-that agree in angle and separation are counted. Where no reference star leads to an answer, every
-pair of the frame is a base (`pair_voting`). Needs the product ``neighbours``.
+that agree in angle and separation are counted. Needs the product ``neighbours``.
+
+That needs a star whose neighbours are mostly in the frame and mostly guide stars. Where a camera
+misses stars and sees others, few fields have one. Where no reference star leads to an answer, every
+pair of the frame is therefore a base: it is laid upon every two stars that are as far apart, and
+the other centroids are looked up in the sky. A field of four known stars is found like this,
+whatever is missing and whatever else is seen. It takes ten times as long as a neighbourhood.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import bin_of
+from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.consensus import Surroundings, by_reference, rows_between, surroundings
-from starcat.matcher.methods.pair_voting import bases
+from starcat.matcher.methods.consensus import Surroundings, by_reference, surroundings
 from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
+from starcat.matcher.star_cells import cells_for, rows_between
 
 _TURN = 2.0 * np.pi
 
@@ -27,22 +33,11 @@ PASSED_OVER = (2, 3, 4)
 centroids between, some may be no guide stars."""
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """How far angles and separations may be off."""
-
-    # S2's eps_dis.
-    separation_rad: float
-    # S2's eps_ang; None for what ``separation_rad`` across makes of the angle.
-    angle_rad: float | None = None
-
-    def between(self, one: Array, other: Array) -> Array:
-        """Return the largest error of the angle between neighbours of these separations."""
-        if self.angle_rad is not None:
-            return np.full(np.shape(one), self.angle_rad)
-        least = self.separation_rad / np.pi
-        one, other = np.maximum(one, least), np.maximum(other, least)
-        return self.separation_rad * np.hypot(1.0 / one, 1.0 / other)
+def angle_tolerance_rad(tolerance_rad: float, one: Array, other: Array) -> Array:
+    """Return the largest error of the angle between neighbours of these separations."""
+    least = tolerance_rad / np.pi
+    one, other = np.maximum(one, least), np.maximum(other, least)
+    return tolerance_rad * np.hypot(1.0 / one, 1.0 / other)
 
 
 def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -50,21 +45,16 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
     At the end three stars each are proposed, of all pairs of the frame (Sun et al. 2021, S2).
     """
-    tolerance = Tolerance(observation.side_tolerance_rad)
 
     def propose(steps: tuple[int, ...]) -> Callable[[int], Candidates]:
-        return lambda reference: rank_stars(observation, database, reference, tolerance, steps)[0]
+        return lambda reference: rank_stars(observation, database, reference, steps)[0]
 
     yield from by_reference(observation, propose((1,)), propose(PASSED_OVER))
     yield from bases(observation, database)
 
 
 def rank_stars(
-    observation: Observation,
-    database: Database,
-    reference: int,
-    tolerance: Tolerance,
-    steps: tuple[int, ...] = (1,),
+    observation: Observation, database: Database, reference: int, steps: tuple[int, ...] = (1,)
 ) -> tuple[Candidates, Array]:
     """Return the stars that a reference star may be, the best first, and their scores.
 
@@ -72,12 +62,12 @@ def rank_stars(
     S2's S (eq. 9), the share of the observed neighbours that agree; of equal stars those with
     fewer neighbours come first. S2's answer is the best star of the first of `references`.
     """
-    product = database.products["neighbours"]
+    product, tolerance_rad = database.products["neighbours"], observation.side_tolerance_rad
     # The radius is not among the product's numbers; its largest separation does as well.
     around = surroundings(observation, reference, product["separation_rad"].max(initial=0.0))
-    found = [_look_up(around, product, tolerance, step) for step in steps]
+    found = [_look_up(around, product, tolerance_rad, step) for step in steps]
     started, begin = (np.concatenate(part) for part in zip(*found, strict=True))
-    start, observed, row = _walk(started, begin, around, product, tolerance)
+    start, observed, row = _walk(started, begin, around, product, tolerance_rad)
     agrees = np.zeros((len(begin), len(around)), dtype=bool)
     agrees[start, observed] = True
     count = agrees.sum(axis=1)
@@ -97,7 +87,7 @@ def rank_stars(
 
 
 def _look_up(
-    around: Surroundings, product: ProductArrays, tolerance: Tolerance, steps: int
+    around: Surroundings, product: ProductArrays, tolerance_rad: float, steps: int
 ) -> tuple[Rows, Rows]:
     """Return neighbours of a reference star and the product's rows that they may be.
 
@@ -109,9 +99,9 @@ def _look_up(
     if len(order) < steps:
         return order[:0], order[:0]
     step = np.append(angle[steps:], angle[:steps] + _TURN) - angle
-    error = tolerance.between(apart, np.roll(apart, -steps))
+    error = angle_tolerance_rad(tolerance_rad, apart, np.roll(apart, -steps))
     least, most = np.maximum(step - error, 0.0), np.minimum(step + error, _TURN)
-    near, far = np.maximum(apart - tolerance.separation_rad, 0.0), apart + tolerance.separation_rad
+    near, far = np.maximum(apart - tolerance_rad, 0.0), apart + tolerance_rad
     numbers = product.numbers
     separations = int(numbers["n_separation_bins"])
     table = numbers["angle_bin_rad"], numbers["separation_bin_rad"], int(numbers["n_angle_bins"])
@@ -124,13 +114,13 @@ def _look_up(
     offsets = product["lookup_offsets"]
     run, entry = rows_between(offsets[first], offsets[last + 1])
     observed, row = observed[run], product["lookup_rows"][entry].astype(np.intp)
-    fits = np.abs(product["separation_rad"][row] - apart[observed]) <= tolerance.separation_rad
+    fits = np.abs(product["separation_rad"][row] - apart[observed]) <= tolerance_rad
     fits &= np.abs(product["successive_angle_rad"][row] - step[observed]) <= error[observed]
     return order[observed[fits]], row[fits]
 
 
 def _walk(
-    started: Rows, begin: Rows, around: Surroundings, product: ProductArrays, tolerance: Tolerance
+    started: Rows, begin: Rows, around: Surroundings, product: ProductArrays, tolerance_rad: float
 ) -> tuple[Rows, Rows, Rows]:
     """Return the start, the observed neighbour and the product's row of all that agree.
 
@@ -139,14 +129,91 @@ def _walk(
     """
     star, offsets = product["star"][begin].astype(np.intp), product["star_offsets"]
     begun, row = rows_between(offsets[star], offsets[star + 1])
-    apart, reach = around.separation_rad, tolerance.separation_rad
-    low = np.searchsorted(apart, product["separation_rad"][row] - reach, side="left")
-    high = np.searchsorted(apart, product["separation_rad"][row] + reach, side="right")
+    apart = around.separation_rad
+    low = np.searchsorted(apart, product["separation_rad"][row] - tolerance_rad, side="left")
+    high = np.searchsorted(apart, product["separation_rad"][row] + tolerance_rad, side="right")
     pair, observed = rows_between(low, high)
     begun, row = begun[pair], row[pair]
     origin = started[begun]
     turn = product["position_angle_rad"][row] - product["position_angle_rad"][begin[begun]]
     turn -= around.position_angle_rad[observed] - around.position_angle_rad[origin]
     turn -= _TURN * np.round(turn / _TURN)
-    fits = np.abs(turn) <= tolerance.between(apart[observed], apart[origin])
+    fits = np.abs(turn) <= angle_tolerance_rad(tolerance_rad, apart[observed], apart[origin])
     return begun[fits], observed[fits], row[fits]
+
+
+LEAST_OTHERS = 2
+"""Centroids beside the base that have to be near a star: four in all, as an answer needs."""
+
+REACH = 3.0
+"""Largest distance of another centroid from its star, in units of the tolerance. It is larger than
+that of an agreement, as two stars leave more of an error in an attitude."""
+
+MOST_PLACES = 2**20
+"""Largest number of places in the sky that a frame is looked up at: some tenths of a second."""
+
+
+def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose what two centroids and a third one are, a batch for each pair of the frame.
+
+    At least one further centroid is near a star then. The pairs are those up to the radius of the
+    product ``neighbours``, of the first centroids of the observation first: these are the brightest
+    ones where magnitudes are known.
+    """
+    order, apart_rad = database.cached(_by_separation)
+    if not len(order):
+        return
+    tolerance_rad = observation.side_tolerance_rad
+    second, first = np.tril_indices(len(observation), -1)
+    separation_rad = observation.separation_rad[first, second]
+    low = np.searchsorted(apart_rad, separation_rad - tolerance_rad, side="left")
+    high = np.searchsorted(apart_rad, separation_rad + tolerance_rad, side="right")
+    places = np.cumsum(high - low) * max(0, len(observation) - 2)
+    for one, other, begin, end in zip(
+        *(ends[places <= MOST_PLACES].tolist() for ends in (first, second, low, high)), strict=True
+    ):
+        observation.budget.spend(LOOKUP + end - begin)
+        found = _on_base(one, other, order[begin:end], observation, database)
+        if len(found):
+            yield found
+
+
+def _on_base(
+    one: int, other: int, rows: Rows, observation: Observation, database: Database
+) -> Candidates:
+    """Return which pairs of stars put enough of the other centroids near a star, with a third."""
+    product = database.products["neighbours"]
+    stars = np.stack([product["star"][rows], product["neighbour"][rows]], axis=-1).astype(np.intp)
+    others = np.delete(np.arange(len(observation)), [one, other])
+    seen = observation.body[others] @ _axes(observation.body[one], observation.body[other]).T
+    icrs = seen @ _axes(*np.moveaxis(database.directions[stars], 1, 0))
+    reach_rad = REACH * observation.tolerance_rad
+    near = cells_for(database, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
+    near = near.reshape(len(rows), len(others))
+    row, third = np.nonzero(near & (near.sum(axis=1) >= LEAST_OTHERS)[:, None])
+    star = (icrs[row, third] @ database.directions.T).argmax(axis=1)
+    ends = np.broadcast_to([one, other], (len(row), 2))
+    found = Candidates(np.column_stack([ends, others[third]]), np.column_stack([stars[row], star]))
+    u = database.directions[found.stars]
+    error = (
+        separation(u[:, :2], u[:, 2:]) - observation.separation_rad[found.centroids[:, 2:], ends]
+    )
+    return found[np.all(np.abs(error) <= observation.side_tolerance_rad, axis=1)]
+
+
+def _axes(one: Array, other: Array) -> Array:
+    """Return axes that go with two directions: their middle, across it, across both.
+
+    Laying the axes of two pairs upon each other is the attitude of least squares.
+    """
+    middle, across = one + other, np.cross(one, other)
+    middle /= np.sqrt(np.einsum("...i,...i->...", middle, middle))[..., None]
+    across /= np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]
+    return np.stack([middle, np.cross(across, middle), across], axis=-2)
+
+
+def _by_separation(database: Database) -> tuple[Rows, Array]:
+    """Return the rows of the product by separation, and the separations in this order."""
+    apart_rad = np.asarray(database.products["neighbours"]["separation_rad"])
+    order = np.argsort(apart_rad, kind="stable")
+    return order, apart_rad[order]

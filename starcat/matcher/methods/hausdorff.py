@@ -36,11 +36,11 @@ from starcat.matcher.methods.consensus import (
     consistent_candidates,
     neighbour_candidates,
     references,
-    rows_between,
     surroundings,
 )
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
+from starcat.matcher.star_cells import rows_between
 
 FIRST_ROUND = (16, 5)
 """Number of the first centroids that take part, and number of names that each of them gets."""
@@ -121,7 +121,6 @@ def rank_by_separations(
 def _add_differences(
     total: Array, sets: ReferenceSets, apart: Array, a: Rows, b: Rows, cap_rad: float
 ) -> None:
-    """Add the smallest differences of pairs of centroids to both centroids' totals."""
     number, star, gain = within_reach(sets, apart[a, b], np.full(len(a), cap_rad))
     for end in (a, b):
         place = end[number] * len(sets) + star
@@ -166,7 +165,7 @@ def likely_stars(
     Distances d err by e each, so d/d' errs by ``e/d' sqrt(1 + (d/d')^2)``: that is where a
     difference ceases to count for more.
     """
-    _, distance = distances_around(observation, database, reference)
+    distance = distances_around(observation, database, reference)
     error = observation.side_tolerance_rad
     best = [np.empty(0, dtype=np.intp)]
     for divisor in range(min(divisors, len(distance) - 1)):
@@ -185,13 +184,12 @@ def likely_stars(
 
 def distances_around(
     observation: Observation, database: Database, reference: int, radius_rad: float | None = None
-) -> tuple[Rows, Array]:
-    """Return centroids around one and their distances, if not 0, in focal lengths, ascending."""
+) -> Array:
+    """Return the distances of the centroids around one, if not 0, in focal lengths, ascending."""
     if radius_rad is None:
         radius_rad = database.products["hausdorff_l2"].numbers["radius_rad"]
-    around = surroundings(observation, reference, radius_rad)
-    apart = around.separation_rad > 0.0
-    return around.centroids[apart], np.tan(around.separation_rad[apart])
+    apart_rad = surroundings(observation, reference, radius_rad).separation_rad
+    return np.tan(apart_rad[apart_rad > 0.0])
 
 
 def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
@@ -280,17 +278,14 @@ class ReferenceSets:
     # The members of star n are ``offsets[n]:offsets[n + 1]``, when they are sorted by star; shape
     # (S + 1,).
     offsets: NDArray[np.int64]
-    # The members of all stars, ascending; shape (M,).
-    value: Array
-    # The star that each member of ``value`` belongs to.
-    star: Rows
+    value: Array  # the members of all stars, ascending; shape (M,)
+    star: Rows  # the star that each member of ``value`` belongs to
     # Each member of ``value`` is the nearest of its star's members to all numbers from ``low`` up
     # to ``high``, the latter excluded; shape (M,).
     low: Array
     high: Array
 
     def __len__(self) -> int:
-        """Return the number of stars."""
         return len(self.offsets) - 1
 
 

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from starcat.arrays import Rows
-from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
-from starcat.matcher.methods.order import select_triangles
+from starcat.matcher.methods.triangle import select_triangles
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
+from starcat.matcher.star_cells import rows_between
 
 
 def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -66,9 +66,7 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
     order = np.argsort(first_c, kind="stable")
     first_c, star_c = first_c[order], star_c[order]
     low = np.searchsorted(first_c, first_b, side="left")
-    count = np.searchsorted(first_c, first_b, side="right") - low
-    left = np.repeat(np.arange(len(first_b)), count)
-    right = np.arange(len(left)) + np.repeat(low - np.cumsum(count) + count, count)
+    left, right = rows_between(low, np.searchsorted(first_c, first_b, side="right"))
     v, w = database.directions[star_b[left]], database.directions[star_c[right]]
     fits = np.abs(separation(v, w) - apart[b, c]) <= tolerance_rad
     left, v, w = left[fits], v[fits], w[fits]
@@ -84,12 +82,7 @@ def directed_pairs(
 ) -> tuple[Rows, Rows]:
     """Return the first and second stars of the pairs of about a separation, in both directions."""
     product = database.products["pairs"]
-    index = KVector(
-        product["separation_rad"],
-        product["kvector_counts"],
-        product.numbers["kvector_intercept"],
-        product.numbers["kvector_slope"],
-    )
+    index = product.kvector("separation_rad")
     rows = index.exact(separation_rad - tolerance_rad, separation_rad + tolerance_rad)
     i, j = product["i"][rows], product["j"][rows]
     return np.concatenate([i, j]), np.concatenate([j, i])
@@ -98,7 +91,6 @@ def directed_pairs(
 def _with_apex(
     stars: Rows, triangle: Rows, apex: int, observation: Observation, database: Database
 ) -> Rows:
-    """Return the triangles that some star makes a pyramid of, with that star."""
     wanted = observation.separation_rad[triangle, apex]
     tolerance_rad = observation.side_tolerance_rad
     first, fourth = directed_pairs(database, float(wanted[0]), tolerance_rad)

@@ -28,11 +28,11 @@ from starcat.matcher.methods.consensus import (
     by_reference,
     consistent_candidates,
     references,
-    rows_between,
     surroundings,
 )
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
+from starcat.matcher.star_cells import rows_between
 
 ALIGNMENTS = 2
 """How many neighbours are tried as the alignment neighbour: the nearest may be a false star."""
@@ -56,34 +56,17 @@ def grid_candidates(observation: Observation, database: Database) -> Iterator[Ca
     )
 
 
-def rank_by_cells(
-    observation: Observation, database: Database, reference: int, *, most: int = MOST_STARS
-) -> tuple[Rows, NDArray[np.int64]]:
-    """Rank the stars that a reference star may be by the number of cells in common.
-
-    The best first; of equal ones those that occupy fewer cells. None without an alignment
-    neighbour. The best star of the reference star nearest to the centre is the paper's own answer.
-    """
-    product = database.products["grid"]
-    around = surroundings(observation, reference, product.numbers["radius_rad"])
-    alignment = _alignment(around, product, 0)
-    if alignment is None:
-        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.int64)
-    rows, votes = _most_votes(around, alignment, observation.tolerance_rad, product, most)
-    return product["star"][rows].astype(np.intp), votes
-
-
 def _aligned(
     observation: Observation, database: Database, choice: int, reference: int
 ) -> Candidates:
     """Return a reference star's candidates whose alignment star is as far as its neighbour."""
     product = database.products["grid"]
     around = surroundings(observation, reference, product.numbers["radius_rad"])
-    alignment = _alignment(around, product, choice)
+    alignment = alignment_of(around, product, choice)
     if alignment is None:
         nothing = np.zeros((0, 2), dtype=np.intp)
         return Candidates(nothing, nothing)
-    rows, _ = _most_votes(around, alignment, observation.tolerance_rad, product, MOST_STARS)
+    rows, _ = most_votes(around, alignment, observation.tolerance_rad, product, MOST_STARS)
     stars = np.stack([product["star"][rows], product["alignment_star"][rows]], axis=-1)
     u = database.directions[stars.astype(np.intp)]
     difference = separation(u[:, 0], u[:, 1]) - around.separation_rad[alignment]
@@ -92,14 +75,14 @@ def _aligned(
     return Candidates(np.broadcast_to(centroids, stars.shape), stars)
 
 
-def _alignment(around: Surroundings, product: ProductArrays, choice: int) -> int | None:
+def alignment_of(around: Surroundings, product: ProductArrays, choice: int) -> int | None:
     """Return the nearest neighbour beyond the buffer, or the next nearest ones."""
     buffer_rad = product.numbers["buffer_rad"]
     first = int(np.searchsorted(around.separation_rad, buffer_rad, side="right"))
     return first + choice if first + choice < len(around) else None
 
 
-def _most_votes(
+def most_votes(
     around: Surroundings, alignment: int, tolerance_rad: float, product: ProductArrays, most: int
 ) -> tuple[Rows, NDArray[np.int64]]:
     """Return the product's rows of most votes, and the votes."""

@@ -21,19 +21,14 @@ class Method:
     # Yields batches of candidates for an observation, the most promising first. What a method is
     # told beside the frame are the settings of the observation.
     propose: Callable[[Observation, Database], Iterator[Candidates]]
-    # Products that it needs beside the stars.
-    products: tuple[str, ...]
+    products: tuple[str, ...]  # products that it needs beside the stars
     description: str = ""
-    # Products that it can use where they are there.
-    optional: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()  # products that it can use where they are there
 
 
 METHODS: dict[str, Method] = {
     "triangle": Method(
-        triangle.candidates,
-        ("triangles",),
-        "area and circumradius of triangles (S4)",
-        ("levels",),
+        triangle.candidates, ("triangles",), "area and circumradius of triangles (S4)", ("levels",)
     ),
     "pairs": Method(pairs.pair_candidates, ("pairs",), "triangles joined from star pairs"),
     "pyramid": Method(pairs.pyramid_candidates, ("pairs",), "such triangles with a fourth star"),

@@ -1,5 +1,11 @@
 """Identification by triangles (S4): area in the K-vector, circumradius as the filter.
 
+The order in which triangles of centroids are looked up is that of three methods. Triangles of the
+brightest stars are first where magnitudes are known, as in S3; otherwise the most compact ones are,
+which in a crowded frame are taken from all over it. The order of S4, by the radius of the inscribed
+circle, can be chosen. Triangles with a short side or a narrow angle are left out, because the two
+centroids of a double star, or three centroids in a line, identify little.
+
 Where the focal length is not known, triangles are looked up by shape, the area over the squared
 circumradius, which is the same for similar triangles, and then by a range of areas. The method
 needs the product ``triangles``, in order of area; that of shape is made when first needed. The
@@ -11,18 +17,120 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from functools import lru_cache
+from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask, Rows
-from starcat.geometry.kvector import KVector
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.order import select_triangles
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.settings import LOOKUP
+from starcat.matcher.settings import LOOKUP, TriangleOrder
+
+LEAST_ANGLE_DEG = 4.0
+"""Smallest angle of a triangle that is tried at all."""
+
+NEIGHBOURS = 20
+"""Number of the nearest centroids that a centroid makes triangles with in the order ``spread``."""
+
+SPREAD_CENTROIDS = 400
+"""Largest number of centroids of that order; more would take seconds to put in order."""
+
+
+def select_triangles(observation: Observation) -> NDArray[np.intp]:
+    """Return the triangles of a frame in the order in which they are to be looked up.
+
+    Rows of the observation, shape (T, 3), ascending within a triangle.
+    """
+    selection = observation.settings.selection
+    count = min(len(observation), selection.most_centroids)
+    is_crowded = count < len(observation) and observation.mag is None
+    if selection.order == "spread" or (selection.order == "auto" and is_crowded):
+        return _spread(observation, selection)
+    stars = _triples(count)
+    a, b, c = _sides(observation.separation_rad, stars)
+    side = selection.min_side_px / observation.camera.focal_length_px
+    good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
+    known = observation.mag is not None
+    if selection.order == "brightness" or (selection.order == "auto" and known):
+        order = np.arange(len(stars))
+    elif selection.order == "inradius":
+        order = np.argsort(-_squared_inradius(a, b, c), kind="stable")
+    else:
+        order = np.argsort(np.maximum(np.maximum(a, b), c), kind="stable")
+    good = good[order]
+    if count > selection.few_centroids:
+        return np.asarray(stars[order[good]])
+    poor = is_well_shaped(a, b, c, observation.tolerance_rad, np.radians(LEAST_ANGLE_DEG))[order]
+    return np.asarray(stars[np.concatenate([order[good], order[poor & ~good]])])
+
+
+def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.intp]:
+    """Return triangles of near centroids from all over a frame, a round of all centroids at a time.
+
+    A database holds the triangles of the brightest stars of its fields. In a crowded frame most
+    stars are fainter, and the compact triangles of one place are often of the same few stars: if
+    one of these is faint, none of the triangles is held.
+    """
+    count = min(len(observation), SPREAD_CENTROIDS)
+    apart = observation.separation_rad[:count, :count]
+    most = min(NEIGHBOURS, count - 1)
+    near = np.argsort(apart, axis=1, kind="stable")[:, 1 : most + 1]
+    first, second = np.triu_indices(most, 1)
+    owner = np.repeat(np.arange(count), len(first))
+    stars = np.sort(
+        np.stack([owner, near[:, first].ravel(), near[:, second].ravel()], axis=-1), axis=-1
+    )
+    i, j, k = stars.T
+    _, fresh = np.unique((i * count + j) * count + k, return_index=True)
+    owner, stars = owner[fresh], stars[fresh]
+    a, b, c = _sides(apart, stars)
+    side = selection.min_side_px / observation.camera.focal_length_px
+    good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
+    owner, stars = owner[good], stars[good]
+    longest = np.maximum(np.maximum(a, b), c)[good]
+    order = np.lexsort((longest, owner))
+    own = owner[order]
+    turn = np.arange(len(own)) - np.searchsorted(own, own)
+    return np.asarray(stars[order][np.lexsort((longest[order], turn))])
+
+
+def is_well_shaped(
+    a: Array, b: Array, c: Array, min_side: float, min_angle_rad: float
+) -> NDArray[np.bool_]:
+    """Return which triangles have longer sides and wider angles than these, shape (T,).
+
+    Sides of shape (T,), in the unit of ``min_side``; the least angle is below pi / 3.
+    """
+    shortest = np.minimum(np.minimum(a, b), c)
+    longest = np.maximum(np.maximum(a, b), c)
+    middle = a + b + c - shortest - longest
+    # The law of cosines for the angle opposite the shortest side.
+    cosine = middle * middle + longest * longest - shortest * shortest
+    wide = cosine < 2.0 * np.cos(min_angle_rad) * middle * longest
+    return np.asarray((shortest > min_side) & wide)
+
+
+def _sides(separation_rad: Array, stars: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Return the sides opposite the first, second and third star of triangles."""
+    i, j, k = stars.T
+    return separation_rad[j, k], separation_rad[i, k], separation_rad[i, j]
+
+
+def _squared_inradius(a: Array, b: Array, c: Array) -> Array:
+    """Return the squared inradius (S4, eq. 7) of plane triangles."""
+    half = 0.5 * (a + b + c)
+    return (half - a) * (half - b) * (half - c) / half
+
+
+@lru_cache(maxsize=64)
+def _triples(count: int) -> NDArray[np.intp]:
+    """Return all triples, those whose last member comes early first."""
+    found = sorted(combinations(range(count), 3), key=lambda triple: triple[::-1])
+    return np.array(found, dtype=np.intp).reshape(-1, 3)
+
 
 BATCHES = (2, 8, 32)
 """Sizes of the first batches of observed triangles; all later batches have the last size."""
@@ -67,9 +175,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 def _look_up(triangles: Rows, observation: Observation, database: Database) -> Candidates:
     """Return the triangles of stars with the area and circumradius of observed ones."""
     product = database.products["triangles"]
-    i, j, k = triangles.T
-    apart = observation.separation_rad
-    sides = np.stack([apart[j, k], apart[i, k], apart[i, j]], axis=-1)
+    sides = np.stack(_sides(observation.separation_rad, triangles), axis=-1)
     tolerance_rad = observation.side_tolerance_rad
     if observation.fov_error:
         found = similar_triangles(sides, tolerance_rad, observation, database)
@@ -86,14 +192,7 @@ def _look_up(triangles: Rows, observation: Observation, database: Database) -> C
 
 
 def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) -> list[Rows]:
-    """Return the rows of the triangles with the area and circumradius of observed ones."""
-    by_area = KVector(
-        product["area_rad2"],
-        product["kvector_counts"],
-        product.numbers["kvector_intercept"],
-        product.numbers["kvector_slope"],
-    )
-    radii, found = product["circumradius_rad"], []
+    by_area, radii, found = product.kvector("area_rad2"), product["circumradius_rad"], []
     for a, b, c in sides.tolist():
         area, area_error, radius, radius_error = features(a, b, c, tolerance_rad)
         near = by_area.range(area - area_error, area + area_error)
@@ -103,11 +202,7 @@ def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) 
 
 
 def _with_sides(
-    rows: Rows,
-    observed: Rows,
-    sides: Array,
-    tolerance_rad: float,
-    database: Database,
+    rows: Rows, observed: Rows, sides: Array, tolerance_rad: float, database: Database
 ) -> tuple[Rows, Rows]:
     """Return the triangles of stars whose sides, by length, are as long as those observed.
 
@@ -186,11 +281,6 @@ def scale_free(
     Sides and their common error in radians. The errors treat those of the three sides as
     independent. That of the shape has a term of second order, since the shape is largest, and
     stationary, where the sides are equal.
-
-    Examples
-    --------
-    >>> round(scale_free(1.0, 1.0, 1.0, 0.0)[0], 3)
-    1.299
     """
     area, slopes = area_and_slopes(a, b, c)
     shape = 16.0 * area**3 / (a * b * c) ** 2
@@ -204,13 +294,10 @@ def scale_free(
 class Shapes:
     """Triangles of stars in order of their shape."""
 
-    # Area over squared circumradius, ascending: 0 in a line, 1.299 with equal sides.
-    shape: Array
+    shape: Array  # area over squared circumradius, ascending: 0 in a line, 1.299 with equal sides
     area_rad2: NDArray[np.float32]
-    # The shortest first, shape (3, M).
-    sides_rad: NDArray[np.float32]
-    # Rows of the product.
-    rows: Rows
+    sides_rad: NDArray[np.float32]  # the shortest first, shape (3, M)
+    rows: Rows  # rows of the product
 
 
 def sides_by_length(database: Database) -> NDArray[np.float32]:
@@ -242,13 +329,13 @@ def similar_triangles(
 
     Sides, shape (T, 3), are those with the focal length that was given, radians.
     """
-    known, scales, found = database.cached(shapes), observation.focal_range, []
+    known, (shortest, longest), found = database.cached(shapes), observation.focal_range, []
     for a, b, c in sides.tolist():
         shape, shape_error, area, area_error = scale_free(a, b, c, tolerance_rad)
         first, last = np.searchsorted(known.shape, (shape - shape_error, shape + shape_error))
         part = known.area_rad2[first:last]
-        smallest = (area - area_error) / scales.high**2
-        largest = (area + area_error) / scales.low**2
+        smallest = (area - area_error) / longest**2
+        largest = (area + area_error) / shortest**2
         near = first + np.flatnonzero((part >= smallest) & (part <= largest))
         # The order in which both are by length fits best; what fails so, fails in every order.
         apart = known.sides_rad[:, near]
@@ -270,8 +357,9 @@ def are_similar(
     (a, b, c), (u, v, w) = sides, apart
     scale = (a * u + b * v + c * w) / (u * u + v * v + w * w)
     bend = CURVATURE * observation.fov_error * observation.camera.radius_rad**2
-    allowed, slack = observation.focal_range, tolerance_rad / np.minimum(np.minimum(a, b), c)
-    good = (scale >= allowed.low - slack) & (scale <= allowed.high + slack)
+    shortest, longest = observation.focal_range
+    slack = tolerance_rad / np.minimum(np.minimum(a, b), c)
+    good = (scale >= shortest - slack) & (scale <= longest + slack)
     for side, true in ((a, u), (b, v), (c, w)):
         good &= np.abs(true * scale - side) <= tolerance_rad + bend * side
     return np.asarray(good)

@@ -38,7 +38,7 @@ class CatalogFacts(BaseModel):
     records: int | None = Field(None, description="Records of the whole archive.")
     citation: str = Field(description="How to cite it.")
     licence: str = Field(description="Terms that it comes under.")
-    read: list[ReadFacts] = Field(description="What is known of it from estimates so far.")
+    read: list[ReadFacts] = Field(description="Figures known from earlier estimates.")
     hint: str | None = Field(None, description="What to do where it is not here.")
 
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Path, Query, Request
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
 from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import Artifact
-from starcat.errors import TargetMissing
+from starcat.errors import ProductError, TargetMissing
 from starcat.releases.tree import Blob
+from starcat.report.coverage_map import Fields
 from starcat.service.access import Publisher, Reader
 from starcat.service.library import Database
 from starcat.service.problems import Problem
@@ -32,7 +37,7 @@ from starcat.service.transfers import (
 router = APIRouter(prefix="/databases", tags=["databases"])
 
 DatabaseId = Annotated[
-    str, Path(description="Sixteen hexadecimal digits.", examples=["0123456789abcdef"])
+    str, PathParameter(description="Sixteen hexadecimal digits.", examples=["0123456789abcdef"])
 ]
 
 REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report/coverage.csv"
@@ -44,13 +49,13 @@ class DatabaseFacts(BaseModel):
     """What a database was made from, and what it holds."""
 
     id: str = Field(
-        description="Beginning of the digest of what it was made from.",
+        description="First digits of the digest of its inputs and spec.",
         examples=["0123456789abcdef"],
     )
     name: str = Field(examples=["gaia-12deg"])
     version: str = Field(examples=["1.0.0"])
     title: str = Field(description="Name of its folder.", examples=["gaia-12deg-1.0.0"])
-    description: str = Field(description="What the spec says of it.")
+    description: str = Field(description="Description from the spec.")
     frame: str = Field(description="Axes of all positions.", examples=["ICRS"])
     epoch_jyear: float = Field(description="Epoch of all positions, Julian year.")
     catalog: str = Field(description="The star catalog.", examples=["gaia"])
@@ -153,9 +158,8 @@ def coverage(
     if has_already(request, digest):
         return Response(status_code=304, headers=headers)
     summary = json.loads((found.folder / COVERAGE).read_bytes())
-    names, *lines = (found.folder / FIELDS).read_text("ascii").splitlines()
-    columns = zip(*(map(json.loads, line.split(",")) for line in lines), strict=True)
-    fields = dict(zip(names.split(","), columns, strict=True))
+    fields = {name: column.tolist() for name, column in vars(fields_of(found)).items()}
+    fields = {"boresight": list(range(len(fields["stars"]))), **fields}
     return JSONResponse({"summary": summary, "fields": fields}, headers=headers)
 
 
@@ -171,9 +175,29 @@ async def difference(
 ) -> dict[str, Any]:
     """Return what differs: spec, sources, software, stars and why, products.
 
-    ``counts`` says how many stars came, went and moved, however many are listed.
+    ``counts`` says how many stars were added, removed and moved, however many are listed.
     """
     return await service.query_pool.run(_difference, service, database, other, most)
+
+
+def fields_of(database: Database) -> Fields:
+    """Read the fields of a database."""
+    path = database.folder / FIELDS
+    try:
+        return _read_fields(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError) as error:
+        raise ProductError(
+            f"{database.title}: {FIELDS} cannot be read ({type(error).__name__}); build the "
+            "database again",
+            path=path,
+        ) from error
+
+
+@lru_cache(maxsize=16)
+def _read_fields(path: Path, changed_ns: int) -> Fields:
+    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, usecols=range(1, 6))
+    ra_deg, dec_deg, *counts = table.T
+    return Fields(ra_deg, dec_deg, *(one.astype(np.int64) for one in counts))
 
 
 def difference_of(service: Service, database: str, other: str) -> Difference:
@@ -204,7 +228,7 @@ def files(database: DatabaseId, service: TheService, reader: Reader) -> list[Dat
 )
 def file(
     database: DatabaseId,
-    path: Annotated[str, Path(examples=["stars.parquet"])],
+    path: Annotated[str, PathParameter(examples=["stars.parquet"])],
     request: Request,
     service: TheService,
     reader: Reader,
@@ -238,12 +262,11 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
 
 @router.delete("/{database}", status_code=204, summary="Remove a database")
 def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
-    """Remove a database from the shelf; what was published of it stays published."""
+    """Remove a database from the service; what was published of it stays published."""
     remove_database(service, database)
 
 
 def _listed(database: Database, name: str) -> Blob:
-    """Return what the manifest says of a file."""
     found = database.files.get(name)
     if found is None:
         raise TargetMissing(

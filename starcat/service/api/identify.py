@@ -8,11 +8,9 @@ import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
 
-from fastapi import APIRouter, Query, Request
-from fastapi import Path as PathParameter
+from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, Field, ValidationError
 from starlette.datastructures import UploadFile
@@ -35,8 +33,7 @@ SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
 Kind = Literal["png", "svg"]
 
 DatabaseId = Annotated[
-    str,
-    PathParameter(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"]),
+    str, Path(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"])
 ]
 
 
@@ -53,63 +50,47 @@ class Identified(BaseModel):
     notes: list[str] = Field(description="For people.")
 
 
+def _object(required: str, **properties: Any) -> dict[str, Any]:
+    return {"type": "object", "required": [required], "properties": properties}
+
+
 _OPTIONS = IdentifyOptions.model_json_schema()
-_CENTROIDS = {
-    "type": "object",
-    "required": ["centroids_px"],
-    "properties": {
-        "centroids_px": {
-            "type": "array",
-            "items": {"type": "array", "items": {"type": "number"}},
-            "description": "Pairs of x to the right and y down, pixels.",
-        },
-        "mag": {"type": "array", "items": {"type": ["number", "null"]}},
-        "name": {"type": "string"},
-        "options": _OPTIONS,
+_CENTROIDS = _object(
+    "centroids_px",
+    centroids_px={
+        "type": "array",
+        "items": {"type": "array", "items": {"type": "number"}},
+        "description": "Pairs of x to the right and y down, pixels.",
     },
+    mag={"type": "array", "items": {"type": ["number", "null"]}},
+    name={"type": "string"},
+    options=_OPTIONS,
+)
+_FRAMES = _object("frames", frames={"type": "array", "items": _CENTROIDS}, options=_OPTIONS)
+_FILE = _object(
+    "file",
+    file={
+        "type": "string",
+        "format": "binary",
+        "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF).",
+    },
+    options={
+        "type": "string",
+        "description": "IdentifyOptions as JSON.",
+        "example": '{"fov_error": 0.02}',
+    },
+)
+_EXAMPLE = {
+    "centroids_px": [[101.2, 33.1], [400.0, 211.9], [88.4, 300.7], [251, 96.6]],
+    "mag": [3.1, 4.0, 4.4, 5.2],
+    "options": {"tolerance_px": 1.5},
 }
 BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
-            "application/json": {
-                "schema": {
-                    "oneOf": [
-                        _CENTROIDS,
-                        {
-                            "type": "object",
-                            "required": ["frames"],
-                            "properties": {
-                                "frames": {"type": "array", "items": _CENTROIDS},
-                                "options": _OPTIONS,
-                            },
-                        },
-                    ]
-                },
-                "example": {
-                    "centroids_px": [[101.2, 33.1], [400.0, 211.9], [88.4, 300.7], [251, 96.6]],
-                    "mag": [3.1, 4.0, 4.4, 5.2],
-                    "options": {"tolerance_px": 1.5},
-                },
-            },
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF).",
-                        },
-                        "options": {
-                            "type": "string",
-                            "description": "IdentifyOptions as JSON.",
-                            "example": '{"fov_error": 0.02}',
-                        },
-                    },
-                }
-            },
+            "application/json": {"schema": {"oneOf": [_CENTROIDS, _FRAMES]}, "example": _EXAMPLE},
+            "multipart/form-data": {"schema": _FILE},
         },
     }
 }
@@ -118,7 +99,7 @@ BODY: dict[str, Any] = {
 @router.get("/options", summary="Options")
 def options_schema(reader: Reader) -> dict[str, Any]:
     """Return the JSON schema of the options."""
-    return IdentifyOptions.model_json_schema()
+    return _OPTIONS
 
 
 @router.post("/{database}", summary="Identify frames", openapi_extra=BODY)
@@ -127,7 +108,9 @@ async def identify(
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
-        found, _ = await service.sandbox.run(_identify, service, database, frames, options, None)
+        found, _ = await service.sandbox.run(
+            identify_upload, service, database, frames, options, None
+        )
     return Identified.model_validate(found)
 
 
@@ -152,7 +135,9 @@ async def picture(
 ) -> Response:
     """Return the first frame as a picture with its stars named, or as it is where none is."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
-        _, drawn = await service.sandbox.run(_identify, service, database, frames, options, kind)
+        _, drawn = await service.sandbox.run(
+            identify_upload, service, database, frames, options, kind
+        )
     return Response(drawn, media_type=type_of(f"picture.{kind}"))
 
 
@@ -185,7 +170,7 @@ async def _sent(
                     422, "no file was sent; send centroids or an image as 'file'", key="file"
                 )
             frames = FrameUpload.of_form(upload, most_mib)
-            yield frames, _options(_json(str(form.get("options") or "{}"), "options"))
+            yield frames, _options_of(_json(str(form.get("options") or "{}"), "options"))
         return
     if kind != "application/json":
         raise Problem(
@@ -196,7 +181,7 @@ async def _sent(
     content = _json((await request.body()).decode(errors="replace"), "body")
     if not isinstance(content, dict):
         raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
-    options = _options(content.pop("options", {}))
+    options = _options_of(content.pop("options", {}))
     # Not named by whoever sent it: messages call it so.
     yield FrameUpload("frame.json", io.BytesIO(json.dumps(content).encode())), options
 
@@ -208,34 +193,29 @@ def _json(text: str, where: str) -> Any:
         raise Problem(422, f"{where}: not JSON ({str(error)[:200]})", key=where) from None
 
 
-def _options(content: Any) -> IdentifyOptions:
+def _options_of(content: Any) -> IdentifyOptions:
+    return checked_options(content, "options", "; /api/v1/identify/options says what there is")
+
+
+def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOptions:
+    """Return the options that a request gives; ``under`` is where in it they are."""
     try:
         return IdentifyOptions.model_validate(content)
     except ValidationError as error:
         where, found = validation_message(error, show_input=True)
-        key = f"options.{where}" if where else "options"
-        told = f"{key}: {found}; /api/v1/identify/options says what there is"
-        raise Problem(422, told, key=key) from None
+        key = ".".join(filter(None, (under, where)))
+        raise Problem(422, f"{key}: {found}{hint}", key=key) from None
 
 
-def _identify(
+def identify_upload(
     service: Service,
     database: str,
     frames: FrameUpload,
     options: IdentifyOptions,
     kind: Kind | None,
 ) -> tuple[dict[str, Any], bytes]:
-    return identify_upload(service, service.library.find(database).folder, frames, options, kind)
-
-
-def identify_upload(
-    service: Service,
-    artifact: Path,
-    frames: FrameUpload,
-    options: IdentifyOptions,
-    kind: Kind | None,
-) -> tuple[dict[str, Any], bytes]:
     """Identify frames in the sandbox; return the answers and the picture of the first."""
+    artifact = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
         with (folder / frames.name).open("wb") as file:
             shutil.copyfileobj(frames.content, file)

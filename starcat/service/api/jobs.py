@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
@@ -34,6 +35,8 @@ router = APIRouter(prefix="/jobs", tags=["jobs"])
 LOOK_S = 0.25
 """How often it is looked whether something has happened to a job that somebody watches."""
 
+NUMBER = re.compile("[0-9]{1,15}")
+
 JobId = Annotated[
     str,
     InPath(
@@ -63,8 +66,8 @@ class BuildWish(Wish):
     changes: dict[Text, Text] = Field(
         default_factory=dict,
         max_length=200,
-        description="With a preset: values by dotted key that take the place of its own, as TOML "
-        "writes them; an empty text removes the key.",
+        description="With a preset: values that replace its own, by dotted key, in TOML; an empty "
+        "text removes the key.",
     )
 
 
@@ -137,12 +140,12 @@ class JobView(BaseModel):
     """A job."""
 
     id: str = Field(description="Thirty-two hexadecimal digits.")
-    kind: Kind = Field(description="What is done.")
+    kind: Kind = Field(description="Kind of work.")
     key: str = Field(description="SHA-256 of all that the result depends on.")
-    owner: str = Field(description="Name of who asked for it.")
+    owner: str = Field(description="User who requested it.")
     title: str = Field(description="For people.")
     state: State = Field(description="How far it is.")
-    request: dict[str, Any] = Field(description="What was asked for.")
+    request: dict[str, Any] = Field(description="The request.")
     created_s: float = Field(description="Seconds since 1970.")
     started_s: float | None = Field(None, description="When the last attempt began.")
     ended_s: float | None = Field(None, description="When it ended.")
@@ -152,7 +155,7 @@ class JobView(BaseModel):
     total: int | None = Field(None, description="Of how much, where that is known.")
     error: dict[str, Any] | None = Field(None, description="Problem details, where it failed.")
     result: dict[str, Any] | None = Field(
-        None, description="What it made: the id of a database, a catalog, or rates."
+        None, description="Result: the id of a database, a catalog, or rates."
     )
 
 
@@ -160,13 +163,15 @@ class JobPage(BaseModel):
     """Some of the jobs, the newest first."""
 
     jobs: list[JobView] = Field(description="The jobs.")
-    total: int = Field(description="How many there are in all that were asked for.")
+    total: int = Field(description="Total number of jobs that match.")
 
 
 class EventView(BaseModel):
     """Something that happened to a job."""
 
-    number: int = Field(description="1, 2, 3 ... of its job; of stages only the last are kept.")
+    number: int = Field(
+        description="Number within its job, from 1; only the last stages are stored."
+    )
     at_s: float = Field(description="Seconds since 1970.")
     kind: Literal["state", "stage", "log"] = Field(description="What changed.")
     data: dict[str, Any] = Field(
@@ -191,7 +196,7 @@ def event_view(event: Event) -> EventView:
         200: {"model": JobView, "description": "A job was there that does the same."},
         507: {"description": "The disk of the service is nearly full."},
     },
-    summary="Ask for a job",
+    summary="Request a job",
 )
 def submit_job(
     wish: Annotated[AnyWish, Body(openapi_examples=EXAMPLES)],
@@ -272,11 +277,7 @@ def _known_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
     return service.jobs.get(job_id)
 
 
-@router.get(
-    "/{job_id}/events",
-    response_class=EventSourceResponse,
-    summary="Watch a job",
-)
+@router.get("/{job_id}/events", response_class=EventSourceResponse, summary="Watch a job")
 async def watch_job(
     job: Annotated[Job, Depends(_known_job)],
     service: TheService,
@@ -291,13 +292,8 @@ async def watch_job(
     The kind of an event is ``state``, ``stage`` or ``log``; its data are those of events.json,
     with ``at_s``. A watcher that comes back goes on where it was.
     """
-    seen = (
-        int(last_event_id)
-        if last_event_id
-        and last_event_id.isascii()
-        and (last_event_id.isdigit() and len(last_event_id) < 16)
-        else after
-    )
+    last_seen = NUMBER.fullmatch(last_event_id or "")
+    seen = int(last_seen[0]) if last_seen else after
     while not service.stopping.is_set():
         has_ended, events = await to_thread.run_sync(_news, service, job.id, seen)
         for event in events:

@@ -26,8 +26,7 @@ registry_router = APIRouter(prefix="/registry", tags=["releases"], responses=REF
 
 BLOB = re.compile(r"blobs/sha256/(?P<two>[0-9a-f]{2})/(?P<digest>(?P=two)[0-9a-f]{62})", re.ASCII)
 RELEASE = re.compile(
-    rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json",
-    re.ASCII,
+    rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json", re.ASCII
 )
 
 MAX_NOTE = 4000
@@ -35,8 +34,7 @@ MAX_NOTE = 4000
 
 def publications(records: Records) -> dict[tuple[str, str], dict[str, Any]]:
     """Return by name and version which database a release was, who published it, when and why."""
-    with records.reading() as connection:
-        rows = connection.execute("SELECT * FROM publications").fetchall()
+    rows = records.rows("SELECT * FROM publications")
     told = ("database", "note", "owner", "published_s")
     return {(row["name"], row["version"]): {key: row[key] for key in told} for row in rows}
 
@@ -77,7 +75,7 @@ class ToPublish(BaseModel):
     )
 
     database: str = Field(description="Id of the database.")
-    note: str = Field("", max_length=MAX_NOTE, description="What is to be known about it.")
+    note: str = Field("", max_length=MAX_NOTE, description="Release note.")
 
 
 class PublishedRelease(ReleaseFacts):
@@ -94,7 +92,9 @@ class PublishedRelease(ReleaseFacts):
 def all_releases(service: TheService, reader: Reader) -> Releases:
     """Return all releases, by name and then by version."""
     known = publications(service.records)
-    return Releases(releases=[_facts(service, one, known) for one in _listed(service)])
+    return Releases(
+        releases=[_facts(service, one, known) for one in recorded(service.paths.registry)]
+    )
 
 
 @router.get("/{name}/{version}", summary="One release")
@@ -105,7 +105,7 @@ def one_release(
     reader: Reader,
 ) -> ReleaseFacts:
     """Return what is known of a release."""
-    for one in _listed(service):
+    for one in recorded(service.paths.registry):
         if (one.name, one.version) == (name, version):
             return _facts(service, one, publications(service.records))
     raise TargetMissing(
@@ -149,12 +149,6 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
         new_blobs=published.new_blobs,
         new_bytes=published.new_bytes,
     )
-
-
-def _listed(service: Service) -> list[Listed]:
-    """Return the releases by their own files: one that was just published is among them."""
-    root = service.paths.registry
-    return recorded(root) if root.is_dir() else []
 
 
 def _facts(

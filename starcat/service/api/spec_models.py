@@ -15,8 +15,7 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
 
-MOST_FIELDS = 50_000
-"""Fields that are listed one by one at the most."""
+MOST_FIELDS = 50_000  # fields that are listed one by one at the most
 
 
 class CheckedSpec(BaseModel):
@@ -24,7 +23,7 @@ class CheckedSpec(BaseModel):
 
     name: str = Field(examples=["gaia-12deg"])
     version: str = Field(examples=["1.0.0"])
-    description: str = Field(description="What it is for.")
+    description: str = Field(description="Purpose.")
     sources: list[str] = Field(description="Catalogs that it reads.", examples=[["gaia"]])
     spec: dict[str, Any] = Field(description="All keys, with those that are as by default.")
     toml: str = Field(description="The same as a file in which every key is explained.")
@@ -36,7 +35,7 @@ class PresetFacts(BaseModel):
     name: str = Field(examples=["gaia-12deg"])
     version: str = Field(examples=["1.0.0"])
     source: str = Field(description="Its catalog.", examples=["gaia"])
-    description: str = Field(description="What it is for.")
+    description: str = Field(description="Purpose.")
 
 
 class Presets(BaseModel):
@@ -73,7 +72,7 @@ class FieldFigures(BaseModel):
     stars: SpreadFacts
     enough_share: float = Field(description="Share of the fields with at least 4 stars.")
     full_share: float = Field(
-        description="Share with as many as ``boresights.brightest``, of which triangles are made."
+        description="Share of fields with ``boresights.brightest`` stars, the number for triangles."
     )
     worst: WorstField
 
@@ -88,7 +87,7 @@ class FilterFigures(BaseModel):
 class EstimateAnswer(BaseModel):
     """What a spec will give."""
 
-    guide_stars: int = Field(description="As many as the build will have.", examples=[6682])
+    guide_stars: int = Field(description="Exact number of guide stars.", examples=[6682])
     fields: FieldFigures
     filters: list[FilterFigures]
     rejected: dict[str, int] = Field(description="All other records, by reason.")
@@ -101,7 +100,7 @@ class EstimateAnswer(BaseModel):
     read_seconds: float = Field(description="Time to read the catalogs.")
     build_seconds: float = Field(description="Time of the whole build, on one quiet processor.")
     refusals: list[str] = Field(description="Why the build will be refused; empty if it will not.")
-    warnings: list[str] = Field(description="What is worth a second look.")
+    warnings: list[str] = Field(description="Warnings.")
     in_words: str = Field(description="The line that 'starcat build' prints.")
 
 
@@ -164,9 +163,9 @@ class StarterAnswer(BaseModel):
 
     checked: CheckedSpec
     limits: list[LimitFigures] = Field(description="Its own limit, and some around it.")
-    thinned: LimitFigures = Field(description="What is left of its own limit after thinning.")
-    advice: list[str] = Field(description="What to think of before the limit is kept.")
-    in_words: str = Field(description="What it will cost, in one line.")
+    thinned: LimitFigures = Field(description="Faintest magnitude left after thinning.")
+    advice: list[str] = Field(description="Remarks on the limit.")
+    in_words: str = Field(description="Size, memory and time of the build, in one line.")
 
 
 def checked_spec(spec: BuildSpec) -> CheckedSpec:

@@ -42,10 +42,7 @@ from starcat.specs.reading import (
 )
 
 router = APIRouter(prefix="/specs", tags=["specs"])
-
-ORIGIN = "spec"
-"""What messages call the spec of a request."""
-
+ORIGIN = "spec"  # what messages call the spec of a request
 TOML_TYPES = ("application/toml", "text/")
 
 MOST_BODY_BYTES = 4 * MOST_CHARACTERS
@@ -63,9 +60,7 @@ class GivenSpec(BaseModel):
     model_config = ConfigDict(
         extra="forbid",
         json_schema_extra={
-            "examples": [
-                {"preset": "gaia-12deg", "changes": {"selection.faint_limit_mag": "5.5"}},
-            ]
+            "examples": [{"preset": "gaia-12deg", "changes": {"selection.faint_limit_mag": "5.5"}}]
         },
     )
 
@@ -136,8 +131,7 @@ def _text(body: bytes) -> str:
         raise ConfigError(f"{ORIGIN}: not a readable TOML file: {error.reason}") from error
 
 
-SpecOfRequest = Annotated[BuildSpec, Depends(_spec_of)]
-"""The spec of a request's body."""
+SpecOfRequest = Annotated[BuildSpec, Depends(_spec_of)]  # the spec of a request's body
 
 TOML_EXAMPLE = """\
 name = "mycam"
@@ -153,17 +147,7 @@ SPEC_BODY: dict[str, Any] = {
         "required": True,
         "description": "A spec: TOML as it is, or JSON.",
         "content": {
-            "application/json": {
-                "schema": {
-                    "type": "object",
-                    "title": "GivenSpec",
-                    **{
-                        key: value
-                        for key, value in GivenSpec.model_json_schema().items()
-                        if key not in ("type", "title")
-                    },
-                }
-            },
+            "application/json": {"schema": GivenSpec.model_json_schema()},
             "application/toml": {"schema": {"type": "string"}, "example": TOML_EXAMPLE},
         },
     }
@@ -218,10 +202,7 @@ def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> Estima
 
 
 @router.post(
-    "/coverage",
-    summary="Guide stars by field",
-    openapi_extra=SPEC_BODY,
-    responses={**KIND, **BUSY},
+    "/coverage", summary="Guide stars by field", openapi_extra=SPEC_BODY, responses={**KIND, **BUSY}
 )
 def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> CoverageMap:
     """Return the guide stars in each field that a spec will give."""

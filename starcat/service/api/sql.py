@@ -23,10 +23,7 @@ from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 router = APIRouter(prefix="/sql", tags=["sql"])
 
 Form = Literal["rows", FileFormat]
-
-MAX_SHOWN = 100_000
-"""Rows of an answer that is no file."""
-
+MAX_SHOWN = 100_000  # rows of an answer that is no file
 Plain = int | float | bool | str | None
 
 TargetName = Annotated[str, Field(max_length=200)]
@@ -77,7 +74,7 @@ class SqlRows(BaseModel):
 
     columns: list[Column]
     rows: list[list[Any]] = Field(
-        description="Whole numbers beyond 2^53 are texts; what is no number is null."
+        description="Integers beyond 2^53 are text; NaN and infinities are null."
     )
     is_cut: bool = Field(description="Whether there are more rows.")
 
@@ -94,7 +91,7 @@ class GalleryQuery(BaseModel):
     """A query that people ask often."""
 
     name: str
-    help: str = Field(description="What it finds.")
+    help: str = Field(description="Description.")
     targets: int = Field(description="How many targets it is about.")
     values: list[GalleryValue]
     text: str = Field(description="SQL.")
@@ -105,7 +102,7 @@ class MacroFacts(BaseModel):
 
     name: str
     arguments: str
-    is_table: bool = Field(description="Whether it stands after FROM.")
+    is_table: bool = Field(description="Whether it is a table macro, used after FROM.")
     help: str
     example: str
 
@@ -174,7 +171,7 @@ def result_file(
 
 @router.post(
     "",
-    summary="Ask a question",
+    summary="Run a query",
     response_model=SqlRows,
     responses={
         200: {
@@ -189,7 +186,7 @@ def result_file(
     },
 )
 async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
-    """Ask a question about databases and catalogs in SQL; nothing is ever written."""
+    """Run an SQL query on databases and catalogs; nothing is ever written."""
     asked = _checked(service, question)
     if question.format == "rows":
         return await service.query_pool.run(_rows, service, asked)

@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ProductError, SourceError
-from starcat.service.jobs.job import Job, job_problem
-from starcat.service.jobs.job_states import Attempt, Outcome, interrupt
+from starcat.service.jobs.job import Attempt, Job, Outcome, failed, interrupt
 from starcat.service.jobs.keys import build_key, ingest_key
 from starcat.service.jobs.runner import (
     CANCELLED,
@@ -36,10 +35,11 @@ from starcat.service.jobs.runner import (
     limit_exceeded,
     time_exceeded,
 )
-from starcat.service.jobs.submission import disk_shortage, owner_excess
+from starcat.service.jobs.submission import owner_excess
 from starcat.service.jobs.work import Order, order_of, place_database, threads_of
 from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
+from starcat.service.security.request_limits import disk_shortage
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import READ_ONLY, sync
 from starcat.store.cluster import cluster
@@ -112,9 +112,9 @@ class ClusterJobs:
         job = attempt.job
         if job.request.get("to") == "hats":
             return self._run_here(attempt)
-        short = disk_shortage(self._service)
+        short = disk_shortage(self._service.settings)
         if short is not None:
-            return Outcome("failed", job_problem("Insufficient storage", 507, short))
+            return failed("Insufficient storage", 507, short)
         unfit: dict[str, str] = {}
         while True:
             result = self._result(attempt, unfit)
@@ -135,7 +135,7 @@ class ClusterJobs:
         fit = sorted(set(client.nthreads()) - set(unfit)) if unfit else None
         if fit == []:
             detail = f"no worker of the cluster can do it: {'; '.join(unfit.values())}"
-            return Outcome("failed", job_problem("No worker", 404, detail))
+            return failed("No worker", 404, detail)
         key = f"starcat-{job.id}-{job.attempt}-{len(unfit)}"
         self._inboxes[key] = SimpleQueue()
         order = order_of(job, self._service.settings, root="")
@@ -155,11 +155,11 @@ class ClusterJobs:
             result: ClusterResult = future.result()
         except KilledWorker as error:
             detail = f"workers died again and again over it ({error}); give them more memory"
-            return Outcome("failed", job_problem("Workers died", 500, detail))
+            return failed("Workers died", 500, detail)
         except Exception as error:
             _logger.exception("job %s: its task failed", job.id)
             detail = f"its task failed ({type(error).__name__}); the log of the server says more"
-            return Outcome("failed", job_problem("Task failed", 500, detail))
+            return failed("Task failed", 500, detail)
         finally:
             future.cancel(force=True)
             del self._inboxes[key]
@@ -174,7 +174,6 @@ class ClusterJobs:
         return client.scatter(archive, hash=False)
 
     def _receive(self, event: tuple[float, dict[str, Any]]) -> None:
-        """Take an event of the cluster, in the thread of its client."""
         _, message = event
         inbox = self._inboxes.get(message["task"])
         if inbox is not None:
@@ -216,7 +215,7 @@ class ClusterJobs:
             place(result.archive, job, ServicePaths(work), paths)
         except (ProductError, TarError, OSError) as error:
             detail = f"what {result.worker} has made cannot be taken: {error}"
-            return Outcome("failed", job_problem("Damaged", 422, detail))
+            return failed("Damaged", 422, detail)
         finally:
             shutil.rmtree(work, ignore_errors=True)
         return outcome
@@ -299,7 +298,6 @@ def _refusal(order: Order, home: Path) -> str:
 
 
 def _followed(worker: Worker, order: Order, job_time_s: float) -> Outcome:
-    """Run the process of a job on a worker, and tell of it."""
     task, began_s = worker.get_current_task(), time.monotonic()
     told_s = -HEARTBEAT_S
 

@@ -1,10 +1,17 @@
-"""A job as it is remembered: what was asked for, how far it is, what became of it."""
+"""A job as it is remembered: what was asked for, how far it is, what becomes of it.
+
+The table is the queue: a job is begun by whoever turns its row from queued to running. From then
+on the number of the attempt says whose job it is: what an earlier attempt reports is not taken.
+Each step is one transaction, and only one can take it.
+"""
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from starcat.errors import TargetMissing
@@ -18,6 +25,14 @@ ENDED: tuple[State, ...] = ("done", "failed", "cancelled")
 
 QUERY = "query"
 """Kind of the rows that are asynchronous queries of TAP, which only `starcat.service.vo` shows."""
+
+MAX_INTERRUPTED = 8
+"""So often a job may lose its server before it is taken for the cause."""
+
+MAX_LOG_LINES = 2000
+"""Lines of the log of a job that are kept, all attempts together."""
+
+NO_STAGE = "stage = NULL, done = NULL, total = NULL"
 
 
 @dataclass(frozen=True)
@@ -65,8 +80,7 @@ class JobStore:
 
     def get(self, job_id: str) -> Job:
         """Return a job."""
-        with self._records.reading() as connection:
-            return job_in(connection, job_id)
+        return job_in(self._records.connection(), job_id)
 
     def all(
         self,
@@ -79,32 +93,25 @@ class JobStore:
     ) -> list[Job]:
         """Return the jobs, the newest first."""
         where, values = _where(state=state, kind=kind, owner=owner)
-        with self._records.reading() as connection:
-            rows = connection.execute(
-                f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?",
-                (*values, most, skip),
-            ).fetchall()
-        return [job_of(row) for row in rows]
+        newest = f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?"
+        return [job_of(row) for row in self._records.rows(newest, *values, most, skip)]
 
     def count(
         self, *, state: State | None = None, kind: Kind | None = None, owner: str | None = None
     ) -> int:
         """Return how many jobs there are."""
         where, values = _where(state=state, kind=kind, owner=owner)
-        with self._records.reading() as connection:
-            [found] = connection.execute(f"SELECT count(*) FROM jobs {where}", values).fetchone()
+        [[found]] = self._records.rows(f"SELECT count(*) FROM jobs {where}", *values)
         return int(found)
 
     def events(self, job_id: str, after: int = 0) -> list[Event]:
         """Return what happened to a job."""
-        with self._records.reading() as connection:
-            rows = connection.execute(
-                "SELECT * FROM job_events WHERE job = ? AND number > ? ORDER BY number",
-                (job_id, after),
-            ).fetchall()
-        return [
-            Event(row["number"], row["at_s"], row["kind"], json.loads(row["data"])) for row in rows
-        ]
+        later = (
+            "SELECT number, at_s, kind, data FROM job_events WHERE job = ? AND number > ? "
+            "ORDER BY number"
+        )
+        rows = self._records.rows(later, job_id, after)
+        return [Event(number, at_s, kind, json.loads(data)) for number, at_s, kind, data in rows]
 
 
 def _where(**wanted: str | None) -> tuple[str, list[str]]:
@@ -132,6 +139,180 @@ def job_of(row: sqlite3.Row) -> Job:
     return Job(**content)
 
 
-def job_problem(title: str, status: int, detail: str) -> dict[str, Any]:
-    """Return problem details of a job that failed."""
-    return {"type": "about:blank", "title": title, "status": status, "detail": detail}
+def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
+    """Return whether a job of some kinds waits."""
+    return bool(records.rows(_first(kinds), *kinds))
+
+
+def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
+    """Begin the job of some kinds that has waited for longest; None where none waits."""
+    with records.writing() as connection:
+        row = connection.execute(
+            "UPDATE jobs SET state = 'running', started_s = ?, attempt = attempt + 1, "
+            f"cancel_requested = 0, {NO_STAGE}, error = NULL WHERE id = ({_first(kinds)}) "
+            "RETURNING *",
+            (time.time(), *kinds),
+        ).fetchone()
+        if row is None:
+            return None
+        job = job_of(row)
+        add_event(connection, job.id, "state", {"state": "running", "attempt": job.attempt})
+    return job
+
+
+def _first(kinds: Sequence[str]) -> str:
+    marks = ", ".join("?" * len(kinds))
+    return (
+        f"SELECT id FROM jobs WHERE state = 'queued' AND kind IN ({marks}) "
+        "ORDER BY queued_s, id LIMIT 1"
+    )
+
+
+def running_jobs(records: Records) -> list[Job]:
+    """Return the jobs that run, of all kinds."""
+    rows = records.rows("SELECT * FROM jobs WHERE state = 'running' ORDER BY created_s")
+    return [job_of(row) for row in rows]
+
+
+def interrupt(records: Records, job: Job) -> None:
+    """Have a job wait again whose attempt is lost, unless that was too often."""
+    with records.writing() as connection:
+        row = connection.execute(
+            "UPDATE jobs SET interrupted = interrupted + 1 WHERE id = ? AND attempt = ? "
+            "AND state = 'running' RETURNING interrupted, cancel_requested",
+            (job.id, job.attempt),
+        ).fetchone()
+        if row is None:
+            return
+        if row["cancel_requested"]:
+            end_job(connection, job.id, "cancelled")
+        elif row["interrupted"] >= MAX_INTERRUPTED:
+            detail = (
+                f"the service ended {row['interrupted']} times while this job ran, which may be "
+                "because of it; ask for less, or try it again"
+            )
+            end_job(connection, job.id, "failed", failed("Interrupted", 500, detail).content)
+        else:
+            _requeue(connection, job.id)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt ended; ``queued`` where the service stops, and the job is to run again."""
+
+    state: Literal["done", "failed", "cancelled", "queued"]
+    content: Mapping[str, Any] = field(default_factory=dict)  # the result, or problem details
+
+
+def failed(title: str, status: int, detail: str) -> Outcome:
+    """Return the end of an attempt with problem details."""
+    content = {"type": "about:blank", "title": title, "status": status, "detail": detail}
+    return Outcome("failed", content)
+
+
+class Attempt:
+    """An attempt at a job: what it reports is taken while the job is its own."""
+
+    def __init__(self, records: Records, job: Job) -> None:
+        self._records = records
+        self.job = job
+
+    def cancel_requested(self) -> bool:
+        """Return whether it has to end: the job was cancelled, or is another attempt's."""
+        wanted = self._records.rows(
+            "SELECT 1 FROM jobs WHERE id = ? AND attempt = ? AND state = 'running' "
+            "AND NOT cancel_requested",
+            self.job.id,
+            self.job.attempt,
+        )
+        return not wanted
+
+    def report(self, message: Mapping[str, Any]) -> None:
+        """Take a message of the process: ``stage``, ``done``, ``total``; or ``log``, ``level``."""
+        if "stage" in message:
+            self.report_stage(message["stage"], message["done"], message["total"])
+        elif "log" in message:
+            self.log(message["level"], message["log"])
+
+    def report_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Record how much of a stage is done; of the events of a stage only the last is kept."""
+        with self._records.writing() as connection:
+            changed = self._update(connection, "stage = ?, done = ?, total = ?", stage, done, total)
+            if not changed:
+                return
+            before = connection.execute(
+                "SELECT max(number) FROM job_events WHERE job = ? AND kind = 'stage' "
+                "AND json_extract(data, '$.stage') = ?",
+                (self.job.id, stage),
+            ).fetchone()[0]
+            add_event(
+                connection, self.job.id, "stage", {"stage": stage, "done": done, "total": total}
+            )
+            connection.execute(
+                "DELETE FROM job_events WHERE job = ? AND number = ?", (self.job.id, before)
+            )
+
+    def log(self, level: str, text: str) -> None:
+        """Add a line to the log; the level is info, warning or error."""
+        with self._records.writing() as connection:
+            if not self._is_mine(connection):
+                return
+            [lines] = connection.execute(
+                "SELECT count(*) FROM job_events WHERE job = ? AND kind = 'log'", (self.job.id,)
+            ).fetchone()
+            if lines < MAX_LOG_LINES:
+                add_event(connection, self.job.id, "log", {"level": level, "text": text})
+            elif lines == MAX_LOG_LINES:
+                text = f"the log ends here, after {lines:,} lines"
+                add_event(connection, self.job.id, "log", {"level": "warning", "text": text})
+
+    def end(self, outcome: Outcome) -> None:
+        """Record how it ended."""
+        with self._records.writing() as connection:
+            if not self._is_mine(connection):
+                return
+            if outcome.state == "queued":
+                _requeue(connection, self.job.id)
+            else:
+                end_job(connection, self.job.id, outcome.state, outcome.content)
+
+    def _is_mine(self, connection: sqlite3.Connection) -> bool:
+        return self._update(connection, "attempt = ?", self.job.attempt)
+
+    def _update(self, connection: sqlite3.Connection, change: str, *values: object) -> bool:
+        done = connection.execute(
+            f"UPDATE jobs SET {change} WHERE id = ? AND attempt = ? AND state = 'running'",
+            (*values, self.job.id, self.job.attempt),
+        )
+        return bool(done.rowcount)
+
+
+def _requeue(connection: sqlite3.Connection, job_id: str) -> None:
+    connection.execute(f"UPDATE jobs SET state = 'queued', {NO_STAGE} WHERE id = ?", (job_id,))
+    add_event(connection, job_id, "state", {"state": "queued"})
+
+
+def end_job(
+    connection: sqlite3.Connection, job_id: str, state: State, content: Mapping[str, Any] = {}
+) -> None:
+    """Record how a job ended, within a transaction."""
+    column = {"done": "result", "failed": "error"}.get(state)
+    told = {} if column is None else {column: dict(content)}
+    result, error = (json.dumps(told[one]) if one in told else None for one in ("result", "error"))
+    connection.execute(
+        "UPDATE jobs SET state = ?, ended_s = ?, cancel_requested = 0, result = ?, error = ? "
+        "WHERE id = ?",
+        (state, time.time(), result, error, job_id),
+    )
+    add_event(connection, job_id, "state", {"state": state, **told})
+
+
+def add_event(
+    connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
+) -> None:
+    """Record what happened to a job, within a transaction."""
+    connection.execute(
+        "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
+        "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",
+        (job_id, time.time(), kind, json.dumps(data), job_id),
+    )

@@ -80,12 +80,8 @@ def _digest(records: Records, path: Path) -> str:
         text = f"{path} {stat.st_size} {stat.st_mtime_ns}"
         return hashlib.sha256(text.encode()).hexdigest()
     facts = (str(path), stat.st_size, stat.st_mtime_ns)
-    with records.reading() as connection:
-        row = connection.execute(
-            "SELECT sha256 FROM file_digests WHERE path = ? AND size_bytes = ? AND changed_ns = ?",
-            facts,
-        ).fetchone()
-    if row is not None:
+    known = "SELECT sha256 FROM file_digests WHERE path = ? AND size_bytes = ? AND changed_ns = ?"
+    for row in records.rows(known, *facts):
         return str(row["sha256"])
     digest = file_sha256(path)
     with records.writing() as connection:

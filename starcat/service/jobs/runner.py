@@ -16,14 +16,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from starcat.service.jobs.job import job_problem
-from starcat.service.jobs.job_states import Outcome
-from starcat.service.jobs.task import memory_problem
-from starcat.service.jobs.work import Order
+from starcat.service.jobs.job import Outcome, failed
+from starcat.service.jobs.work import Order, out_of_memory
 from starcat.service.sandbox.child import Child
 from starcat.storage.atomic import make_folder
 
-TASK = "starcat.service.jobs.task:main"
+TASK = "starcat.service.jobs.work:main"
 
 TICK_S = 0.2
 """How often it is looked whether a process has to end."""
@@ -44,7 +42,7 @@ ReasonToEnd = Callable[[], Outcome | None]
 
 def limit_exceeded(detail: str) -> Outcome:
     """Return the end of an attempt that took more than it may."""
-    return Outcome("failed", job_problem("Limit exceeded", 422, detail))
+    return failed("Limit exceeded", 422, detail)
 
 
 def time_exceeded(began_s: float, job_time_s: float) -> Outcome | None:
@@ -106,7 +104,6 @@ class Processes:
 
 
 def _outcome_in(line: bytes, report: Report) -> Outcome | None:
-    """Return the outcome that a message tells; any other message is reported."""
     try:
         message: dict[str, Any] = json.loads(line)
     except ValueError:  # cut off
@@ -125,14 +122,14 @@ def _death(code: int, order: Order) -> Outcome:
         return STOPPED
     last_words = _tail(order.paths.job_stderr(order.job_id)).lower()
     if any(word in last_words for word in NO_MEMORY):
-        return Outcome("failed", memory_problem(order.memory_bytes))
+        return out_of_memory(order.memory_bytes)
     name = signal.Signals(-code).name if code < 0 else f"code {code}"
     hint = ", as a system does that runs out of memory" if code == -signal.SIGKILL else ""
     detail = (
         f"the process of the job ended by {name}{hint}; the operator finds more in "
         f"jobs/{order.job_id}/stderr.txt under the root"
     )
-    return Outcome("failed", job_problem("Ended", 500, detail))
+    return failed("Ended", 500, detail)
 
 
 def _tail(path: Path) -> str:

@@ -15,25 +15,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.service.jobs.cluster import ClusterJobs
-from starcat.service.jobs.job import QUERY, job_problem
-from starcat.service.jobs.job_states import (
+from starcat.service.jobs.job import (
+    QUERY,
     Attempt,
     Outcome,
     begin_next,
+    failed,
     interrupt,
     is_waiting,
     running_jobs,
 )
-from starcat.service.jobs.runner import (
-    CANCELLED,
-    STOPPED,
-    Processes,
-    limit_exceeded,
-    time_exceeded,
-)
-from starcat.service.jobs.submission import disk_shortage, folder_bytes, owner_excess
+from starcat.service.jobs.runner import CANCELLED, STOPPED, Processes, limit_exceeded, time_exceeded
+from starcat.service.jobs.submission import folder_bytes, owner_excess
 from starcat.service.jobs.work import order_of
 from starcat.service.paths import JOB_ID, ServicePaths
+from starcat.service.security.request_limits import disk_shortage
 from starcat.storage.locks import locked
 
 if TYPE_CHECKING:
@@ -106,8 +102,7 @@ class JobSlots:
         """Take no further job; those that run have their time, and queries end at once."""
         if self.stop_at_s is None:
             self.stop_at_s = time.monotonic() + self.service.settings.shutdown_s
-        with self.service.job_queued:
-            self.service.job_queued.notify_all()
+        self.service.wake_slots()
 
     def stop(self) -> None:
         """Stop, and wait until all slots have ended."""
@@ -134,7 +129,6 @@ class JobSlots:
         return made, _Lane("query", (QUERY,), queries, self._answer_query)
 
     def _serve(self, lane: _Lane) -> None:
-        """Run jobs until the service stops."""
         records, queued = self.service.records, self.service.job_queued
         while self.stop_at_s is None:
             try:
@@ -166,14 +160,14 @@ class JobSlots:
         return True
 
     def _answer_query(self, attempt: Attempt) -> Outcome:
-        return self.service.tap.jobs.answer(attempt, lambda: self.stop_at_s is not None)
+        return self.service.query_jobs.answer(attempt, lambda: self.stop_at_s is not None)
 
     def run_process(self, attempt: Attempt) -> Outcome:
         """Do a job in a process of this machine."""
         service, job = self.service, attempt.job
-        short = disk_shortage(service)
+        short = disk_shortage(service.settings)
         if short is not None:
-            return Outcome("failed", job_problem("Insufficient storage", 507, short))
+            return failed("Insufficient storage", 507, short)
         order = order_of(job, service.settings, str(service.paths.root))
         try:
             return self.processes.run(order, attempt.report, self._watch(attempt))
@@ -199,7 +193,7 @@ class JobSlots:
                 return outcome
             disk_at_s = time.monotonic()
             made = folder_bytes(service.paths.job(job.id))
-            full = disk_shortage(service) or owner_excess(service, job.owner, made)
+            full = disk_shortage(service.settings) or owner_excess(service, job.owner, made)
             return None if full is None else limit_exceeded(full)
 
         return watch
@@ -220,7 +214,7 @@ def recover(service: Service) -> None:
     for folder in service.paths.databases.iterdir():
         with suppress(OSError):  # it is not empty
             folder.rmdir()
-    service.tap.jobs.sweep()
+    service.query_jobs.sweep()
 
 
 def _wait_for_end(paths: ServicePaths, job_id: str) -> None:

@@ -1,57 +1,45 @@
-"""Submitting and cancelling jobs: what is checked first, and what they may take of the disk.
+"""Submitting, cancelling and retrying jobs, and what they may take of the disk.
 
 The same request gives the same job while it waits, runs, or its result exists.
 """
 
 from __future__ import annotations
 
-import shutil
+import json
+import secrets
+import sqlite3
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from starcat.catalog.ingest import ingest_options
 from starcat.errors import ProductError, TargetMissing
-from starcat.service.access import Principal, Role
-from starcat.service.jobs.job import Job, Kind
-from starcat.service.jobs.job_states import add_once, cancel, retry
+from starcat.service.access import Principal
+from starcat.service.jobs.job import NO_STAGE, Job, Kind, add_event, end_job, job_in, job_of
 from starcat.service.jobs.keys import build_key, ingest_key, key_of
 from starcat.service.problems import Problem
+from starcat.service.security.request_limits import GIB, check_disk
 from starcat.service.service import Service
+from starcat.service.settings import Role
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 
-if TYPE_CHECKING:
-    from starcat.service.service import Service
-
-GIB = 2**30
+Format = Literal["parquet", "hats"]
 
 
 def check_room(service: Service, owner: str) -> None:
     """Check that there is room for what a user wants to have made."""
-    short = disk_shortage(service)
-    if short is not None:
-        raise Problem(507, short)
+    check_disk(service.settings)
     full = owner_excess(service, owner)
     if full is not None:
         raise Problem(409, full)
 
 
-def disk_shortage(service: Service) -> str | None:
-    """Return what to say where the disk is nearly full."""
-    free_gib = shutil.disk_usage(service.paths.root).free / GIB
-    if free_gib >= service.settings.free_gib:
-        return None
-    return (
-        f"the disk of the service has {free_gib:.2f} GiB free, and {service.settings.free_gib:g} "
-        "have to be left (free_gib); remove unused databases, or ask the operator"
-    )
-
-
 def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
     """Return what to say where a user's databases take more of the disk than they may."""
-    taken_gib = (owned_bytes(service, owner) + more_bytes) / GIB
+    taken_gib = (_owned_bytes(service, owner) + more_bytes) / GIB
     if taken_gib < service.settings.disk_gib:
         return None
     return (
@@ -60,14 +48,12 @@ def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | Non
     )
 
 
-def owned_bytes(service: Service, owner: str) -> int:
-    """Return how much of the disk the databases of a user take."""
-    with service.records.reading() as connection:
-        rows = connection.execute(
-            "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
-            "WHERE owner = ? AND kind = 'build' AND state = 'done'",
-            (owner,),
-        ).fetchall()
+def _owned_bytes(service: Service, owner: str) -> int:
+    rows = service.records.rows(
+        "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
+        "WHERE owner = ? AND kind = 'build' AND state = 'done'",
+        owner,
+    )
     taken = 0
     for [database_id] in rows:
         try:
@@ -89,9 +75,6 @@ def folder_bytes(folder: Path) -> int:
     return taken
 
 
-Format = Literal["parquet", "hats"]
-
-
 @dataclass(frozen=True)
 class Submitted:
     """What became of a request for a job: the job that does it, perhaps one that there was."""
@@ -104,7 +87,7 @@ def submit_build(service: Service, spec: BuildSpec, owner: str) -> Submitted:
     """Have a database built."""
     key = build_key(service.records, spec)
     title = f"{spec.name} {spec.version}"
-    return _submit(service, "build", {"spec": spec.recorded()}, key, title, owner)
+    return submit(service, "build", {"spec": spec.recorded()}, key, title, owner)
 
 
 def submit_ingest(
@@ -126,7 +109,7 @@ def submit_ingest(
         "to": to,
     }
     key = ingest_key(service.records, request)
-    return _submit(service, "ingest", request, key, f"{source} ({to})", owner)
+    return submit(service, "ingest", request, key, f"{source} ({to})", owner)
 
 
 def submit_evaluation(
@@ -150,29 +133,57 @@ def submit_evaluation(
         "seed": test.seed if seed is None else seed,
     }
     key = key_of("evaluate", request)
-    return _submit(service, "evaluate", request, key, f"{database.title} self-test", owner)
+    return submit(service, "evaluate", request, key, f"{database.title} self-test", owner)
 
 
-def _submit(
+def submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
-    job, is_new = add_once(
-        service.records,
-        kind,
-        request,
-        key=key,
-        title=title,
-        owner=owner,
-        most_waiting=service.settings.jobs_waiting,
-        has_result=lambda job: has_result(service, job),
-        check=lambda: check_room(service, owner),
-    )
+    """Have a job done, or find the one that does the same."""
+    job_id, now_s = secrets.token_hex(16), time.time()
+    with service.records.writing() as connection:
+        same = _same(service, connection, key)
+        if same is not None:
+            return Submitted(same, is_new=False)
+        check_room(service, owner)
+        _check_waiting(service, connection, owner)
+        connection.execute(
+            "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, queued_s) "
+            "VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?)",
+            (job_id, kind, key, owner, title, json.dumps(request), now_s, now_s),
+        )
+        add_event(connection, job_id, "state", {"state": "queued"})
     service.wake_slots()
-    return Submitted(job, is_new)
+    return Submitted(service.jobs.get(job_id), is_new=True)
 
 
-def has_result(service: Service, job: Job) -> bool:
-    """Return whether what a job has made is still there."""
+def _same(service: Service, connection: sqlite3.Connection, key: str) -> Job | None:
+    """Return the newest job that gives or will give what has this key."""
+    rows = connection.execute(
+        "SELECT * FROM jobs WHERE key = ? AND state IN ('queued', 'running', 'done') "
+        "ORDER BY created_s DESC, id",
+        (key,),
+    ).fetchall()
+    jobs = map(job_of, rows)
+    return next((job for job in jobs if job.state != "done" or _has_result(service, job)), None)
+
+
+def _check_waiting(service: Service, connection: sqlite3.Connection, owner: str) -> None:
+    [waiting] = connection.execute(
+        "SELECT count(*) FROM jobs WHERE owner = ? AND state = 'queued' AND kind != 'query'",
+        (owner,),
+    ).fetchone()
+    most = service.settings.jobs_waiting
+    if waiting >= most:
+        raise Problem(
+            429,
+            f"{waiting} jobs of {owner} are waiting, and {most} may; wait until one has begun, "
+            "or cancel one",
+            headers={"Retry-After": "30"},
+        )
+
+
+def _has_result(service: Service, job: Job) -> bool:
     result = job.result or {}
     if job.kind == "evaluate":
         return "rates" in result
@@ -187,9 +198,16 @@ def has_result(service: Service, job: Job) -> bool:
 
 
 def cancel_job(service: Service, job_id: str, principal: Principal) -> Job:
-    """End a job."""
+    """End a job that waits, and ask for the end of one that runs."""
     _check_may(service.jobs.get(job_id), principal)
-    cancel(service.records, job_id)
+    with service.records.writing() as connection:
+        job = job_in(connection, job_id)
+        if job.state == "queued":
+            end_job(connection, job_id, "cancelled")
+        elif job.state == "running":
+            connection.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job_id,))
+        elif job.state != "cancelled":
+            raise Problem(409, f"job {job_id} has ended already; it is {job.state}")
     return service.jobs.get(job_id)
 
 
@@ -198,12 +216,18 @@ def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
     job = service.jobs.get(job_id)
     _check_may(job, principal)
     check_room(service, job.owner)
-    retry(
-        service.records,
-        job_id,
-        most_waiting=service.settings.jobs_waiting,
-        has_result=lambda one: has_result(service, one),
-    )
+    with service.records.writing() as connection:
+        same = _same(service, connection, job.key)
+        if same is not None:
+            what = "it" if same.id == job_id else f"job {same.id} does the same and"
+            raise Problem(409, f"job {job_id} need not be tried again: {what} is {same.state}")
+        _check_waiting(service, connection, job.owner)
+        connection.execute(
+            "UPDATE jobs SET state = 'queued', queued_s = ?, interrupted = 0, ended_s = NULL, "
+            f"cancel_requested = 0, {NO_STAGE}, error = NULL, result = NULL WHERE id = ?",
+            (time.time(), job_id),
+        )
+        add_event(connection, job_id, "state", {"state": "queued"})
     service.wake_slots()
     return service.jobs.get(job_id)
 

@@ -1,26 +1,56 @@
-"""What the kinds of jobs do: a function each, from a request to a result.
+"""The process of one job: it reads an order, says how far it is, and leaves a result or an error.
 
-What a job makes is made in a folder of its own, and moved to its place in one step when it is
-whole; what is there already is not made again.
+The order is the first line of its input. What it has to say are lines of JSON on its output: a
+stage, a line of the log, and at last the result or the error. It ends when its input does, which
+is when the worker that started it is gone.
+
+What the kinds of jobs do is a function each, from a request to a result. What a job makes is made
+in a folder of its own, and moved to its place in one step when it is whole; what is there already
+is not made again.
 """
 
 from __future__ import annotations
 
+import ctypes
+import json
+import logging
 import os
 import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from starcat.errors import TargetMissing
+from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.service.jobs.job import Job, Kind
+from starcat.query.confinement import limit_memory
+from starcat.service.jobs.job import Job, Kind, Outcome, failed
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
+from starcat.service.sandbox.child import own_output
 from starcat.service.settings import Settings
 from starcat.storage.atomic import sync
+from starcat.storage.locks import locked
+
+NICENESS = 10
+"""Requests come before jobs."""
+
+STAGES_A_SECOND = 4.0
+
+MAX_LINE = 2000
+"""Characters of a line of the log that are kept."""
+
+NO_THREAD = "can't start new thread"
+"""What Python says where there is no memory for the stack of a thread."""
+
+_SET_PARENT_DEATH_SIGNAL = 1
 
 Log = Callable[[str, str], None]
 """Called with a level and a line of the log."""
@@ -56,8 +86,7 @@ def prepare(kind: Kind) -> None:
         import_module(name)
 
 
-def do_job(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
-    """Do a job."""
+def _do_job(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     shutil.rmtree(order.work, ignore_errors=True)
     order.work.mkdir(parents=True)
     return _DOES[order.kind](order, progress, log)
@@ -204,3 +233,116 @@ def order_of(job: Job, settings: Settings, root: str) -> Order:
 def threads_of(workers: int) -> int:
     """Return how many threads a job may use where several run at the same time."""
     return max(1, (os.cpu_count() or 1) // max(1, workers))
+
+
+class Messages:
+    """What happens, written as lines of JSON."""
+
+    def __init__(self, output: IO[bytes]) -> None:
+        self._output = output
+        self._lock = threading.Lock()
+        self._stage, self._at_s = "", 0.0
+
+    def stage(self, stage: str, done: int, total: int | None) -> None:
+        """Write how much of a stage is done, unless that was written a moment ago."""
+        now = time.monotonic()
+        is_last = total is not None and done >= total
+        with self._lock:
+            is_new = stage != self._stage
+            if not (is_new or is_last or now - self._at_s >= 1.0 / STAGES_A_SECOND):
+                return
+            if is_last and not is_new and now - self._at_s < 0.05:
+                return
+            self._stage, self._at_s = stage, now
+        self.write(
+            {"stage": stage, "done": int(done), "total": None if total is None else int(total)}
+        )
+
+    def log(self, level: str, text: str) -> None:
+        """Write a line of the log."""
+        self.write({"log": text[:MAX_LINE], "level": level})
+
+    def write(self, content: dict[str, Any]) -> None:
+        """Write any message."""
+        with self._lock:
+            self._output.write(json.dumps(content).encode() + b"\n")
+            self._output.flush()
+
+
+class _Lines(logging.Handler):
+    """What starcat logs, as lines of the job's log."""
+
+    def __init__(self, messages: Messages) -> None:
+        super().__init__(logging.INFO)
+        self._messages = messages
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = "info" if record.levelno < logging.WARNING else "warning"
+        self._messages.log(level, record.getMessage())
+
+
+def main() -> None:
+    """Read the order, and do it."""
+    _end_with_parent()
+    messages = Messages(own_output())
+    order = Order(**json.loads(sys.stdin.buffer.readline()))
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    with suppress(OSError, AttributeError):
+        os.nice(NICENESS)
+        # What answers somebody who waits gets a processor at once, where Linux can do that.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    logger = logging.getLogger("starcat")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(_Lines(messages))
+    with locked(order.paths.job_lock(order.job_id)):
+        prepare(order.kind)
+        limit_memory(order.memory_bytes)
+        try:
+            messages.write({"result": _do_job(order, messages.stage, messages.log)})
+        except Exception as error:
+            messages.write({"error": _problem_of(error, order)})
+    sys.stderr.flush()
+    os._exit(0)  # whatever threads of libraries do
+
+
+def _end_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+
+
+def _end_with_input() -> None:
+    """End this process, and those that it has started, when its input ends."""
+    while sys.stdin.buffer.read(1):
+        pass
+    if hasattr(os, "killpg") and os.getpgid(0) == os.getpid():
+        os.killpg(os.getpid(), signal.SIGKILL)
+    os._exit(1)
+
+
+def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
+    """Return problem details of an exception; a traceback is the operator's."""
+    from starcat.failures import failure_of
+    from starcat.service.problems import ProblemDetails, problem_of, without_folders
+
+    if isinstance(error, MemoryError) or NO_THREAD in str(error):
+        return dict(out_of_memory(order.memory_bytes).content)
+    if isinstance(error, OSError) and not isinstance(error, StarcatError):
+        failure = failure_of(error, "the job")
+        detail = without_folders(failure.message)
+        problem = ProblemDetails(
+            title="The system refused", status=500, detail=detail, kind=failure.kind
+        )
+    else:
+        problem = problem_of(error)
+    if problem.status == 500:
+        traceback.print_exception(error)
+    return problem.model_dump(exclude_none=True)
+
+
+def out_of_memory(memory_bytes: int) -> Outcome:
+    """Return what to say of a job that wanted more memory than it may take."""
+    detail = (
+        f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
+        "(job_memory_gib); ask for less, or ask the operator for more"
+    )
+    return failed("Out of memory", 422, detail)

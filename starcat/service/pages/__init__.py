@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from starcat.service.pages import (
-    console,
-    databases,
-    home,
-    identify,
-    jobs,
-    new,
-    releases,
-    rendering,
-)
+from starcat.service.pages import console, databases, home, identify, jobs, new, releases, rendering
 
 ROUTERS: tuple[APIRouter, ...] = (
     rendering.static_router,

@@ -17,21 +17,15 @@ from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_qu
 from starcat.query.result import ResultTable
 from starcat.service.access import Reader
 from starcat.service.api.sql import SqlQuery, result_file, result_table
-from starcat.service.pages.facts import database_row, products_of
+from starcat.service.pages.facts import database_rows, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
 
 router = page_router()
-
-ROWS = (20, 100, 500, 2000)
-"""Rows that can be shown."""
-
-VALUE = "value."
-"""What the names of fields with values of ``$name`` begin with."""
-
-MAX_TEXT = 8_000
-"""Characters of a query, which is part of an address."""
+ROWS = (20, 100, 500, 2000)  # rows that can be shown
+VALUE = "value."  # what the names of fields with values of ``$name`` begin with
+MAX_TEXT = 8_000  # characters of a query, which is part of an address
 
 FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIMIT 20"
 """What stands in the console before anything was asked."""
@@ -129,12 +123,7 @@ def _checked(service: Service, database_id: str, form: ConsoleForm, most: int) -
 
 
 def _page(
-    request: Request,
-    service: Service,
-    database_id: str,
-    content: dict[str, Any],
-    *,
-    is_part: bool,
+    request: Request, service: Service, database_id: str, content: dict[str, Any], *, is_part: bool
 ) -> Response:
     database = service.library.database(database_id)
     problem: ProblemDetails | None = content["problem"]
@@ -150,7 +139,7 @@ def _page(
         "console.html",
         status=status,
         **content,
-        row=database_row(service, database),
+        row=database_rows(service, database)[0],
         formats={name: FORMATS[name].title for name in PAGE_FORMATS},
         tab="sql",
         text=text,

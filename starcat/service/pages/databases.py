@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,23 +11,18 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from starcat.artifact.diff import Difference
-from starcat.errors import ProductError, TargetMissing
+from starcat.errors import TargetMissing
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
 from starcat.report.coverage_map import Fields, field_at, nearest_raster, raster_png, sky_map
-from starcat.service.access import Builder, Reader, Role
-from starcat.service.api.databases import difference_of
+from starcat.service.access import Builder, Reader
+from starcat.service.api.databases import difference_of, fields_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
-from starcat.service.pages.facts import (
-    MANIFEST_DIGEST,
-    database_row,
-    database_rows,
-    products_of,
-    report_of,
-)
+from starcat.service.pages.facts import MANIFEST_DIGEST, database_rows, products_of, report_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.service import Service, TheService
+from starcat.service.settings import Role
 
 router = page_router()
 
@@ -36,16 +30,11 @@ REPORT_PAGE = "report/index.html"
 REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox"
 """A report has its style and its plots inside, and nothing else; no script of it runs."""
 
-COVERAGE = "report/coverage.csv"
 RASTER_WIDTH = 960
+FIELDS_SHOWN = 25  # fields of the tiling on a page
+DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
 
-FIELDS_SHOWN = 25
-"""Fields of the tiling on a page."""
-
-DIFFERENCES_SHOWN = 100
-"""Stars of each kind that a comparison lists."""
-
-KEPT = {"Cache-Control": "private, max-age=86400"}
+CACHED = {"Cache-Control": "private, max-age=86400"}
 """What never changes under its address: the id says what is in a database."""
 
 Order = Literal["fewest", "most", "number"]
@@ -111,28 +100,7 @@ def coverage_page(
     )
 
 
-def fields_of(database: Database) -> Fields:
-    """Read the fields of a database."""
-    path = database.folder / COVERAGE
-    try:
-        return _read_fields(path, path.stat().st_mtime_ns)
-    except (OSError, ValueError) as error:
-        raise ProductError(
-            f"{database.title}: {COVERAGE} cannot be read ({type(error).__name__}); build the "
-            "database again",
-            path=path,
-        ) from error
-
-
-@lru_cache(maxsize=16)
-def _read_fields(path: Path, changed_ns: int) -> Fields:
-    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, usecols=range(1, 6))
-    ra_deg, dec_deg, *counts = table.T
-    return Fields(ra_deg, dec_deg, *(one.astype(np.int64) for one in counts))
-
-
 def _ordered(fields: Fields, order: Order) -> list[int]:
-    """Return the numbers of the fields in an order."""
     if order == "number":
         return list(range(len(fields)))
     stars = fields.stars if order == "fewest" else -fields.stars
@@ -151,7 +119,7 @@ def coverage_raster(service: TheService, _: Reader, database_id: str) -> Respons
     """Give the raster of the map of the sky."""
     database = service.library.database(database_id)
     return Response(
-        _map_png(database.id, fields_of(database)), media_type="image/png", headers=KEPT
+        _map_png(database.id, fields_of(database)), media_type="image/png", headers=CACHED
     )
 
 
@@ -164,7 +132,7 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
         "dec_deg": fields.dec_deg.round(4).tolist(),
         "stars": fields.stars.tolist(),
     }
-    return JSONResponse(content, headers=KEPT)
+    return JSONResponse(content, headers=CACHED)
 
 
 @router.get("/databases/{database_id}/report")
@@ -174,7 +142,7 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     path = database.folder / REPORT_PAGE
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
         raise TargetMissing(f"{database.title} has no report; build it again to get one")
-    headers = {**KEPT, "Content-Security-Policy": REPORT_POLICY}
+    headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
     return Response(path.read_bytes(), media_type="text/html; charset=utf-8", headers=headers)
 
 
@@ -195,11 +163,7 @@ async def compare(
 
 
 def _comparison(
-    request: Request,
-    service: Service,
-    database_id: str,
-    other: str,
-    difference: Difference | None,
+    request: Request, service: Service, database_id: str, other: str, difference: Difference | None
 ) -> Response:
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
@@ -224,5 +188,4 @@ def evaluate(service: TheService, builder: Builder, database_id: str) -> Respons
 
 
 def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
-    """Return what the head of every page of a database needs."""
-    return {"row": database_row(service, database), "database": database, "tab": tab}
+    return {"row": database_rows(service, database)[0], "database": database, "tab": tab}

@@ -18,11 +18,9 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import content_of_toml, spec_from_dict
+from starcat.specs.reading import content_of_toml, put_key, spec_from_dict
 
-ORIGIN = "spec"
-"""What messages call the text."""
-
+ORIGIN = "spec"  # what messages call the text
 TEXT = "toml"
 BEFORE = "toml-before"
 LENS = "lens"
@@ -60,10 +58,7 @@ PRODUCTS = (
 )
 """Products that the form has a box for."""
 
-_OF_LENS = {
-    "field": ("camera.focal_length_mm", "camera.pixel_um"),
-    "focal": ("camera.fov_x_deg",),
-}
+_OF_LENS = {"field": ("camera.focal_length_mm", "camera.pixel_um"), "focal": ("camera.fov_x_deg",)}
 """What goes away where a camera is told by the one or by the other."""
 
 _USUAL_PIXEL_UM = 5.5
@@ -101,9 +96,9 @@ def draft_of_text(text: str) -> Draft:
     """Return the draft that a text is."""
     text = text.replace("\r\n", "\n")
     try:
-        return _checked(content_of_toml(text, ORIGIN), text)
+        return _draft(content_of_toml(text, ORIGIN), text)
     except ConfigError as error:
-        return _draft({}, text, None, ConfigError(str(error), key=TEXT))
+        return _draft({}, text, ConfigError(str(error), key=TEXT))
 
 
 def draft_of_form(form: Mapping[str, str]) -> Draft:
@@ -120,8 +115,8 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     try:
         edit = _edit(content, form)
     except ConfigError as error:
-        return _draft(content, before, None, error)
-    return _checked(edit.content, edit.text(before)) if edit.changes else known
+        return _draft(content, before, ConfigError(str(error), key=TEXT))
+    return _draft(edit.content, edit.text(before)) if edit.changes else known
 
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
@@ -137,7 +132,7 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
     """Return the draft of a spec that is parsed."""
-    return _checked(content, tomlkit.dumps(content))
+    return _draft(content, tomlkit.dumps(content))
 
 
 def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,20 +141,17 @@ def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     for path, key in _KEYS.items():
         value = _at(content, path)
         if value is not None and (key.default is REQUIRED or value != key.default):
-            _put(kept, path, value)
+            put_key(kept, path, value)
     return kept
 
 
-def _checked(content: Mapping[str, Any], text: str) -> Draft:
-    try:
-        return _draft(content, text, spec_from_dict(dict(content), ORIGIN), None)
-    except ConfigError as error:
-        return _draft(content, text, None, error)
-
-
-def _draft(
-    content: Mapping[str, Any], text: str, spec: BuildSpec | None, error: ConfigError | None
-) -> Draft:
+def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = None) -> Draft:
+    spec = None
+    if error is None:
+        try:
+            spec = spec_from_dict(dict(content), ORIGIN)
+        except ConfigError as found:
+            error = found
     has_focal = any(_at(content, key) is not None for key in _OF_LENS["field"])
     enabled = {name: _at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS}
     source = _at(content, "catalog.source")
@@ -206,7 +198,7 @@ class _Edit:
     def put(self, path: str, value: Any) -> None:
         """Change a key; None removes it."""
         if value is not None or _at(self.content, path) is not None:
-            _put(self.content, path, value)
+            put_key(self.content, path, value)
             self.changes[path] = value
 
     def text(self, before: str) -> str:
@@ -214,7 +206,7 @@ class _Edit:
         try:
             document = tomlkit.parse(before)
             for path, value in self.changes.items():
-                _put(document, path, value)
+                put_key(document, path, value)
             text = tomlkit.dumps(document)
             if content_of_toml(text, ORIGIN) == self.content:
                 return text
@@ -224,7 +216,6 @@ class _Edit:
 
 
 def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
-    """Return the changes that the fields of a form make."""
     edit = _Edit(content)
     source = _at(content, "catalog.source")
     for key in FIELDS:
@@ -287,23 +278,3 @@ def _at(content: Mapping[str, Any], path: str) -> Any:
             return None
         value = value.get(name)
     return value
-
-
-def _put(content: dict[str, Any], path: str, value: Any) -> None:
-    """Change a key; a table inside another that becomes empty goes too."""
-    *tables, name = path.split(".")
-    inside = []
-    for table in tables:
-        if table not in content:
-            content[table] = {}
-        inside.append((content, table))
-        content = content[table]
-        if not isinstance(content, dict):
-            raise ConfigError(f"{path}: {table} is a value, not a table of the spec", key=TEXT)
-    if value is not None:
-        content[name] = value
-        return
-    content.pop(name, None)
-    for outer, table in reversed(inside[1:]):
-        if not outer[table]:
-            del outer[table]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,12 +17,8 @@ from starcat.service.service import Service
 from starcat.storage.schema import product_schema
 
 REPORT = "report/report.json"
-
-MANIFEST_DIGEST = "manifest_sha256"
-"""Key of a manifest with the digest of all the others."""
-
-MAX_JOBS = 1000
-"""Jobs that are looked through for the time of a build."""
+MANIFEST_DIGEST = "manifest_sha256"  # key of a manifest with the digest of all the others
+MAX_JOBS = 1000  # jobs that are looked through for the time of a build
 
 
 @dataclass(frozen=True)
@@ -36,36 +31,8 @@ class Row:
     built_s: float  # seconds since 1970
 
 
-@dataclass(frozen=True)
-class Product:
-    """A product of a database."""
-
-    name: str
-    schema: str  # with its version
-    description: str  # what a row is, and what else is stored
-    parquet: str  # its file
-    rows: int
-    bytes: int  # of the file
-    in_database: bool  # whether the matcher's file has it too
-    columns: list[tuple[str, str, str, str]]  # name, type, unit and meaning of each
-
-    @property
-    def summary(self) -> str:
-        """What a row is."""
-        return re.split(r"[.:;] ", self.description)[0].rstrip(".")
-
-
-def database_rows(service: Service) -> list[Row]:
-    """Return all databases as the list shows them."""
-    return _rows(service, service.library.databases())
-
-
-def database_row(service: Service, database: Database) -> Row:
-    """Return one database as the list shows it."""
-    return _rows(service, [database])[0]
-
-
-def _rows(service: Service, databases: list[Database]) -> list[Row]:
+def database_rows(service: Service, *databases: Database) -> list[Row]:
+    """Return databases as the list shows them: these, or all."""
     released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
     built: dict[str, float] = {}
     for job in service.jobs.all(state="done", most=MAX_JOBS):
@@ -79,7 +46,7 @@ def _rows(service: Service, databases: list[Database]) -> list[Row]:
             one.title in released and released[one.title] == one.manifest_blob.sha256,
             built.get(one.id) or (one.folder / MANIFEST_NAME).stat().st_mtime,
         )
-        for one in databases
+        for one in databases or service.library.databases()
     ]
 
 
@@ -91,25 +58,18 @@ def _rates(database: Database) -> list[Mapping[str, Any]]:
         return []
 
 
-def products_of(manifest: Mapping[str, Any]) -> list[Product]:
-    """Return the products of a database."""
-    found = []
-    for name, facts in manifest["products"].items():
-        product, _, version = str(facts["schema"]).rpartition("-")
-        schema = product_schema(product, version)
-        found.append(
-            Product(
-                name=name,
-                schema=facts["schema"],
-                description=schema.description,
-                parquet=facts["parquet"],
-                rows=int(facts["rows"]),
-                bytes=int(manifest["files"][facts["parquet"]]["bytes"]),
-                in_database=bool(facts.get("in_database")),
-                columns=[(c.name, c.dtype, c.unit, c.description) for c in schema.columns],
-            )
-        )
-    return found
+def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the products of a manifest, each with its schema and the size of its file."""
+    return [
+        {
+            **facts,
+            "name": name,
+            "schema": product_schema(*facts["schema"].rsplit("-", 1)),
+            "bytes": manifest["files"][facts["parquet"]]["bytes"],
+            "in_database": facts.get("in_database", False),
+        }
+        for name, facts in manifest["products"].items()
+    ]
 
 
 def report_of(database: Database) -> dict[str, Any]:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 
-from starcat.service.access import Reader
+from starcat.service.access import Identities, Reader, cookie_name, network_of, session_in
 from starcat.service.api import releases as api
 from starcat.service.jobs.job import ENDED
 from starcat.service.pages.facts import database_rows
 from starcat.service.pages.releases import address_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.security import request_limits
-from starcat.service.security.auth import Identities, network_of
-from starcat.service.security.tokens import cookie_name, session_in
 from starcat.service.service import TheService
+from starcat.service.settings import Settings
 
 router = page_router()
-
-SHOWN = 8
-"""Databases, jobs and releases that are shown of each."""
+SHOWN = 8  # databases, jobs and releases that are shown of each
 
 
 @router.get("/")
@@ -97,14 +93,17 @@ def sign_in(
         return form
     answer = RedirectResponse(own_path(next_address), 303)
     answer.set_cookie(
-        cookie_name(service.settings),
-        identities.sessions.open(found),
+        value=identities.sessions.open(found),
         max_age=round(service.settings.session_hours * 3600),
-        secure=service.settings.is_secure,
-        httponly=True,
-        samesite="strict",
+        **_cookie(service.settings),
     )
     return answer
+
+
+def _cookie(settings: Settings) -> dict[str, Any]:
+    """Return what setting and deleting the cookie of a sign-in have to agree in."""
+    secure = settings.is_secure
+    return {"key": cookie_name(settings), "secure": secure, "httponly": True, "samesite": "strict"}
 
 
 @sign_in_router.post("/sign-out")
@@ -114,52 +113,30 @@ def sign_out(request: Request, service: TheService) -> Response:
     if secret is not None:
         request.app.state.identities.sign_out(secret)
     answer = RedirectResponse("/", 303)
-    answer.delete_cookie(
-        cookie_name(service.settings),
-        secure=service.settings.is_secure,
-        httponly=True,
-        samesite="strict",
-    )
+    answer.delete_cookie(**_cookie(service.settings))
     return answer
-
-
-@dataclass(frozen=True)
-class Operation:
-    """What an address does."""
-
-    # method, path, summary, description: as the schema has them
-    method: str
-    path: str
-    summary: str
-    description: str
-    parameters: list[tuple[str, str, str]]  # name, where it stands, and meaning of each
-    answers: list[tuple[str, str]]  # status and meaning of each
 
 
 @router.get("/api/docs")
 def interface(request: Request, reader: Reader) -> Response:
     """Show the REST interface."""
-    return render(request, "interface.html", groups=operations_of(request.app.openapi()))
-
-
-def operations_of(schema: dict[str, Any]) -> dict[str, list[Operation]]:
-    """Return the operations of a schema."""
-    groups: dict[str, list[Operation]] = {}
-    for path, methods in schema["paths"].items():
-        for method, told in methods.items():
-            [tag, *_] = told.get("tags") or ["other"]
-            groups.setdefault(tag, []).append(_operation(method.upper(), path, told))
-    return groups
-
-
-def _operation(method: str, path: str, told: dict[str, Any]) -> Operation:
-    parameters = [
-        (str(one.get("name", "")), str(one.get("in", "")), str(one.get("description", "")))
-        for one in told.get("parameters", [])
-    ]
-    answers = [
-        (status, str(one.get("description", "")))
-        for status, one in sorted(told.get("responses", {}).items())
-    ]
-    summary, description = str(told.get("summary", "")), str(told.get("description", ""))
-    return Operation(method, path, summary, description, parameters, answers)
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for path, methods in request.app.openapi()["paths"].items():
+        for method, operation in methods.items():
+            tag = next(iter(operation.get("tags", ())), "other")
+            groups.setdefault(tag, []).append(
+                {
+                    **operation,
+                    "method": method.upper(),
+                    "path": path,
+                    "parameters": [
+                        (one["name"], one["in"], one.get("description", ""))
+                        for one in operation.get("parameters", ())
+                    ],
+                    "answers": [
+                        (status, one["description"])
+                        for status, one in sorted(operation["responses"].items())
+                    ],
+                }
+            )
+    return render(request, "interface.html", groups=groups)

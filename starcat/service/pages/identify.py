@@ -6,23 +6,26 @@ import base64
 import io
 import math
 import re
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import Query, Request
 from fastapi.responses import Response
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
-from starcat.failures import validation_message
 from starcat.images.render import write_simulated
 from starcat.images.solve_files import IdentifyOptions
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
-from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
+from starcat.service.api.identify import (
+    MIB,
+    SUFFIXES,
+    FrameUpload,
+    checked_options,
+    identify_upload,
+)
 from starcat.service.library import Database
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, problem_of
@@ -33,12 +36,8 @@ from starcat.simulation.simulate import Noise, simulate_frames
 router = page_router()
 
 MAX_SEED = 2**31 - 1
-
-MAX_PIXELS = 2**23
-"""Frames with more are given as centroids, not as pictures."""
-
-NOISE_PX = 0.3
-"""Noise of a centroid, each axis."""
+MAX_PIXELS = 2**23  # frames with more are given as centroids, not as pictures
+NOISE_PX = 0.3  # noise of a centroid, each axis
 
 FIELDS = (
     "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
@@ -70,10 +69,9 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
 
 
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
-    """Return what the page shows of an answer."""
     database = service.library.database(given["database"])
     frame, options = frame_of(form, given, database, service), options_of(given, service)
-    found, picture = identify_upload(service, database.folder, frame, options, "png")
+    found, picture = identify_upload(service, database.id, frame, options, "png")
     first = found["frames"][0]
     return {
         "found": found,
@@ -135,8 +133,8 @@ def frame_of(
             "a simulated frame",
             key="file",
         )
-    is_mag = given["brightness"] == "mag"
-    suffix, text = centroid_file(given["centroids"], "mag" if is_mag else "light")
+    third = "mag" if given["brightness"] == "mag" else "flux"
+    suffix, text = centroid_file(given["centroids"], third)
     return FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))
 
 
@@ -148,17 +146,18 @@ def options_of(given: dict[str, str], service: Service) -> IdentifyOptions:
         "fov_error": None if percent is None else percent / 100.0,
         "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
     }
-    try:
-        options = IdentifyOptions.model_validate(content)
-    except ValidationError as error:
-        key, found = validation_message(error, show_input=True)
-        raise Problem(422, f"{key}: {found}", key=key) from None
-    return options.model_copy(update={"time_limit_s": service.settings.query_time_s})
+    return checked_options(content).model_copy(
+        update={"time_limit_s": service.settings.query_time_s}
+    )
 
 
 def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
+    stars = open_database(database.folder, ())
+    frame = next(
+        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
+    )
     with scratch_folder(service.paths) as folder:
-        write_frame(folder / name, database, seed)
+        write_simulated(folder / name, frame, stars.camera, seed)
         return (folder / name).read_bytes()
 
 
@@ -207,30 +206,13 @@ def frame_suffix(database: Database) -> str:
     return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"
 
 
-def write_frame(path: Path, database: Database, seed: int) -> None:
-    """Write a simulated frame."""
-    stars = open_database(database.folder, ())
-    frame = next(
-        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
-    )
-    write_simulated(path, frame, stars.camera, seed)
-
-
-Brightness = Literal["light", "mag"]
-
 MAX_LINES = 20_000
 
 _SEPARATORS = re.compile(r"[\s,;]+")
 
 
-def centroid_file(text: str, brightness: Brightness = "light") -> tuple[str, str]:
-    r"""Return pasted centroids as a centroid file.
-
-    Examples
-    --------
-    >>> centroid_file("10.5 20 3000\n30, 40, 1200")
-    ('.csv', 'x_px,y_px,flux\n10.5,20,3000\n30,40,1200\n')
-    """
+def centroid_file(text: str, third: str = "flux") -> tuple[str, str]:
+    """Return pasted centroids as a centroid file; ``third`` is what a third number is."""
     stripped = text.strip()
     if stripped[:1] in ("{", "["):
         return ".json", stripped
@@ -242,7 +224,6 @@ def centroid_file(text: str, brightness: Brightness = "light") -> tuple[str, str
             "no centroid was pasted; give a line 'x y' or 'x y brightness' for each, in pixels",
             key="centroids",
         )
-    third = {"light": "flux", "mag": "mag"}[brightness]
     names = ("x_px", "y_px", third)[: len(rows[0])]
     return ".csv", "\n".join(map(",".join, (names, *rows))) + "\n"
 

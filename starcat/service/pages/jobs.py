@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
@@ -20,10 +19,7 @@ from starcat.service.pages.rendering import count_text, page_router, render, siz
 from starcat.service.service import TheService
 
 JOBS_A_PAGE = 50
-
-LINES = 500
-"""Lines of the log that a page has; the address of the log has all."""
-
+LINES = 500  # lines of the log that a page has; the address of the log has all
 STATES: tuple[State, ...] = ("queued", "running", "done", "failed", "cancelled")
 
 STEPS = {
@@ -43,15 +39,6 @@ STEPS = {
 """What people see of the stages of each kind of job: a name, and first words of stages."""
 
 router = page_router()
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of a job."""
-
-    name: str  # for people
-    words: str  # first words of its stages
-    state: str  # how far it is
 
 
 @router.get("/jobs")
@@ -134,16 +121,16 @@ def progress_text(job: Job) -> str:
 
 def facts_of(job: Job) -> list[tuple[str, str]]:
     """Return what else is known of a job, besides the spec of a build."""
-    asked = {name: value for name, value in job.request.items() if name != "spec"}
-    made = {} if job.result is None else job.result
-    told: dict[str, Any] = {**asked, **{key: made[key] for key in made if key != "rates"}}
+    facts = {**job.request, **(job.result or {})}
     return [
-        (name.replace("_", " "), str(value)) for name, value in told.items() if value is not None
+        (name.replace("_", " "), str(value))
+        for name, value in facts.items()
+        if value is not None and name not in ("spec", "rates")
     ]
 
 
-def steps_of(job: Job, events: Sequence[Event]) -> list[Step]:
-    """Return the steps of a job."""
+def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:
+    """Return the steps of a job: name, first words of its stages, and how far it is."""
     begun = max(
         (event.number for event in events if event.data.get("state") == "running"), default=0
     )
@@ -161,5 +148,6 @@ def steps_of(job: Job, events: Sequence[Event]) -> list[Step]:
         state = "done" if job.state == "done" or k < reached else "open"
         if k == reached and job.state != "done":
             state = "current" if job.state == "running" else "failed"
-        found.append(Step(name, " ".join(words), "open" if job.state == "queued" else state))
+        state = "open" if job.state == "queued" else state
+        found.append({"name": name, "words": " ".join(words), "state": state})
     return found

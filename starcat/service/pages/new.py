@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+import base64
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
+from starcat.arrays import Array
 from starcat.errors import StarcatError
-from starcat.service.access import Reader, Role, principal_of
+from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.pipeline.estimate import Estimate
+from starcat.report.coverage_map import (
+    Bin,
+    Counts,
+    Fields,
+    SkyMap,
+    bins_of,
+    nearest_raster,
+    raster_png,
+    sky_map,
+)
+from starcat.service.access import Reader, principal_of
 from starcat.service.jobs.submission import submit_build
 from starcat.service.pages.draft import (
     TEXT,
@@ -17,7 +34,6 @@ from starcat.service.pages.draft import (
     draft_of_form,
     without_defaults,
 )
-from starcat.service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_content
 from starcat.service.pages.rendering import (
     ENVIRONMENT,
     count_text,
@@ -28,10 +44,14 @@ from starcat.service.pages.rendering import (
 )
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.settings import Role
 from starcat.specs.reading import preset, preset_names
 
-MOST_FIELDS = 100
-"""Fields of a form; this one has 30."""
+MOST_FIELDS = 100  # fields of a form; this one has 30
+MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
+MOST_BARS = 48
+MOST_MAPPED = 50_000
+"""Of more boresights than these no map is drawn: their fields would be finer than its dots."""
 
 router = page_router()
 
@@ -116,7 +136,9 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
 @router.get("/new/tiling")
 def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Response:
     """Tell a script where the fields of a tiling are."""
-    return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
+    ra_deg, dec_deg = _tiling(count)
+    content = {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
+    return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
 
 
 def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
@@ -160,7 +182,6 @@ def _page(
 
 
 def _summary(seen: Preview | None, draft: Draft, problem: ProblemDetails | None) -> str:
-    """Return what a spec would give in one line, or why that is not known."""
     if seen is None:
         why = next(iter(draft.errors.values()), problem.detail if problem else "")
         return f"No estimate: {why}" if why else ""
@@ -180,3 +201,70 @@ def _sources(service: Service) -> list[tuple[str, str]]:
         told = one.source.identifier if one.is_here else "its files are not here"
         found.append((one.source.name, f"{one.source.name} – {told}"))
     return found
+
+
+# What a spec would give: sizes, a histogram, and the map of the sky.
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar of the histogram of stars in a field."""
+
+    least: int  # stars of a field
+    most: int
+    fields: int
+    colour: str  # class of the colour that the map has for them
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What a spec would give."""
+
+    estimate: Estimate
+    files: list[tuple[str, int | None, int]]  # name, rows of a product, bytes; the largest first
+    bars: list[Bar]
+    map: SkyMap | None  # None: the tiling is too fine for a map
+    picture: str  # the raster, as an address that holds it
+
+
+def preview_of(estimate: Estimate) -> Preview:
+    """Return what the page shows of an estimate."""
+    counts = estimate.fields.count.astype(np.int64)
+    ra_deg, dec_deg = _tiling(len(counts))
+    none = np.zeros_like(counts)
+    fields = Fields(ra_deg, dec_deg, counts, none, none)
+    bins = bins_of(counts)
+    is_mapped = len(counts) <= MOST_MAPPED
+    return Preview(
+        estimate,
+        sorted(estimate.files, key=lambda file: (-file[2], file[0])),
+        _bars(counts, bins),
+        sky_map(fields) if is_mapped else None,
+        _picture(counts) if is_mapped else "",
+    )
+
+
+@lru_cache(maxsize=4)
+def _tiling(count: int) -> tuple[Array, Array]:
+    return radec_from_directions(saff_kuijlaars(count))
+
+
+def _bars(counts: Counts, bins: tuple[Bin, ...]) -> list[Bar]:
+    least, most = int(counts.min()), int(counts.max())
+    step = -(-(most - least + 1) // MOST_BARS)
+    fields = np.bincount((counts - least) // step)
+    bars = []
+    for low, count in zip(range(least, most + 1, step), fields.tolist(), strict=True):
+        colour = next((one.name for one in reversed(bins) if one.least <= low), bins[0].name)
+        bars.append(Bar(low, low + step - 1, count, colour))
+    return bars
+
+
+@lru_cache(maxsize=4)
+def _nearest(count: int) -> Array:
+    return nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
+
+
+def _picture(counts: Counts) -> str:
+    raster = raster_png(_nearest(len(counts)), counts)
+    return f"data:image/png;base64,{base64.b64encode(raster).decode()}"

@@ -8,12 +8,13 @@ from fastapi import Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from starcat.errors import StarcatError
-from starcat.service.access import Publisher, Reader, Role
+from starcat.service.access import Publisher, Reader
 from starcat.service.api import releases as api
 from starcat.service.pages.facts import database_rows
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.settings import Role
 
 router = page_router()
 

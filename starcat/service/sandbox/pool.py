@@ -1,58 +1,38 @@
-"""A bounded number at the same time: of threads that work, and of processes that are lent."""
+"""A bounded number of processes at the same time, and of threads that use them."""
 
 from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
 import anyio
 from anyio import CapacityLimiter, to_thread
 
+from starcat.errors import QueryError
+from starcat.query.session import Limits, Session, open_session
 from starcat.service.problems import Problem
+from starcat.service.settings import Settings
 
 WAIT_S = 10.0
 """Seconds that a request waits while others are answered."""
 
+IDLE = 4
+"""Query sessions that are kept while nobody asks; those used longest ago are closed first."""
+
+DISK_GB = 4.0
+"""Gigabytes of disk that a query may take for what does not fit into its memory."""
+
+GIB_IN_GB = 2**30 / 1e9
+
 P = ParamSpec("P")
 T = TypeVar("T")
 K = TypeVar("K")
-
-
-class Limiter:
-    """So many at the same time; `run` lets requests wait without holding a thread."""
-
-    def __init__(self, count: int) -> None:
-        self._threads = CapacityLimiter(count)
-        self._slots = threading.BoundedSemaphore(count)
-
-    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread when one of the threads is free."""
-        borrower = object()
-        with anyio.move_on_after(WAIT_S) as waiting:
-            await self._threads.acquire_on_behalf_of(borrower)
-        if waiting.cancelled_caught:
-            raise _busy()
-        try:
-            # A thread is free already: the limiter of this call keeps nobody waiting.
-            return await to_thread.run_sync(
-                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
-            )
-        finally:
-            self._threads.release_on_behalf_of(borrower)
-
-    @contextmanager
-    def slot(self) -> Iterator[None]:
-        """Hold one of the slots, which whoever streams an answer does for longer than `run`."""
-        if not self._slots.acquire(timeout=WAIT_S):
-            raise _busy()
-        try:
-            yield
-        finally:
-            self._slots.release()
 
 
 class Process(Protocol):
@@ -61,9 +41,6 @@ class Process(Protocol):
     @property
     def is_running(self) -> bool:
         """Whether it can be lent again."""
-
-    def close(self) -> None:
-        """End it."""
 
 
 ProcessT = TypeVar("ProcessT", bound=Process)
@@ -78,24 +55,39 @@ class Pool(Generic[K, ProcessT]):
 
     def __init__(
         self,
-        begin: Callable[[K], ProcessT],
+        begin: Callable[[K], AbstractContextManager[ProcessT]],
         most: int,
         most_idle: int,
         harmless: tuple[type[Exception], ...] = (),
     ) -> None:
         self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
-        self._limiter = Limiter(most)
-        self.run = self._limiter.run  # for handlers that are ``async def``
-        self._idle: list[tuple[K, ProcessT]] = []
+        self._threads = CapacityLimiter(most)
+        self._slots = threading.BoundedSemaphore(most)
+        self._idle: list[tuple[K, ProcessT, ExitStack]] = []
         self._lock = threading.Lock()
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
 
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function in a thread when one is free; who waits for it holds no thread."""
+        borrower = object()
+        with anyio.move_on_after(WAIT_S) as waiting:
+            await self._threads.acquire_on_behalf_of(borrower)
+        if waiting.cancelled_caught:
+            raise _busy()
+        try:
+            # A thread is free already: the limiter of this call keeps nobody waiting.
+            return await to_thread.run_sync(
+                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
+            )
+        finally:
+            self._threads.release_on_behalf_of(borrower)
+
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
         """Give a process that nobody else uses meanwhile."""
-        with self._limiter.slot():
-            process = self._idle_one(key) or self._begin(key)
+        with self._slot():
+            process, closing = self._idle_one(key) or self._begun(key)
             is_reusable = False
             try:
                 yield process
@@ -104,7 +96,7 @@ class Pool(Generic[K, ProcessT]):
                 is_reusable = True
                 raise
             finally:
-                self._give_back(key, process, is_reusable and process.is_running)
+                self._give_back((key, process, closing), is_reusable and process.is_running)
 
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
@@ -119,29 +111,88 @@ class Pool(Generic[K, ProcessT]):
             self._is_closed = True
         self.forget(lambda _: True)
 
-    def _idle_one(self, key: K) -> ProcessT | None:
+    @contextmanager
+    def _slot(self) -> Iterator[None]:
+        """Hold one of the slots, which whoever streams an answer does for longer than `run`."""
+        if not self._slots.acquire(timeout=WAIT_S):
+            raise _busy()
+        try:
+            yield
+        finally:
+            self._slots.release()
+
+    def _begun(self, key: K) -> tuple[ProcessT, ExitStack]:
+        with ExitStack() as closing:
+            return closing.enter_context(self._begin(key)), closing.pop_all()
+
+    def _idle_one(self, key: K) -> tuple[ProcessT, ExitStack] | None:
         with self._lock:
             found = next((one for one in reversed(self._idle) if one[0] == key), None)
-            if found is not None:
-                self._idle.remove(found)
-        if found is not None and not found[1].is_running:
-            _close([found])
-            return self._idle_one(key)
-        return None if found is None else found[1]
+            if found is None:
+                return None
+            self._idle.remove(found)
+        if found[1].is_running:
+            return found[1:]
+        _close([found])
+        return self._idle_one(key)
 
-    def _give_back(self, key: K, process: ProcessT, is_reusable: bool) -> None:
-        gone = [] if is_reusable else [(key, process)]
+    def _give_back(self, lent: tuple[K, ProcessT, ExitStack], is_reusable: bool) -> None:
+        gone = [] if is_reusable else [lent]
         with self._lock:
             if is_reusable:
-                self._idle.append((key, process))
+                self._idle.append(lent)
             while len(self._idle) > (0 if self._is_closed else self._most_idle):
                 gone.append(self._idle.pop(0))
         _close(gone)
 
 
-def _close(idle: list[tuple[K, ProcessT]]) -> None:
+def _close(idle: list[tuple[K, ProcessT, ExitStack]]) -> None:
     while idle:
-        idle.pop()[1].close()
+        idle.pop()[-1].close()
+
+
+Key = tuple[tuple[str, int, int], ...]  # path, inode and time of each target
+
+
+class QueryPool:
+    """Query sessions, which are kept for the next query about the same targets.
+
+    Each is a process of its own with the guard of `starcat.query`; `run` calls what uses `session`
+    in a thread.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        memory_gb = settings.query_memory_gib * GIB_IN_GB
+        self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
+        self._open: Pool[Key, Session] = Pool(self._begin, settings.queries, IDLE, (QueryError,))
+        self.run = self._open.run
+        self.close = self._open.close
+
+    @contextmanager
+    def session(
+        self, targets: Sequence[str | Path], time_s: float | None = None
+    ) -> Iterator[Session]:
+        """Give a session about some targets, which nobody else uses meanwhile."""
+        limits = replace(self._limits, time_s=time_s or self._limits.time_s)
+        with self._open.lend(tuple(map(_identity, targets))) as one:
+            yield replace(one, limits=limits)
+
+    def forget(self, target: str | Path) -> None:
+        """Close the sessions about a target that is to be removed and that nobody uses."""
+        name = str(target)
+        self._open.forget(lambda key: name in [text for text, *_ in key])
+
+    def _begin(self, key: Key) -> AbstractContextManager[Session]:
+        return open_session([text for text, *_ in key], self._limits)
+
+
+def _identity(target: str | Path) -> tuple[str, int, int]:
+    """Return what tells a target from another that takes its place."""
+    try:
+        found = Path(target).stat()
+    except OSError:
+        return str(target), 0, 0
+    return str(target), found.st_ino, found.st_mtime_ns
 
 
 def _busy() -> Problem:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ class Sandbox:
         """Have an Arrow stream made a file of some format: some need the table in memory."""
         self.call("convert", {"source": str(source), "target": str(target), "form": form})
 
-    def _begin(self, _: None) -> Child:
+    def _begin(self, _: None) -> closing[Child]:
         child = Child(
             "starcat.service.sandbox.worker:serve",
             # astropy tries out a temporary file where it writes FITS.
@@ -60,7 +61,7 @@ class Sandbox:
             },
         )
         child.send({"scratch": str(self._scratch), "memory_bytes": self._memory_bytes})
-        return child
+        return closing(child)
 
     def _answer(self, child: Child, request: Mapping[str, Any]) -> dict[str, Any]:
         late = QueryLimitError(f"stopped after {self._time_s:g} s; send less")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from typing import get_args
 
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
@@ -21,8 +22,9 @@ from pydantic import BaseModel, Field
 from starlette.types import Scope
 
 from starcat.service.access import Reader
+from starcat.service.jobs.job import State
 from starcat.service.jobs.slots import JobSlots
-from starcat.service.security.request_limits import GIB, free_gib
+from starcat.service.security.request_limits import GIB, disk_shortage, free_gib
 from starcat.service.security.tokens import SessionStore
 from starcat.service.service import Service, TheService
 from starcat.version import __version__
@@ -30,8 +32,6 @@ from starcat.version import __version__
 router = APIRouter(tags=["operations"])
 
 BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
-
-STATES = ("queued", "running", "done", "failed", "cancelled")
 
 UNMATCHED = "unmatched"
 """Route of a request to no address that there is: what people make up is no label."""
@@ -88,13 +88,9 @@ class _State(Collector):
         """Return the figures."""
         service = self._service
         jobs = GaugeMetricFamily("starcat_jobs", "Jobs that are remembered.", labels=["state"])
-        with service.records.reading() as connection:
-            counts = dict(
-                connection.execute(
-                    "SELECT state, count(*) FROM jobs WHERE kind != 'query' GROUP BY state"
-                ).fetchall()
-            )
-        for state in STATES:
+        by_state = "SELECT state, count(*) FROM jobs WHERE kind != 'query' GROUP BY state"
+        counts = {state: count for state, count in service.records.rows(by_state)}  # noqa: C416
+        for state in get_args(State):
             jobs.add_metric([state], counts.get(state, 0))
         yield jobs
         yield GaugeMetricFamily(
@@ -151,7 +147,15 @@ def alive() -> Alive:
 )
 def ready(request: Request, service: TheService, who: Reader) -> Response:
     """Look at the records, the disk and the slots of jobs."""
-    reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
+    reasons = []
+    try:
+        with service.records.writing() as connection:
+            connection.execute("SELECT 1")
+    except sqlite3.Error as error:
+        reasons.append(f"the records cannot be written: {error}")
+    short = disk_shortage(service.settings)
+    if short is not None:
+        reasons.append(short)
     slots: JobSlots = request.app.state.slots
     if not slots.is_alive:
         reasons.append("a slot of jobs has ended; start the service again")
@@ -165,21 +169,3 @@ def ready(request: Request, service: TheService, who: Reader) -> Response:
 def figures(request: Request, who: Reader) -> Response:
     """Return all figures as text."""
     return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
-
-
-def _lack_of_records(service: Service) -> str | None:
-    try:
-        with service.records.writing() as connection:
-            connection.execute("SELECT 1")
-    except sqlite3.Error as error:
-        return f"the records cannot be written: {error}"
-    return None
-
-
-def _lack_of_disk(service: Service) -> str | None:
-    free, least = free_gib(service.settings.root), service.settings.free_gib
-    return None if free >= least else f"{free:.1f} GiB of disk are left, less than {least:g}"
-
-
-CHECKS: tuple[Callable[[Service], str | None], ...] = (_lack_of_records, _lack_of_disk)
-"""Each returns what is wrong, or None."""

@@ -3,24 +3,32 @@
 It gets a name, a line in the log and a place in the figures (`RequestContext`); its answer gets
 headers that browsers keep to (`SafeHeaders`); it is refused where a check says so (`Refusals`); and
 what no handler foresaw is told without a traceback (`Defects`).
+
+The log has a line of JSON for each request and for whatever else is worth it, never a secret: of a
+request its path is written, not its query, which may hold what somebody asks, nor any header. JSON
+writes every control character as an escape, so no request can begin a line of its own.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import secrets
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from starcat.service.problems import Problem, as_json
-from starcat.service.security.logs import log_request, request_id
 from starcat.service.security.metrics import Metrics
-from starcat.service.security.request_limits import BodyLimits
+from starcat.service.security.request_limits import BodyLimits, address_of
 from starcat.service.settings import Settings
 
 ID_HEADER = "X-Request-ID"
@@ -43,7 +51,52 @@ ALWAYS = {
 }
 A_YEAR = "max-age=31536000"
 
+MOST = 500
+"""Characters of a path that are written."""
+
+QUIET = ("/healthz", "/readyz", "/metrics")
+"""Paths that machines ask for all the time: logged only where they fail."""
+
+request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
+
 _logger = logging.getLogger(__name__)
+_requests = logging.getLogger("starcat.service.requests")
+
+
+class JsonFormatter(logging.Formatter):
+    """A record of the log as an object on one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        content: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            "request_id": request_id.get(),
+        }
+        content |= getattr(record, "facts", {})
+        if record.exc_info:
+            content["exception"] = self.formatException(record.exc_info)
+        return json.dumps({name: value for name, value in content.items() if value is not None})
+
+
+def log_settings(level: str = "INFO") -> dict[str, Any]:
+    """Return the configuration of `logging` for the server."""
+    return {
+        "version": 1,
+        "disable_existing_loggers": False,
+        "formatters": {"json": {"()": JsonFormatter}},
+        "handlers": {
+            "stderr": {"class": "logging.StreamHandler", "formatter": "json", "stream": sys.stderr}
+        },
+        "root": {"handlers": ["stderr"], "level": "WARNING"},
+        "loggers": {
+            "starcat": {"level": level},
+            "uvicorn": {"level": "WARNING"},
+            "uvicorn.error": {"level": "WARNING"},
+        },
+    }
 
 
 class _HttpMiddleware(ABC):
@@ -91,8 +144,25 @@ class RequestContext(_HttpMiddleware):
             self._metrics.running.dec()
             taken_s = time.perf_counter() - begun_s
             self._metrics.count(scope, status, None if is_endless else taken_s)
-            log_request(scope, status, sent, taken_s)
+            _log_request(scope, status, sent, taken_s)
             request_id.reset(before)
+
+
+def _log_request(scope: Scope, status: int, sent: int, taken_s: float) -> None:
+    if status < 500 and scope["path"] in QUIET:
+        return
+    principal = scope.get("state", {}).get("principal")
+    facts = {
+        "method": scope["method"][:20],
+        "path": scope["path"][:MOST],
+        "status": status,
+        "bytes": sent,
+        "seconds": round(taken_s, 4),
+        "address": address_of(scope),
+        "who": getattr(principal, "name", None),
+    }
+    level = logging.ERROR if status >= 500 else logging.INFO
+    _requests.log(level, "request", extra={"facts": facts})
 
 
 class SafeHeaders(_HttpMiddleware):
@@ -158,7 +228,7 @@ class Defects(_HttpMiddleware):
         try:
             await self._app(scope, receive, send_noted)
         except Exception as error:
-            _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:500])
+            _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:
                 raise  # the server ends the connection, so that the client sees it is not whole
             await as_json(error)(scope, receive, send)

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
+from starcat.service.access import session_in
 from starcat.service.problems import Problem
-from starcat.service.security.tokens import session_in
 from starcat.service.settings import Settings
 
 SAFE = ("GET", "HEAD", "OPTIONS")
@@ -27,7 +27,7 @@ class Origins:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._names = known_names(settings)
+        self._names = _known_names(settings)
 
     def check(self, scope: Scope) -> None:
         """Refuse a request that is not meant for this service, or not meant by who sends it."""
@@ -70,8 +70,7 @@ class Origins:
         return None
 
 
-def known_names(settings: Settings) -> frozenset[str] | None:
-    """Return the names that the service may be called by."""
+def _known_names(settings: Settings) -> frozenset[str] | None:
     if not settings.is_loopback and settings.public_url is None:
         return None
     names = {"localhost", settings.host.lower()}

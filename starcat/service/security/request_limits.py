@@ -42,14 +42,9 @@ MOST_BUCKETS = 10_000
 class Buckets:
     """A bucket for each key: full at first, emptied by one each time, filled again steadily."""
 
-    def __init__(
-        self,
-        per_minute: float,
-        most_at_once: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, per_minute: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_s = per_minute / 60.0
-        self._size = per_minute if most_at_once is None else most_at_once
+        self._size = per_minute
         self._clock = clock
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
@@ -137,12 +132,20 @@ class BodyLimits:
 
 def check_disk(settings: Settings) -> None:
     """Refuse what would add to a disk that is nearly full."""
-    if free_gib(settings.root) < settings.free_gib:
-        raise Problem(
-            507,
-            f"the disk of the service has less than {settings.free_gib:g} GiB left; remove "
-            "unused databases or results, or tell the operator",
-        )
+    short = disk_shortage(settings)
+    if short is not None:
+        raise Problem(507, short)
+
+
+def disk_shortage(settings: Settings) -> str | None:
+    """Return what to say where the disk is nearly full."""
+    free = free_gib(settings.root)
+    if free >= settings.free_gib:
+        return None
+    return (
+        f"the disk of the service has {free:.2f} GiB free, and {settings.free_gib:g} have to be "
+        "left (free_gib); remove unused databases or results, or ask the operator"
+    )
 
 
 def free_gib(folder: Path) -> float:

@@ -14,18 +14,15 @@ import sqlite3
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from http.cookies import CookieError, SimpleCookie
 
 from starcat.errors import ConfigError, TargetMissing
-from starcat.service.access import Role
 from starcat.service.records import Records
-from starcat.service.settings import Settings
+from starcat.service.settings import Role
 
 PREFIX = "starcat_"
 """Beginning of every token, for people and for scanners of leaked secrets."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
-RESERVED = ("anonymous",)
 DAY_S = 86_400.0
 
 
@@ -75,7 +72,7 @@ class TokenStore:
         expires_s = None if expires_days is None else now_s + expires_days * DAY_S
         with self._records.writing() as connection:
             same = connection.execute("SELECT * FROM tokens WHERE name = ?", (name,)).fetchall()
-            if any(token_of(row).state(now_s) == "valid" for row in same):
+            if _valid(same) is not None:
                 raise ConfigError(
                     f"there is a valid token with the name {name!r}; choose another name, or "
                     f"revoke that one first: starcat token revoke {name}",
@@ -92,14 +89,12 @@ class TokenStore:
 
     def all(self) -> list[Token]:
         """Return all tokens, the oldest first, those that are no longer valid among them."""
-        with self._records.reading() as connection:
-            rows = connection.execute("SELECT * FROM tokens ORDER BY created_s, id").fetchall()
+        rows = self._records.rows("SELECT * FROM tokens ORDER BY created_s, id")
         return [token_of(row) for row in rows]
 
     def has_valid(self) -> bool:
         """Return whether anybody has a token that is valid now."""
-        now_s = time.time()
-        return any(token.state(now_s) == "valid" for token in self.all())
+        return _valid(self._records.rows("SELECT * FROM tokens")) is not None
 
     def revoke(self, name: str) -> list[Token]:
         """Make the valid tokens of a name, or the one of an id, worth nothing from now on."""
@@ -125,17 +120,12 @@ class TokenStore:
         """Return the token of a text."""
         if not text.startswith(PREFIX):
             return None
-        with self._records.reading() as connection:
-            row = connection.execute(
-                "SELECT * FROM tokens WHERE digest = ?", (digest_of(text),)
-            ).fetchone()
-        token = None if row is None else token_of(row)
-        return token if token is not None and token.state(time.time()) == "valid" else None
+        return _valid(self._records.rows("SELECT * FROM tokens WHERE digest = ?", digest_of(text)))
 
 
 def check_name(name: str) -> None:
     """Check the name of a token."""
-    if not NAME.fullmatch(name) or name in RESERVED:
+    if not NAME.fullmatch(name) or name == "anonymous":
         raise ConfigError(
             f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits and "
             "'.', '_', '@', '-', not 'anonymous'. Choose another",
@@ -151,14 +141,13 @@ def digest_of(secret: str) -> str:
 
 def token_of(row: sqlite3.Row) -> Token:
     """Return the token of a row of the records."""
-    return Token(
-        row["id"],
-        row["name"],
-        Role.named(row["role"]),
-        row["created_s"],
-        row["expires_s"],
-        row["revoked_s"],
-    )
+    facts = {name: row[name] for name in Token.__dataclass_fields__}
+    return Token(**{**facts, "role": Role.named(row["role"])})
+
+
+def _valid(rows: list[sqlite3.Row]) -> Token | None:
+    now_s = time.time()
+    return next((one for one in map(token_of, rows) if one.state(now_s) == "valid"), None)
 
 
 def _date(at_s: float | None) -> str | None:
@@ -187,15 +176,13 @@ class SessionStore:
 
     def find(self, secret: str) -> Token | None:
         """Return the token that a session was begun with; None where none is valid."""
-        now_s = time.time()
-        with self._records.reading() as connection:
-            row = connection.execute(
-                "SELECT tokens.* FROM sessions JOIN tokens ON tokens.id = sessions.token "
-                "WHERE sessions.digest = ? AND sessions.expires_s > ?",
-                (digest_of(secret), now_s),
-            ).fetchone()
-        token = None if row is None else token_of(row)
-        return token if token is not None and token.state(now_s) == "valid" else None
+        rows = self._records.rows(
+            "SELECT tokens.* FROM sessions JOIN tokens ON tokens.id = sessions.token "
+            "WHERE sessions.digest = ? AND sessions.expires_s > ?",
+            digest_of(secret),
+            time.time(),
+        )
+        return _valid(rows)
 
     def close(self, secret: str) -> None:
         """End a session."""
@@ -204,31 +191,12 @@ class SessionStore:
 
     def count(self) -> int:
         """Return the number of sessions that have not expired."""
-        with self._records.reading() as connection:
-            row = connection.execute(
-                "SELECT count(*) FROM sessions WHERE expires_s > ?", (time.time(),)
-            ).fetchone()
-        return int(row[0])
+        unexpired = "SELECT count(*) FROM sessions WHERE expires_s > ?"
+        [[count]] = self._records.rows(unexpired, time.time())
+        return int(count)
 
     def forget_expired(self) -> int:
         """Remove the sessions that have expired, and return how many."""
         with self._records.writing() as connection:
             done = connection.execute("DELETE FROM sessions WHERE expires_s <= ?", (time.time(),))
         return done.rowcount
-
-
-def cookie_name(settings: Settings) -> str:
-    """Return the name of the cookie; behind https one that only this very host can set."""
-    return "__Host-starcat" if settings.is_secure else "starcat"
-
-
-def session_in(cookies: str, settings: Settings) -> str | None:
-    """Return the secret of a session."""
-    name = cookie_name(settings)
-    if name not in cookies:
-        return None
-    try:
-        found = SimpleCookie(cookies).get(name)
-    except CookieError:
-        return None
-    return found.value or None if found is not None else None

@@ -9,36 +9,26 @@ from tempfile import SpooledTemporaryFile
 from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
-from starcat.errors import QueryLimitError, StarcatError, TargetMissing
+from starcat.errors import QueryLimitError, TargetMissing
 from starcat.exchange.columns import Label
+from starcat.exchange.votable_fields import error_document
 from starcat.exchange.writers import result_chunks
 from starcat.service.access import Reader
-from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
+from starcat.service.problems import ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import chunks_of
+from starcat.service.vo.tap import VOTableRoute, in_address
 from starcat.store.layout import is_store
-from starcat.vo.cone import (
-    MEDIA_TYPE,
-    ConeRequest,
-    cone_error,
-    cone_query,
-    cone_request,
-    star_view,
-    with_ucds,
-)
+from starcat.vo.cone import MEDIA_TYPE, ConeRequest, cone_query, cone_request, star_view, with_ucds
 
 
-class ConeRoute(RenderingRoute):
-    """A route whose errors are VOTables, but for those of who may do what."""
+class ConeRoute(VOTableRoute):
+    """A route whose errors are as cone searches have them; a wrong parameter is a bad request."""
 
-    def render(self, error: Exception, request: Request) -> Response:
-        """Return an error as cone searches have it; a wrong parameter is a bad request."""
-        problem = problem_of(error)
-        if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
-            return as_json(error)
+    def votable(self, error: Exception, problem: ProblemDetails) -> Response:
+        """Return an error as cone searches have it."""
         is_bad = problem.status == 422 and not isinstance(error, QueryLimitError)
-        headers = {**getattr(error, "headers", {}), **_VOTABLE}
-        return Response(cone_error(problem.detail), 400 if is_bad else problem.status, headers)
+        return Response(error_document(problem.detail), 400 if is_bad else problem.status, _VOTABLE)
 
 
 router = APIRouter(prefix="/scs", tags=["cone search"], route_class=ConeRoute)
@@ -49,26 +39,14 @@ _VOTABLE = {"Content-Type": MEDIA_TYPE}
 _STARS = "stars.parquet"
 _HELD_BYTES = 4 << 20
 """What an answer may take of the memory; a larger one is held in a file without a name."""
-PARAMETERS = {
-    "parameters": [
-        {
-            "name": name,
-            "in": "query",
-            "required": name in ("RA", "DEC", "SR"),
-            "description": text,
-            "schema": {"type": kind},
-            "example": example,
-        }
-        for name, kind, example, text in (
-            ("RA", "number", 83.6, "Right ascension of the centre, ICRS, decimal degrees."),
-            ("DEC", "number", -5.4, "Declination of the centre, ICRS, decimal degrees."),
-            ("SR", "number", 1.0, "Radius in degrees; 0 asks for the columns only."),
-            ("VERB", "integer", 2, "1: identity and place; 2: columns with a UCD; 3: all."),
-            ("MAXREC", "integer", 1000, "Rows at most."),
-            ("RESPONSEFORMAT", "string", "text/xml", "A format of TAP; VOTable by default."),
-        )
-    ]
-}
+_PARAMETERS = (
+    ("RA", "number", 83.6, "Right ascension of the centre, ICRS, decimal degrees."),
+    ("DEC", "number", -5.4, "Declination of the centre, ICRS, decimal degrees."),
+    ("SR", "number", 1.0, "Radius in degrees; 0 asks for the columns only."),
+    ("VERB", "integer", 2, "1: identity and place; 2: columns with a UCD; 3: all."),
+    ("MAXREC", "integer", 1000, "Rows at most."),
+    ("RESPONSEFORMAT", "string", "text/xml", "A format of TAP; VOTable by default."),
+)
 
 
 @router.get(
@@ -86,7 +64,7 @@ PARAMETERS = {
             )
         },
     },
-    openapi_extra=PARAMETERS,
+    openapi_extra=in_address(_PARAMETERS, ["RA", "DEC", "SR"]),
 )
 async def search(catalog: str, request: Request, service: TheService, reader: Reader) -> Response:
     """Find the stars within a radius of a place.
@@ -99,8 +77,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     return StreamingResponse(chunks_of(found), headers={"Content-Type": asked.media_type})
 
 
-def target_of(service: Service, name: str) -> tuple[Path, Label]:
-    """Return the database or the catalog of a name."""
+def _target_of(service: Service, name: str) -> tuple[Path, Label]:
     named = [one for one in service.library.databases() if name in (one.id, one.name, one.title)]
     if named:
         newest = named[-1]
@@ -124,7 +101,7 @@ def _read_ones(folder: Path, name: str) -> list[Path]:
 
 def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporaryFile[bytes]:
     """Return the whole answer, so that a slow reader keeps no session from others."""
-    folder, label = target_of(service, name)
+    folder, label = _target_of(service, name)
     max_rows = service.settings.max_rows
     maxrec = max_rows if asked.maxrec is None else min(asked.maxrec, max_rows)
     with service.query_pool.session([folder]) as session:

@@ -1,53 +1,187 @@
-"""Routers of TAP: queries that are answered at once, and what the service tells of itself."""
+"""TAP: queries that are answered at once, and what the service tells of itself.
+
+What its handlers share is here too: parameters of a request wherever they stand, and errors as
+VOTable.
+"""
 
 from __future__ import annotations
 
-import tempfile
+import shutil
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import AsyncIterator, Generator, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from anyio import CancelScope, to_thread
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
-from starcat.errors import TargetMissing, quoted
+from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
 from starcat.service.access import Reader
-from starcat.service.service import Service, TheService
-from starcat.service.vo.tap_request import (
-    FORM,
-    IN_ADDRESS,
-    PREFIX,
-    TapRequest,
-    TapRoute,
-    TheRequest,
-    base_url,
-)
+from starcat.service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
+from starcat.service.service import Service, TheService, service_of
+from starcat.service.transfers import body_type, scratch_folder
 from starcat.vo.documents import (
     MEDIA_TYPE,
+    VOTABLE_TYPE,
     availability,
     capabilities,
+    error_votable,
     examples_page,
     for_tap_plus,
     table_document,
     tableset,
 )
-from starcat.vo.parameters import Question, question
+from starcat.vo.parameters import MAX_UPLOADS, Parameters, Question, question
 
-router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=TapRoute)
+PREFIX = "/tap"
 
-_STARTED = datetime.now(UTC)
-
+MAX_PARAMETERS = 100
+MAX_PARAMETER_BYTES = 1 << 20
 
 READ_BYTES = 1 << 18
 
 LOOK_S = 1.0
 """How often a reader that waits looks whether the answer has ended."""
+
+TAP_PLUS = ("tables", "only_tables", "share_accessible")
+"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+
+_STARTED = datetime.now(UTC)
+
+_FORMS = ("application/x-www-form-urlencoded", "multipart/form-data")
+
+_PARAMETERS: tuple[tuple[str, str, object, str], ...] = (
+    ("QUERY", "string", "SELECT TOP 5 * FROM tap_schema.tables", "The query, in ADQL 2.1."),
+    ("LANG", "string", "ADQL", "ADQL, ADQL-2.0 or ADQL-2.1."),
+    ("RESPONSEFORMAT", "string", "csv", "A format of the capabilities; VOTable by default."),
+    ("MAXREC", "integer", 1000, "Rows at most; VOTable says where there were more."),
+    ("RUNID", "string", "mine", "What the client calls it."),
+    ("UPLOAD", "string", "mine,param:file1", "Tables that come along, as parts of the form."),
+)
+
+FORM: dict[str, Any] = {
+    "requestBody": {
+        "content": {
+            kind: {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        name: {"type": type_, "description": told, "example": example}
+                        for name, type_, example, told in _PARAMETERS
+                    },
+                }
+            }
+            for kind in _FORMS
+        }
+    }
+}
+"""For ``openapi_extra=``: the parameters of TAP in a form."""
+
+
+def in_address(
+    parameters: Sequence[tuple[str, str, object, str]], required: Sequence[str]
+) -> dict[str, Any]:
+    """Return for ``openapi_extra=`` parameters that a handler takes from the address itself.
+
+    Each has a name, a type, an example and a description.
+    """
+    return {
+        "parameters": [
+            {
+                "name": name,
+                "in": "query",
+                "required": name in required,
+                "description": told,
+                "schema": {"type": kind},
+                "example": example,
+            }
+            for name, kind, example, told in parameters
+        ]
+    }
+
+
+class VOTableRoute(RenderingRoute):
+    """A route whose errors are VOTables, but for those of who may do what."""
+
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return an error as the protocol has it."""
+        problem = problem_of(error)
+        if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
+            return as_json(error)
+        answer = self.votable(error, problem)
+        answer.headers.update(getattr(error, "headers", {}))
+        return answer
+
+    def votable(self, error: Exception, problem: ProblemDetails) -> Response:
+        """Return an error as TAP has it."""
+        return Response(error_votable(problem.detail), problem.status, media_type=VOTABLE_TYPE)
+
+
+@dataclass(frozen=True)
+class TapRequest:
+    """What a request says, in its address and its body."""
+
+    parameters: Parameters
+    uploads: dict[str, UploadFile]  # parts of the body that are files, by their names
+
+    def keep(self, folder: Path) -> dict[str, Path]:
+        """Copy the files of the request into a folder."""
+        kept = {}
+        for number, (name, upload) in enumerate(self.uploads.items()):
+            kept[name] = folder / f"upload-{number}.vot"
+            upload.file.seek(0)
+            with kept[name].open("wb") as stream:
+                shutil.copyfileobj(upload.file, stream)
+        return kept
+
+
+async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
+    """Give what a request says; its files are there while it is answered."""
+    given = list(request.query_params.multi_items())
+    kind = body_type(request)
+    if request.method != "POST" or not kind:
+        yield TapRequest(Parameters(given), {})
+        return
+    if kind not in _FORMS:
+        raise Problem(415, f"the body is {kind[:60]}; send one of {', '.join(_FORMS)}")
+    form = await _form(request)
+    try:
+        given += [(name, value) for name, value in form.multi_items() if isinstance(value, str)]
+        uploads = {name: one for name, one in form.items() if isinstance(one, UploadFile)}
+        yield TapRequest(Parameters(given), uploads)
+    finally:
+        await form.close()
+
+
+TheRequest = Annotated[TapRequest, Depends(tap_request)]
+
+
+async def _form(request: Request) -> FormData:
+    try:
+        return await request.form(
+            max_files=MAX_UPLOADS, max_fields=MAX_PARAMETERS, max_part_size=MAX_PARAMETER_BYTES
+        )
+    except HTTPException as error:
+        if error.status_code != 400:  # too large, or too slow
+            raise
+        raise ConfigError(f"the form cannot be read: {error.detail}") from error
+
+
+def base_url(request: Request) -> str:
+    """Return the address of TAP as the client sees it."""
+    own = service_of(request).settings.public_url or str(request.base_url)
+    return own.rstrip("/") + PREFIX
+
+
+router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=VOTableRoute)
 
 
 class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
@@ -130,7 +264,9 @@ class _Closing(StreamingResponse):
                 await to_thread.run_sync(self._rest.close)
 
 
-@router.get("/sync", summary="Answer a query in ADQL", openapi_extra=IN_ADDRESS)
+@router.get(  # an upload needs a form
+    "/sync", summary="Answer a query in ADQL", openapi_extra=in_address(_PARAMETERS[:-1], ["QUERY"])
+)
 @router.post(
     "/sync", summary="Answer a query in ADQL, perhaps about uploaded tables", openapi_extra=FORM
 )
@@ -152,13 +288,12 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         if gone.is_set():
             raise ClientGone
 
-    scratch = service.paths.scratch
-    with tempfile.TemporaryDirectory(prefix="sync-", dir=scratch) as folder:
-        files = given.keep(Path(folder)) | service.tap.jobs.answers(asked.uploads, owner)
-        parts = service.tap.queries.answer(asked, files, progress=watch)
+    with scratch_folder(service.paths) as folder:
+        files = given.keep(folder) | service.query_jobs.answers(asked.uploads, owner)
+        parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")
-    return first, Spool(parts, scratch, gone)
+    return first, Spool(parts, service.paths.scratch, gone)
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")
@@ -173,10 +308,6 @@ def get_availability() -> Response:
     return Response(availability(_STARTED), media_type=MEDIA_TYPE)
 
 
-TAP_PLUS = ("tables", "only_tables", "share_accessible")
-"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
-
-
 @router.get("/tables", summary="All tables (VOSI)")
 def get_tables(
     request: Request,
@@ -186,7 +317,7 @@ def get_tables(
 ) -> Response:
     """Return schemas, tables and columns."""
     given = request.query_params
-    found = service.tap.tables.state().tables
+    found = service.tap.state().tables
     if "tables" in given:
         found = found.chosen(given["tables"].split(","))
     content = tableset(found, detail == "max" and given.get("only_tables") != "true")
@@ -199,7 +330,7 @@ def get_tables(
 @router.get("/tables/{name}", summary="A table (VOSI)")
 def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
-    for table in service.tap.tables.state().tables.chosen([name]):
+    for table in service.tap.state().tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
 
@@ -207,5 +338,5 @@ def get_table(name: str, service: TheService, who: Reader) -> Response:
 @router.get("/examples", summary="Queries to begin with (DALI)")
 def get_examples(service: TheService, who: Reader) -> Response:
     """Return queries that run on the tables that there are."""
-    page = examples_page(service.tap.tables.state().tables)
+    page = examples_page(service.tap.state().tables)
     return Response(page, media_type="application/xhtml+xml")

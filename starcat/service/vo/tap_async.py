@@ -15,8 +15,8 @@ from starcat.errors import ConfigError, TargetMissing, quoted
 from starcat.exchange.formats import TAP_FORMATS
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
+from starcat.service.vo.tap import FORM, PREFIX, TheRequest, VOTableRoute, base_url
 from starcat.service.vo.tap_jobs import RESULT
-from starcat.service.vo.tap_request import FORM, PREFIX, TapRoute, TheRequest, base_url
 from starcat.vo.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
 from starcat.vo.uws import (
     ACTIVE,
@@ -28,7 +28,7 @@ from starcat.vo.uws import (
     results_document,
 )
 
-router = APIRouter(prefix=f"{PREFIX}/async", tags=["TAP"], route_class=TapRoute)
+router = APIRouter(prefix=f"{PREFIX}/async", tags=["TAP"], route_class=VOTableRoute)
 
 MAX_WAIT_S = 60.0
 """How long a request may wait for a change of phase."""
@@ -40,7 +40,7 @@ PHASES = (*ACTIVE, "COMPLETED", "ERROR", "ABORTED", "UNKNOWN", "HELD", "SUSPENDE
 
 def own_job(job_id: str, service: TheService, who: Reader) -> JobFacts:
     """Return the job of a request, which is one of who asks."""
-    return service.tap.jobs.job(job_id, who.name)
+    return service.query_jobs.job(job_id, who.name)
 
 
 TheJob = Annotated[JobFacts, Depends(own_job)]
@@ -64,7 +64,7 @@ def list_jobs(
     since = None if after is None else _seconds("AFTER", after)
     found = [
         job
-        for job in service.tap.jobs.jobs(who.name)
+        for job in service.query_jobs.jobs(who.name)
         if (not phases or job.phase in phases) and (since is None or job.created_s > since)
     ]
     return _xml(jobs_document(found[:last], f"{base_url(request)}/async"))
@@ -77,11 +77,11 @@ def make_job(given: TheRequest, request: Request, service: TheService, who: Read
     if phase not in (None, "RUN"):
         raise ConfigError(f"PHASE is {quoted(phase or '')}; a new job takes RUN only", key="PHASE")
     kept = [(name, value) for name, value in given.parameters.items() if name != "PHASE"]
-    job = service.tap.jobs.create(who.name)
-    files = given.keep(service.tap.jobs.folder(job.job_id))
-    service.tap.jobs.set_parameters(job.job_id, kept, files)
+    job = service.query_jobs.create(who.name)
+    files = given.keep(service.query_jobs.folder(job.job_id))
+    service.query_jobs.set_parameters(job.job_id, kept, files)
     if phase == "RUN":
-        service.tap.jobs.run(job.job_id)
+        service.query_jobs.run(job.job_id)
     return _see(request, job)
 
 
@@ -130,9 +130,9 @@ def set_phase(given: TheRequest, job: TheJob, request: Request, service: TheServ
     """Run a job that is pending, or abort one that is not at its end."""
     phase = given.parameters.one("PHASE")
     if phase == "RUN":
-        service.tap.jobs.run(job.job_id)
+        service.query_jobs.run(job.job_id)
     elif phase == "ABORT":
-        service.tap.jobs.abort(job.job_id)
+        service.query_jobs.abort(job.job_id)
     else:
         raise ConfigError(f"PHASE is {quoted(phase or '')}; it may be RUN or ABORT", key="PHASE")
     return _see(request, job)
@@ -156,7 +156,7 @@ def set_limit(given: TheRequest, job: TheJob, request: Request, service: TheServ
         raise ConfigError(
             f"EXECUTIONDURATION is {quoted(text)}; it is seconds", key="EXECUTIONDURATION"
         )
-    service.tap.jobs.set_limit(job.job_id, seconds)
+    service.query_jobs.set_limit(job.job_id, seconds)
     return _see(request, job)
 
 
@@ -172,7 +172,7 @@ def set_destruction(
 ) -> Response:
     """Set a time, at most as late as the service grants."""
     text = given.parameters.one("DESTRUCTION") or ""
-    service.tap.jobs.set_destruction(job.job_id, _seconds("DESTRUCTION", text))
+    service.query_jobs.set_destruction(job.job_id, _seconds("DESTRUCTION", text))
     return _see(request, job)
 
 
@@ -201,8 +201,8 @@ def set_parameters(
     """Set parameters of a job that is pending."""
     if job.phase != "PENDING":
         raise ConfigError(f"the job is {job.phase}; parameters are set before it is run")
-    files = given.keep(service.tap.jobs.folder(job.job_id))
-    service.tap.jobs.set_parameters(job.job_id, given.parameters.items(), files)
+    files = given.keep(service.query_jobs.folder(job.job_id))
+    service.query_jobs.set_parameters(job.job_id, given.parameters.items(), files)
     return _see(request, job)
 
 
@@ -215,7 +215,7 @@ def get_results(job: TheJob, request: Request) -> Response:
 @router.get("/{job_id}/results/result", summary="The answer of a job (TAP)")
 def get_result(job: TheJob, service: TheService) -> Response:
     """Return the answer in the format that was asked for."""
-    path = service.tap.jobs.folder(job.job_id) / RESULT
+    path = service.query_jobs.folder(job.job_id) / RESULT
     if job.phase != "COMPLETED" or not path.is_file():
         raise TargetMissing(
             f"the job is {job.phase} and has no answer; its phase tells when it has"
@@ -243,13 +243,13 @@ async def _changed(service: Service, job: JobFacts, most_s: float) -> JobFacts:
     found = job
     while found.phase == job.phase and job.phase in ACTIVE and time.monotonic() < ends:
         await asyncio.sleep(LOOK_S)
-        found = service.tap.jobs.job(job.job_id)
+        found = service.query_jobs.job(job.job_id)
     return found
 
 
 def _deleted(request: Request, service: Service, job: JobFacts) -> Response:
-    service.tap.jobs.abort(job.job_id)
-    service.tap.jobs.delete(job.job_id)
+    service.query_jobs.abort(job.job_id)
+    service.query_jobs.delete(job.job_id)
     return RedirectResponse(f"{base_url(request)}/async", 303)
 
 

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing
-from starcat.service.jobs.job import QUERY
-from starcat.service.jobs.job_states import Attempt, Outcome
+from starcat.service.jobs.job import QUERY, Attempt, Outcome
 from starcat.service.paths import JOB_ID, ServicePaths, checked
 from starcat.service.problems import Problem, problem_of
 from starcat.service.records import Records
-from starcat.service.vo.tap_queries import TapQueries
+from starcat.service.vo.tap_queries import Tap
 from starcat.storage.atomic import make_folder, whole_file
-from starcat.vo.documents import ServiceLimits
 from starcat.vo.parameters import Parameters, Upload, question
 from starcat.vo.uws import JobFacts
 
@@ -56,24 +54,18 @@ class QueryJobs:
     """The asynchronous queries of a service."""
 
     def __init__(
-        self,
-        records: Records,
-        paths: ServicePaths,
-        limits: ServiceLimits,
-        queries: TapQueries,
-        wake_slots: Callable[[], None],
+        self, records: Records, paths: ServicePaths, tap: Tap, wake_slots: Callable[[], None]
     ) -> None:
         self._records = records
         self._paths = paths
-        self._limits = limits
-        self._queries = queries
+        self._tap = tap
         self._wake_slots = wake_slots
 
     def create(self, owner: str) -> JobFacts:
         """Make a job without parameters, which is not run yet."""
         self.sweep()
         job_id, now_s = secrets.token_hex(16), time.time()
-        request = {"parameters": [], "files": {}, "run_id": "", "limit_s": self._limits.run_s}
+        request = {"parameters": [], "files": {}, "run_id": "", "limit_s": self._tap.limits.run_s}
         make_folder(self.folder(job_id))
         with self._records.writing() as connection:
             [waiting] = connection.execute(
@@ -88,7 +80,7 @@ class QueryJobs:
             connection.execute(
                 "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, "
                 "destroyed_s) VALUES (?, ?, '', ?, '', 'pending', ?, ?, ?)",
-                (job_id, QUERY, owner, json.dumps(request), now_s, now_s + self._limits.keep_s),
+                (job_id, QUERY, owner, json.dumps(request), now_s, now_s + self._tap.limits.keep_s),
             )
         return self.job(job_id)
 
@@ -101,12 +93,13 @@ class QueryJobs:
 
     def jobs(self, owner: str) -> list[JobFacts]:
         """Return all jobs of somebody, the newest first."""
-        with self._records.reading() as connection:
-            rows = connection.execute(
-                "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
-                "ORDER BY created_s DESC, id",
-                (QUERY, owner, time.time()),
-            ).fetchall()
+        rows = self._records.rows(
+            "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
+            "ORDER BY created_s DESC, id",
+            QUERY,
+            owner,
+            time.time(),
+        )
         return [_facts(row) for row in rows]
 
     def folder(self, job_id: str) -> Path:
@@ -138,14 +131,14 @@ class QueryJobs:
 
     def set_limit(self, job_id: str, seconds: float) -> None:
         """Set how long a job that has not been run may run, at most what is granted."""
-        most = float(self._limits.run_s)
+        most = float(self._tap.limits.run_s)
         limit_s = min(seconds, most) if seconds > 0 else most
         request = {**_request(self._row(job_id)), "limit_s": limit_s}
         self._change(job_id, ("pending",), request=json.dumps(request))
 
     def set_destruction(self, job_id: str, at_s: float) -> None:
         """Set when a job goes, at most as late as is granted."""
-        latest = self.job(job_id).created_s + self._limits.keep_s
+        latest = self.job(job_id).created_s + self._tap.limits.keep_s
         self._change(job_id, tuple(PHASES), destroyed_s=min(at_s, latest))
 
     def run(self, job_id: str) -> None:
@@ -165,11 +158,8 @@ class QueryJobs:
 
     def sweep(self) -> None:
         """Remove the jobs whose time is over."""
-        with self._records.reading() as connection:
-            rows = connection.execute(
-                "SELECT id FROM jobs WHERE kind = ? AND destroyed_s < ?", (QUERY, time.time())
-            ).fetchall()
-        for row in rows:
+        over = "SELECT id FROM jobs WHERE kind = ? AND destroyed_s < ?"
+        for row in self._records.rows(over, QUERY, time.time()):
             self.delete(row["id"])
 
     def answer(self, attempt: Attempt, is_stopping: Callable[[], bool]) -> Outcome:
@@ -194,39 +184,30 @@ class QueryJobs:
         except (StarcatError, Problem) as error:
             return Outcome("failed", {"detail": problem_of(error).detail})
         finally:
-            if attempt.cancel_requested() and not self._exists(job_id):
+            if attempt.cancel_requested() and not self._rows(job_id):
                 shutil.rmtree(self.folder(job_id), ignore_errors=True)
 
     def _written(self, job_id: str, check: Callable[..., None]) -> Outcome:
-        """Write the answer of a job into its file."""
         row = self._row(job_id)
         job, folder = _facts(row), self.folder(job_id)
-        asked = question(Parameters(job.parameters), self._queries.most_rows)
+        asked = question(Parameters(job.parameters), self._tap.limits.rows)
         files = {part: folder / name for part, name in _request(row)["files"].items()}
         files |= self.answers(asked.uploads, job.owner)
         with whole_file(folder / RESULT) as path, path.open("wb") as stream:
-            for part in self._queries.answer(asked, files, job.limit_s, check):
+            for part in self._tap.answer(asked, files, job.limit_s, check):
                 check()
                 stream.write(part)
         return Outcome("done", {"media_type": asked.form.tap_type})
 
-    def _exists(self, job_id: str) -> bool:
-        with self._records.reading() as connection:
-            found = connection.execute("SELECT 1 FROM jobs WHERE id = ?", (job_id,)).fetchone()
-        return found is not None
-
     def _row(self, job_id: str) -> sqlite3.Row:
-        checked(job_id, JOB_ID, "job")
-        with self._records.reading() as connection:
-            row: sqlite3.Row | None = connection.execute(
-                "SELECT * FROM jobs WHERE id = ? AND kind = ?", (job_id, QUERY)
-            ).fetchone()
-        if row is None:
-            raise _no_job(job_id)
-        return row
+        for row in self._rows(checked(job_id, JOB_ID, "job")):
+            return row
+        raise _no_job(job_id)
+
+    def _rows(self, job_id: str) -> list[sqlite3.Row]:
+        return self._records.rows("SELECT * FROM jobs WHERE id = ? AND kind = ?", job_id, QUERY)
 
     def _change(self, job_id: str, states: tuple[str, ...], **values: object) -> None:
-        """Set columns of a job if it is in one of some states."""
         setting = ", ".join(f"{name} = ?" for name in values)
         within = ", ".join("?" * len(states))
         with self._records.writing() as connection:

@@ -1,47 +1,49 @@
-"""A question of TAP from its parameters to the bytes of its answer."""
+"""What TAP may be asked about, and a question from its parameters to the bytes of its answer."""
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import hashlib
+import logging
+import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, StarcatError
 from starcat.exchange.columns import Label
 from starcat.exchange.formats import Format
 from starcat.exchange.writers import result_chunks
 from starcat.progress import Progress, no_progress
+from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
-from starcat.service.query_pool import QueryPool
+from starcat.service.sandbox.pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
+from starcat.service.settings import Settings
 from starcat.service.transfers import chunks_of, scratch_folder, write_rows
+from starcat.store.layout import is_store
 from starcat.vo.adql import ask, translate
+from starcat.vo.documents import ServiceLimits
 from starcat.vo.parameters import Question, Upload
-from starcat.vo.tables import Schema, Table
-from starcat.vo.tap_schema import UPLOADS
+from starcat.vo.tables import (
+    NAME,
+    UPLOADS,
+    Schema,
+    Table,
+    Tables,
+    own_schema,
+    session_schemas,
+    write_tap_schema,
+)
 from starcat.vo.uploads import table_of_facts
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
-import hashlib
-import logging
-import threading
-from dataclasses import dataclass
-
-from starcat.catalog.verdict import rejected_path
-from starcat.errors import StarcatError
-from starcat.service.library import Library
-from starcat.store.layout import is_store
-from starcat.vo.tables import Tables
-from starcat.vo.tap_schema import NAME, own_schema, session_schemas, write_tap_schema
+DAY_S = 86_400
 
 _LABEL = Label("result")
-
 
 _logger = logging.getLogger(__name__)
 
@@ -50,17 +52,31 @@ _logger = logging.getLogger(__name__)
 class TapState:
     """What there is to be asked."""
 
-    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA at the end
-    tables: Tables  # all tables, with TAP_SCHEMA
+    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA and uploads at the end
+    tables: Tables  # all tables, with those of TAP_SCHEMA and uploads
 
 
-class TapTables:
-    """The tables of a service, as they are now."""
+class Tap:
+    """What TAP grants, the tables of a service as they are now, and answers about them."""
 
-    def __init__(self, paths: ServicePaths, library: Library, query_pool: QueryPool) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        paths: ServicePaths,
+        library: Library,
+        query_pool: QueryPool,
+        sandbox: Sandbox,
+    ) -> None:
+        self.limits = ServiceLimits(
+            run_s=int(settings.job_time_s),
+            keep_s=int(settings.keep_results_days * DAY_S),
+            rows=settings.max_rows,
+            upload_bytes=int(settings.upload_mib * 2**20),
+        )
         self._paths = paths
         self._library = library
         self._query_pool = query_pool
+        self._sandbox = sandbox
         self._looking = threading.Lock()
         self._state: tuple[str, TapState] | None = None
 
@@ -82,8 +98,8 @@ class TapTables:
             for database in self._library.databases()
         }
         for path in sorted(self._paths.catalogs.iterdir()):
-            is_table = path.suffix == ".parquet" and path != rejected_path(path)
-            if path.is_file() and is_table and not path.stem.endswith("rejected"):
+            is_table = path.suffix == ".parquet" and not path.stem.endswith("rejected")
+            if path.is_file() and is_table:
                 found[path] = f"Stars of the catalog {path.stem}"
             elif path.is_dir() and (is_store(path) or any(path.glob("*.parquet"))):
                 found[path] = f"Stars of the catalog {path.name}"
@@ -116,30 +132,6 @@ class TapTables:
         write_tap_schema(tables, folder)
         return TapState((*about, folder), tables)
 
-
-def _digest(paths: list[Path]) -> str:
-    """Return a name for a state of what there is."""
-    told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
-
-
-class TapQueries:
-    """What answers questions."""
-
-    def __init__(
-        self,
-        paths: ServicePaths,
-        tables: TapTables,
-        query_pool: QueryPool,
-        sandbox: Sandbox,
-        most_rows: int,
-    ) -> None:
-        self._sandbox = sandbox
-        self.most_rows = most_rows
-        self._paths = paths
-        self._tables = tables
-        self._query_pool = query_pool
-
     def answer(
         self,
         asked: Question,
@@ -148,14 +140,9 @@ class TapQueries:
         progress: Progress | Callable[..., None] = no_progress,
     ) -> Generator[bytes, None, None]:
         """Yield the answer to a question."""
-        with self._uploaded(asked.uploads, files) as (folder, uploaded):
-            state = self._tables.state()
-            tables, targets = state.tables, list(state.targets)
-            if uploaded is not None and folder is not None:
-                tables = tables.with_schema(uploaded)
-                targets.append(folder)
-            translated = translate(asked.query, tables)
-            with self._query_pool.session(targets, time_s) as session:
+        with self._state_with(asked.uploads, files) as state:
+            translated = translate(asked.query, state.tables)
+            with self._query_pool.session(state.targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
                 yield from self._chunks(batches, asked.form, asked.max_rows)
 
@@ -175,12 +162,12 @@ class TapQueries:
         yield from chunks
 
     @contextmanager
-    def _uploaded(
+    def _state_with(
         self, uploads: tuple[Upload, ...], files: Mapping[str, Path]
-    ) -> Iterator[tuple[Path | None, Schema | None]]:
-        """Give the folder and the schema of what came with a question, while it is answered."""
+    ) -> Iterator[TapState]:
+        """Give what there is to be asked, with the tables that came with a question."""
         if not uploads:
-            yield None, None
+            yield self.state()
             return
         for one in uploads:
             if one.part and one.part not in files:
@@ -189,17 +176,22 @@ class TapQueries:
                     "part of multipart/form-data with that name",
                     key="UPLOAD",
                 )
-        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._paths.scratch))
-        try:
-            folder = top / UPLOADS
+        with scratch_folder(self._paths) as scratch:
+            folder = scratch / UPLOADS
             folder.mkdir()
             tables = tuple(
                 self._read(files[one.part or one.job_id], one, folder) for one in uploads
             )
-            yield folder, Schema(UPLOADS, "Tables that came with the query", tables)
-        finally:
-            shutil.rmtree(top, ignore_errors=True)
+            uploaded = Schema(UPLOADS, "Tables that came with the query", tables)
+            state = self.state()
+            yield TapState((*state.targets, folder), state.tables.with_schema(uploaded))
 
     def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
         given = {"path": str(file), "name": upload.table, "folder": str(folder)}
         return table_of_facts(self._sandbox.call("upload", given))
+
+
+def _digest(paths: list[Path]) -> str:
+    """Return a name for a state of what there is."""
+    told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]

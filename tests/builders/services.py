@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from artifact_copies import copied
 from fastapi.testclient import TestClient
 
 from starcat.service.app import make_app
-from starcat.service.jobs.job_states import add_once
-from starcat.service.settings import Settings
+from starcat.service.jobs.submission import submit
+from starcat.service.records import Records
+from starcat.service.security.tokens import TokenStore
+from starcat.service.settings import Role, Settings
 
 if TYPE_CHECKING:
     from starcat.service.jobs.job import Job
@@ -32,24 +34,25 @@ def client_of(
         yield client
 
 
-def shelve(root: Path, artifact: Path, database: str = DATABASE) -> Path:
+def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
     """Copy an artifact into the folder of a service; return where it is."""
-    folder = root / "databases" / database / artifact.name
-    shutil.copytree(artifact, folder, copy_function=shutil.copyfile)
-    return folder
+    return copied(artifact, root / "databases" / database)
+
+
+def token_of(root: Path, name: str) -> str:
+    """Make somebody a publisher in a service that does not run yet."""
+    records = Records(root / "records.sqlite")
+    _, token = TokenStore(records).create(name, Role.PUBLISHER)
+    records.close()
+    return token
+
+
+def states(service: Service, job: Job) -> list[str]:
+    """Return the states that a job has been in."""
+    events = service.jobs.events(job.id)
+    return [event.data["state"] for event in events if event.kind == "state"]
 
 
 def waiting_build(service: Service, key: str) -> Job:
     """Add a build that waits, of nothing."""
-    job, _ = add_once(
-        service.records,
-        "build",
-        {},
-        key=key.ljust(64, "0"),
-        title="small 1.0.0",
-        owner="me",
-        most_waiting=100,
-        has_result=bool,
-        check=lambda: None,
-    )
-    return job
+    return submit(service, "build", {}, key.ljust(64, "0"), "small 1.0.0", "me").job

@@ -1,0 +1,31 @@
+"""Copies of an artifact that may be changed, and manifests that are right again afterwards."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
+from starcat.storage.digests import file_sha256, json_bytes
+
+
+def copied(artifact: Path, folder: Path) -> Path:
+    """Copy an artifact into a folder, under its own name; the files can be written to."""
+    return Path(shutil.copytree(artifact, folder / artifact.name, copy_function=shutil.copyfile))
+
+
+def seal(
+    artifact: Path, change: Callable[[dict[str, Any]], object] = lambda manifest: None
+) -> None:
+    """Make the digests of files and of the manifest right, after a change of what it says."""
+    manifest = json.loads((artifact / MANIFEST_NAME).read_bytes())
+    for name, facts in manifest["files"].items():
+        path = artifact / name
+        if path.is_file():
+            facts |= {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    change(manifest)
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (artifact / MANIFEST_NAME).write_bytes(json_bytes(manifest))
