@@ -33,6 +33,7 @@ _EXCESS_SIGMA_PX = (1.0, 4.0)
 _CUT_SHARE = (0.2, 0.985)
 _STAR_NOISE = 4.5
 _FLAT_EXCESS = 0.3  # smoothed pixels with so little of the noise of white ones are flat, not noisy
+_MOST_EXCESS = 10.0
 # Noise is white up to the first; the background has structure beyond the second.
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
 _HOT_NOISE = 4.0
@@ -55,6 +56,8 @@ class Levels:
     # whether there is next to no noise: what compression left of it are steps
     is_flat: bool = False
     box_px: int = _BOX_PX  # side of the boxes in which the background was found
+    # noise of pixels that are smoothed by a pixel, over what white noise would leave of it
+    excess: float = 1.0
 
 
 def load_sep() -> Any:
@@ -95,7 +98,7 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
         noise = np.maximum(levels.noise, _step(raw[~mask]))
         return replace(levels, noise=noise, is_flat=True)
     if max(excess) < _WHITE_EXCESS:
-        return levels
+        return levels  # white, within what a few boxes tell
     # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
     smooth = gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
     for box in _BOXES_PX:
@@ -103,7 +106,7 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
         fine, coarse = _excess(levels)
         if coarse < _CLOUD_EXCESS * fine:
             break
-    return replace(levels, is_rough=True)
+    return replace(levels, is_rough=True, excess=float(np.clip(fine, 1.0, _MOST_EXCESS)))
 
 
 def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> Levels:
