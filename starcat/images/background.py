@@ -39,6 +39,9 @@ _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
 _HOT_NOISE = 4.0
 # A hot pixel's neighbours have less than this part of the light that a star would give them.
 _HOT_PART = 0.25
+# The median of a star's 8 neighbours is more than this part of its brightest pixel, if its spot is
+# wider than 0.6 px; that of a hot pixel is not, even where some neighbours are hot too.
+_HOT_MEDIAN_PART, _HOT_ROUNDS = 0.15, 3
 
 
 @dataclass(frozen=True)
@@ -217,6 +220,23 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     above = levels.above.copy()
     above[y[hot], x[hot]] = neighbours[hot] / 8.0
     return replace(levels, above=above)
+
+
+def mask_hot_pixels(levels: Levels) -> Levels:
+    """Replace bright pixels among dark ones by the median of those, clusters of them included.
+
+    Many of them seem to be noise, so that the background is measured once more without them. It
+    costs stars whose light falls on one pixel, so it is for images that have no answer else.
+    """
+    for _ in range(_HOT_ROUNDS):
+        above = levels.above.copy()
+        y, x = np.nonzero(above > _HOT_NOISE * levels.noise)
+        around = pixels_around(above, x, y).reshape(-1, 9)
+        neighbours = np.median(np.delete(around, 4, axis=1), axis=1)
+        hot = neighbours < _HOT_MEDIAN_PART * around[:, 4]
+        above[y[hot], x[hot]] = neighbours[hot]
+        levels = _leveled(levels.raw + (above - levels.above), levels.mask)
+    return levels
 
 
 def pixels_around(image: Grey, x: NDArray[np.int64], y: NDArray[np.int64]) -> Grey:

@@ -22,6 +22,7 @@ from starcat.images.background import (
     PIXEL_VARIANCE,
     Levels,
     load_sep,
+    mask_hot_pixels,
     pixels_around,
     repair_hot_pixels,
     subtract_background,
@@ -67,12 +68,14 @@ def find_spots(
     psf_sigma_px: float | None = None,
     most_spots: int | None = None,
     gain_e_per_adu: float | None = None,
+    without_hot_pixels: bool = False,
 ) -> Spots:
     """Find the spots of an image and measure them.
 
     ``gain_e_per_adu``, the electrons of one step of the image, is for the errors of the
-    centroids; by default it is judged from the noise of the sky. Bertin and Arnouts 1996, A&AS
-    117, 393. Barbary 2016, JOSS 1 (6), 58.
+    centroids; by default it is judged from the noise of the sky. ``without_hot_pixels`` is for
+    images with many of them, and costs stars that are as narrow as a pixel. Bertin and Arnouts
+    1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
     given = {"threshold_sigma": threshold_sigma, "psf_sigma_px": psf_sigma_px}
     given["gain_e_per_adu"] = gain_e_per_adu
@@ -81,6 +84,8 @@ def find_spots(
             text = f"{name} is {value}; expected a positive number"
             raise ConfigError(text, key=name, value=value)
     levels = subtract_background(image)
+    if without_hot_pixels:
+        levels = mask_hot_pixels(levels)
     gain = gain_e_per_adu or electrons_per_step(levels)
     sigma = psf_sigma_px
     if sigma is None:

@@ -187,9 +187,7 @@ def _haze(rng: Rng) -> Picture:
 def _moonlight(rng: Rng) -> Picture:
     away, toward = rng.uniform(700.0, 2500.0), rng.uniform(0.0, 2.0 * np.pi)
     place = 512.0 + away * np.array([np.cos(toward), np.sin(toward)])
-    scene = Scene(
-        moon_px=(place[0], place[1]), glow_e=10.0 ** rng.uniform(3.5, 4.5), glow_px=400.0
-    )
+    scene = Scene(moon_px=(place[0], place[1]), glow_e=10.0 ** rng.uniform(3.5, 4.5), glow_px=400.0)
     return Picture(_exposed(rng, 0.1, background_e=10.0 ** rng.uniform(2.5, 3.7)), scene)
 
 
