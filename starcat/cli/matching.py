@@ -144,19 +144,16 @@ def identify(
     """Identify the stars of frames and find the camera's attitude.
 
     Of several files, a folder or a pattern the answers are one table, or with --json a line of
-    JSON each. The exit code is 0 if all files could be used, identified or not; 2 if some could
-    not, after the answers of the others; 6 with --fail-on-no-match if all could be used and some
-    frame was not identified.
+    JSON each. The exit code is then 2 if a file cannot be used, after the answers of the others;
+    otherwise 0, or 6 with --fail-on-no-match if a frame is not identified.
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.batch import files_of, is_batch
 
-    many = is_batch(files)
-    if many or contact_sheet is not None:
+    if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
-        paths = files_of(files) if many else [Path(files[0])]
-        tally = _identify_batch(paths, artifact, context.params, as_lines=ndjson or json)
+        tally = _identify_batch(files_of(files), artifact, context, as_lines=ndjson or json)
     elif context.obj is not None:
         from starcat.cli.remote import identify_remotely
 
@@ -180,15 +177,15 @@ def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None)
 
 
 def _identify_batch(
-    paths: list[Path], artifact: Path, given: Mapping[str, Any], *, as_lines: bool
+    paths: list[Path], artifact: Path, context: typer.Context, *, as_lines: bool
 ) -> Tally:
     from starcat.cli.matches import print_batch
     from starcat.images.batch import identify_files
     from starcat.images.contact_sheet import check_sheet, write_contact_sheet
 
-    sheet = given["contact_sheet"]
+    sheet = context.params["contact_sheet"]
     check_sheet(sheet)
-    matcher, chosen, local = _matcher_and_inputs(artifact, given)
+    matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
     items = identify_files(paths, matcher, chosen, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
     if sheet is not None:

@@ -188,11 +188,10 @@ def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Meas
 def small_picture(image: NDArray[Any], side_px: int = TILE_PX) -> Small:
     """Return an image as a tile: the brightest pixel of each block, so that no star is lost."""
     step = max(1, -(-max(image.shape) // side_px))
-    height, width = (side // step for side in image.shape)
-    if not height or not width:
-        step, (height, width) = 1, image.shape
-    finite = np.nan_to_num(image[: height * step, : width * step].astype(np.float32))
-    tile = finite.reshape(height, step, width, step).max(axis=(1, 3))
+    rows, columns = (np.arange(0, side, step) for side in image.shape)
+    finite = np.nan_to_num(image.astype(np.float32))
+    tile = np.maximum.reduceat(np.maximum.reduceat(finite, rows, axis=0), columns, axis=1)
+    height, width = tile.shape
     tile -= median_filter(tile[::_COARSE, ::_COARSE], _COARSE)[
         np.arange(height)[:, None] // _COARSE, np.arange(width) // _COARSE
     ]

@@ -16,26 +16,13 @@ from starcat.images.background import Levels
 def centroid_sigma_px(
     flux: Array, noise: Array, sigma_px: float, gain_e_per_adu: float, window_px: float
 ) -> Array:
-    """Return the standard errors of windowed centroids on each axis.
+    """Return the standard errors of windowed centroids on each axis; infinite without light.
 
-    Parameters
-    ----------
-    flux, noise : ndarray of float64, shape (N,)
-        Light of each spot and standard deviation of a pixel of its background, both in steps of
-        the image.
-    sigma_px : float
-        Standard deviation of the Gaussian spot as the pixels show it.
-    gain_e_per_adu : float
-        Electrons of one step of the image.
-    window_px : float
-        Standard deviation of the Gaussian window.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Pixels. With a window as wide as the spot that is sqrt(8 pi) s^2 noise / flux for the
-        background, the least that there can be, and 4/3 s / sqrt(electrons) for the photons,
-        added in squares. Infinite where there is no light.
+    ``flux`` is the light of each spot and ``noise`` the standard deviation of a pixel of its
+    background, both in steps of the image; the spot as the pixels show it and the window are
+    Gaussians of ``sigma_px`` and ``window_px``. With a window as wide as the spot the errors are
+    sqrt(8 pi) s^2 noise / flux for the background, the least that there can be, and
+    4/3 s / sqrt(electrons) for the photons, added in squares.
     """
     spot, window = sigma_px**2, window_px**2
     # A centroid is where the windowed first moment is zero. That moment falls by `slope` times
