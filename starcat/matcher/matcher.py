@@ -35,6 +35,7 @@ from starcat.matcher.settings import (
     TriangleOrder,
     check_scale_free,
     has_default_search,
+    in_range,
 )
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -178,14 +179,15 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             If the centroids are not pairs of numbers, the magnitudes are not one each, the
-            prior is no quaternion or its error is missing or out of range.
+            prior is no quaternion, or an error is missing or out of range.
         """
         frame = as_frame(centroids_px, camera or self.database.camera, magnitudes)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
             return self._timed(frame, partial(identify_blind, fov_deg=fov_deg))
+        in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
         if fov_error:
             error = self._checked_fov_error(fov_error)
             return self._timed(frame, partial(solve, fov_error=error, prior=near))
@@ -221,12 +223,13 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             As `identify`, or if there are not as many arrays of magnitudes as frames.
         """
         camera = camera or self.database.camera
         if magnitudes is not None and len(magnitudes) != len(frames):
-            raise ValueError(f"magnitudes of {len(magnitudes)} frames; expected {len(frames)}")
+            text = f"magnitudes of {len(magnitudes)} frames; expected {len(frames)}"
+            raise ConfigError(text, key="magnitudes", value=magnitudes)
         given = [
             as_frame(frame, camera, None if magnitudes is None else magnitudes[n])
             for n, frame in enumerate(frames)
@@ -298,7 +301,4 @@ class Matcher(Settings, _WithDatabase):
         why = "an onboard image needs the focal length"
         self.database.check_has_products(why, key="fov_error", value=fov_error)
         check_scale_free(self)
-        if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
-            text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
-            raise ConfigError(text, key="fov_error", value=fov_error)
         return float(fov_error)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
 
@@ -34,15 +35,36 @@ class Frame:
 
 
 def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | None = None) -> Frame:
-    """Return what a caller gives as a frame; ``ValueError`` unless shapes are as expected."""
-    given = np.asarray(centroids_px, dtype=np.float64)
+    """Return what a caller gives as a frame; `ConfigError` unless numbers are as expected."""
+    given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     given = given.reshape(0, 2) if given.size == 0 else given
     if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
-    if mag is not None and mag.shape != (len(given),):
-        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+        raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+    if magnitudes is None:
+        return Frame(given, None, camera)
+    shape = f"({len(given)},)"
+    mag = numbers_of("magnitudes", magnitudes, shape)
+    if mag.shape != (len(given),):
+        raise _error_of_shape("magnitudes have", mag, f"{shape}, one a centroid", "magnitudes")
     return Frame(given, mag, camera)
+
+
+def numbers_of(name: str, values: ArrayLike, shape: str) -> Array:
+    """Return an argument as an array of real numbers."""
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex numbers")
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
+            key=name,
+            value=values,
+        ) from error
+
+
+def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigError:
+    return ConfigError(f"{what} shape {found.shape}; expected {expected}", key=key, value=found)
 
 
 @dataclass(frozen=True)
