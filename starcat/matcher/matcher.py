@@ -36,6 +36,7 @@ from starcat.matcher.settings import (
     TriangleOrder,
     check_scale_free,
     has_default_search,
+    in_range,
 )
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -183,9 +184,9 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             If the centroids are not pairs of numbers, the magnitudes are not one each, the
-            prior is no quaternion or its error is missing or out of range.
+            prior is no quaternion, or an error is missing or out of range.
         """
         camera = camera or self.database.camera
         px, mags = as_arrays(centroids_px, magnitudes)
@@ -193,13 +194,10 @@ class Matcher(Settings, _WithDatabase):
         search = partial(solve, prior=near)
         if fov_deg is not None:
             search = partial(identify_blind, fov_deg=fov_deg)
-        elif fov_error:
-            search = partial(search, fov_error=self._checked_fov_error(fov_error))
-        else:
-            in_c = self._in_c(camera)
-            found = None if in_c is None else in_c.one(px, mags, near)
-            if found is not None:
-                return near.checked(found, camera, self.tolerance_px) if near else found
+        elif error := self._checked_fov_error(fov_error):
+            search = partial(search, fov_error=error)
+        elif (in_c := self._in_c(camera)) and (found := in_c.one(px, mags, near)):
+            return near.checked(found, camera, self.tolerance_px) if near else found
         return self._timed(as_frame(px, camera, mags), search)
 
     def identify_many(
@@ -232,7 +230,7 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             As `identify`, or if there are not as many arrays of magnitudes as frames.
         """
         camera = camera or self.database.camera
@@ -306,12 +304,14 @@ class Matcher(Settings, _WithDatabase):
         )
 
     def _checked_fov_error(self, fov_error: float) -> float:
+        if type(fov_error) is float and fov_error == 0.0:  # in nearly all calls, so at once
+            return fov_error
+        in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
+        if not fov_error:
+            return 0.0
         why = "an onboard image needs the focal length"
         self.database.check_has_products(why, key="fov_error", value=fov_error)
         check_scale_free(self)
-        if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
-            text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
-            raise ConfigError(text, key="fov_error", value=fov_error)
         return float(fov_error)
 
 

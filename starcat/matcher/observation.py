@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
 
@@ -20,6 +21,9 @@ WIDEST_FOV_ERROR = 0.5
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
 ``duplicate``."""
+
+
+FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -69,14 +73,17 @@ def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | No
 def as_arrays(
     centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
 ) -> tuple[Pixels, Array | None]:
-    """Return the arrays of a frame; ``ValueError`` unless shapes are as expected."""
-    given = np.asarray(centroids_px, dtype=np.float64)
+    """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
+    given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     given = given.reshape(0, 2) if given.size == 0 else given
     if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
-    if mag is not None and mag.shape != (len(given),):
-        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+        raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+    if magnitudes is None:
+        return given, None
+    mag = numbers_of("magnitudes", magnitudes, f"({len(given)},)")
+    if mag.shape != (len(given),):
+        one_each = f"({len(given)},), one a centroid"
+        raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
     return given, mag
 
 
@@ -85,7 +92,8 @@ def as_frames(
 ) -> Frames:
     """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
     if magnitudes is not None and len(magnitudes) != len(centroids_px):
-        raise ValueError(f"magnitudes of {len(magnitudes)} frames; expected {len(centroids_px)}")
+        text = f"magnitudes of {len(magnitudes)} frames; expected {len(centroids_px)}"
+        raise ConfigError(text, key="magnitudes", value=magnitudes)
     mags = [None] * len(centroids_px) if magnitudes is None else magnitudes
     joined = _joined(centroids_px, magnitudes)
     if joined is None:  # one after the other, which finds what is wrong, or not an array
@@ -119,6 +127,26 @@ def _joined(
     total = sum(counts)
     fits = px.shape == (total, 2) and (mag is None or mag.shape == (total,))
     return (counts, px, mag) if fits else None
+
+
+def numbers_of(name: str, values: ArrayLike, shape: str) -> Array:
+    """Return an argument as an array of real numbers."""
+    if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
+        return values
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex numbers")
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
+            key=name,
+            value=values,
+        ) from error
+
+
+def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigError:
+    return ConfigError(f"{what} shape {found.shape}; expected {expected}", key=key, value=found)
 
 
 @dataclass(frozen=True)
