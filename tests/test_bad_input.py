@@ -521,6 +521,18 @@ IDENTIFY_OPTIONS: Cases = {
     "noise of magnitudes that is none": lambda place: (
         lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
     ),
+    "tolerance of centroids that is none": lambda place: (
+        lambda: Matcher.open(place.artifact, tolerance_px=-1.0)
+    ),
+    "probability that is none": lambda place: (
+        lambda: Matcher.open(place.artifact, max_false_match_probability=2.0)
+    ),
+    "centroids that are no numbers": lambda place: (
+        lambda: Matcher.open(place.artifact).identify([["a", "b"]])
+    ),
+    "centroids of three numbers": lambda place: (
+        lambda: Matcher.open(place.artifact).identify([[1.0, 2.0, 3.0]])
+    ),
     "option unknown": run("build --ouput {out}"),
     "unknown unit in a data-source file": misspelt_unit,
     "WCS of centroids": identify("--wcs {out}/copy.fits"),

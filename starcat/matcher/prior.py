@@ -19,10 +19,10 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.observation import Candidates, Observation, numbers_of
 from starcat.matcher.pose import Pose
 from starcat.matcher.result import MatchResult, Refusal, no_match
-from starcat.matcher.settings import LOOKUP, REACH
+from starcat.matcher.settings import LOOKUP, REACH, in_range
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify
 
@@ -69,18 +69,15 @@ def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | N
         raise ConfigError(
             f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
         )
-    q = np.asarray(quaternion, dtype=np.float64)
-    square = float(q @ q) if q.shape == (4,) else math.nan
-    if not 0.0 < square < math.inf:
+    q = numbers_of("prior", quaternion, "(4,)")
+    largest = float(np.abs(q).max()) if q.shape == (4,) else math.nan
+    if not 0.0 < largest < math.inf:
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
         raise ConfigError(text, key="prior", value=quaternion)
-    if not 0.0 < error_deg <= WIDEST_PRIOR_DEG:
-        raise ConfigError(
-            f"prior_error_deg is {error_deg}; expected above 0, at most {WIDEST_PRIOR_DEG:g}",
-            key="prior_error_deg",
-            value=error_deg,
-        )
-    return Prior(q / math.sqrt(square), math.radians(error_deg))
+    in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+    # Its length carries no meaning, and the square of 1e200 would overflow.
+    q = np.ldexp(q, -math.frexp(largest)[1])
+    return Prior(q / math.sqrt(float(q @ q)), math.radians(error_deg))
 
 
 def search_near(

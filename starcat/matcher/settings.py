@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Literal, get_args
 
 from starcat.errors import ConfigError
-from starcat.geometry.distortion import checked_number
 
 Engine = Literal["auto", "c", "numpy"]
 
@@ -34,6 +35,9 @@ CERTAIN = 1e-9
 
 Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
 """
+
+LARGEST = {"tolerance_px": 200.0, "noise_px": 50.0, "noise_mag": 10.0}
+"""Largest values that can be stated; beyond them any spot is any star."""
 
 MAX_BATCHES = 200
 """Batches of candidates that are tried before giving up."""
@@ -146,14 +150,13 @@ class Settings:
     time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
-        for name in ("noise_px", "noise_mag"):
+        for name, most in LARGEST.items():
             if getattr(self, name) is not None:
-                checked_number(name, getattr(self, name), 0.0)
-        if not 0.0 <= self.min_share <= 1.0:
-            raise self._error("min_share", "0 to 1")
-        for name in ("max_steps", "time_limit_s"):
-            if not getattr(self, name) > 0.0:
-                raise self._error(name, "a number above 0")
+                in_range(name, getattr(self, name), most)
+        for name in ("max_false_match_probability", "min_share"):
+            in_range(name, getattr(self, name), 1.0, with_zero=True)
+        for name in ("max_batches", "max_steps", "time_limit_s"):
+            in_range(name, getattr(self, name), math.inf)
         of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
         if self.tolerance_px is None:
             object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
@@ -169,9 +172,17 @@ class Settings:
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
 
-    def _error(self, name: str, expected: str) -> ConfigError:
-        value = getattr(self, name)
-        return ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)
+
+def in_range(name: str, value: object, most: float, *, with_zero: bool = False) -> None:
+    """Check that an argument is a number above 0, or from 0 on, and at most ``most``."""
+    if isinstance(value, Real) and not isinstance(value, bool):
+        with suppress(OverflowError):  # a whole number may be too large for a float
+            number = float(value)
+            if 0.0 < number <= most or (with_zero and number == 0.0):
+                return
+    above = "" if most == math.inf else f", at most {most:g}"
+    expected = f"0 to {most:g}" if with_zero else f"a number above 0{above}"
+    raise ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)
 
 
 def has_default_search(settings: Settings) -> bool:
