@@ -148,11 +148,11 @@ class BatchResult(Sequence[MatchResult]):
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
-        return MatchResult.later(STATUSES[self._codes[frame]], partial(self._answer, frame))
+        return MatchResult.later(STATUSES[self._codes[frame]], self._answer, frame)
 
     def __iter__(self) -> Iterator[MatchResult]:
         for frame, code in enumerate(self._codes):
-            yield MatchResult.later(STATUSES[code], partial(self._answer, frame))
+            yield MatchResult.later(STATUSES[code], self._answer, frame)
 
     def _answer(self, n: int) -> MatchResult:
         stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
@@ -241,8 +241,9 @@ class Search:
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        make = partial(self._answer_of_bytes, record, stars, px, mags, prior)
-        return MatchResult.later(STATUSES[code], make)
+        return MatchResult.later(
+            STATUSES[code], self._answer_of_bytes, record, stars, px, mags, prior
+        )
 
     def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
         """Identify the stars of frames; None where the library does not take one of them."""

@@ -75,13 +75,14 @@ def as_arrays(
 ) -> tuple[Pixels, Array | None]:
     """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
-    given = given.reshape(0, 2) if given.size == 0 else given
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+    if given.shape[1:] != (2,):
+        if given.size:
+            raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+        given = given.reshape(0, 2)
     if magnitudes is None:
         return given, None
-    mag = numbers_of("magnitudes", magnitudes, f"({len(given)},)")
-    if mag.shape != (len(given),):
+    mag = numbers_of("magnitudes", magnitudes, "(N,)")
+    if mag.shape != given.shape[:1]:
         one_each = f"({len(given)},), one a centroid"
         raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
     return given, mag
