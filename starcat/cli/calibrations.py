@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcat.calibration.calibrate import CalibratedFrame, Calibration
+from starcat.calibration.earth_rotation import EARTH_RATE_ARCSEC_S, EarthRotation
 from starcat.calibration.fit import AXES, PARAMETERS, Fit
 from starcat.calibration.models import Trial
 from starcat.cli.console import print_json, print_table, say
@@ -22,10 +23,15 @@ _SHORT = {
 }
 
 
-def print_calibration(calibration: Calibration, output: Path, *, as_json: bool) -> None:
+def print_calibration(
+    calibration: Calibration, output: Path, turned: EarthRotation | None = None, *, as_json: bool
+) -> None:
     """Print a calibration: the camera with its errors, the comparison of models, the frames."""
     if as_json:
-        print_json(_as_dict(calibration, output))
+        content = _as_dict(calibration, output)
+        if turned is not None:
+            content["earth_rotation"] = {**asdict(turned), "within_three_sigma": turned.within}
+        print_json(content)
         return
     print_table(
         f"{calibration.n_identified} of {len(calibration.frames)} frames, "
@@ -46,11 +52,54 @@ def print_calibration(calibration: Calibration, output: Path, *, as_json: bool) 
         [_frame(frame) for frame in calibration.frames],
         numbers=(2, 3),
     )
+    if turned is not None:
+        _print_turned(turned)
     if not calibration.has_square_pixels:
         say(
             "The frames do not fit a camera with square pixels (aspect and skew above): the "
             "images may have been resized, or the lens may need another model."
         )
+
+
+def _print_turned(found: EarthRotation) -> None:
+    """Print what the turn of the Earth says about the attitudes."""
+    print_table(
+        f"Against the turn of the Earth: {len(found.frames)} frames, {found.n_sets} places of the sky",
+        ("frame", "place", "UTC", "x arcsec", "y", "z", "expected x", "y", "z", "clock s", "chi2"),
+        [
+            (
+                one.name,
+                one.set_number,
+                one.time[11:22].removesuffix("Z"),
+                *(f"{value:+.1f}" for value in one.error_arcsec),
+                *(f"{value:.1f}" for value in one.sigma_arcsec),
+                f"{one.clock_s:+.2f}",
+                f"{one.chi2:.1f}",
+            )
+            for one in found.frames
+        ],
+        numbers=(1, 3, 4, 5, 6, 7, 8, 9, 10),
+    )
+    rows = [
+        ("error of attitude about x, y, z", _three(found.rms_arcsec)),
+        ("expected from the centroids", _three(found.expected_arcsec)),
+        ("about the pole, where that of the clock is too", f"{found.about_pole_arcsec:.1f} arcsec"),
+        (
+            "without what the clock explains",
+            f"chi2 {found.chi2:.2f} (1 is expected), {found.within} of {len(found.frames)} frames "
+            "within three sigma",
+        ),
+        (
+            "turn that the frames show",
+            f"{found.rate_arcsec_s:.3f} +- {found.rate_error_arcsec_s:.3f} arcsec/s "
+            f"(the Earth: {EARTH_RATE_ARCSEC_S:.3f})",
+        ),
+    ]
+    print_table("Attitude", ("", ""), rows)
+
+
+def _three(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.1f}" for value in values) + " arcsec"
 
 
 def _errors(calibration: Calibration) -> Mapping[str, float]:

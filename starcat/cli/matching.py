@@ -257,12 +257,27 @@ def calibrate(
         bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
+    earth_rotation: Annotated[
+        bool,
+        typer.Option(
+            "--earth-rotation",
+            help="The camera stood on the ground: the turn of the Earth tells errors of attitude.",
+        ),
+    ] = False,
+    times: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Columns frame and time (UTC), where the pictures do not say when they were taken.",
+        ),
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """Find focal length, principal point and distortion of a camera from frames of stars.
 
     Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
     """
+    from starcat.calibration import earth_rotation as earth
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
     from starcat.images.figure_file import check_kind
@@ -270,6 +285,9 @@ def calibrate(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    if times is not None and not earth_rotation:
+        raise ConfigError("--times is for --earth-rotation; give both, or neither")
+    when = earth.times_of_frames(files, times) if earth_rotation else None
     known = read_camera(camera) if camera else None
     size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
@@ -280,7 +298,8 @@ def calibrate(
     write_camera(found, output)
     if plot:
         draw_residuals(found, plot)
-    print_calibration(found, output, as_json=json)
+    turned = None if when is None else earth.earth_rotation(found, when)
+    print_calibration(found, output, turned, as_json=json)
 
 
 @app.command()

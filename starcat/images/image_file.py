@@ -19,6 +19,7 @@ import logging
 import re
 import warnings
 import zlib
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +56,8 @@ WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
     ".jpg": "JPEG", ".jpeg": "JPEG",
 }  # fmt: skip
+# Files that may say when they were taken.
+KNOWS_TIME = (".fits", ".fit", ".fts", ".jpg", ".jpeg", ".tif", ".tiff", ".png")
 _LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
@@ -228,6 +231,48 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
     bits = max(picture.tag_v2.get(258, (1,)))  # BitsPerSample
     # Pillow turns 8-bit values around where white is zero, but not 16-bit ones.
     return bits, picture.tag_v2.get(262) == 0 and picture.mode.startswith("I;16")
+
+
+def time_in_file(path: Path) -> datetime | None:
+    """Return the middle of the exposure that a FITS header or EXIF tells, as UTC; None without."""
+    data = _unpacked(path)
+    try:
+        found = _time_of_fits(data) if data.startswith(b"SIMPLE  =") else _time_of_exif(data)
+    except Exception as error:  # damaged bytes make either library raise whatever it happens to
+        _log.info("%s: no time can be read (%s)", path, error)
+        return None
+    return found
+
+
+def _time_of_fits(data: bytes) -> datetime | None:
+    from astropy.io import fits
+
+    with fits.open(io.BytesIO(data), memmap=False) as parts:
+        headers = [part.header for part in parts if "DATE-OBS" in part.header]
+        if not headers:
+            return None
+        start = datetime.fromisoformat(str(headers[0]["DATE-OBS"]))
+        return _middle(start, headers[0].get("EXPTIME", 0.0))
+
+
+def _time_of_exif(data: bytes) -> datetime | None:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=("PNG", "TIFF", "JPEG")) as picture:
+        exif = picture.getexif().get_ifd(0x8769)
+    if 0x9003 not in exif:  # DateTimeOriginal
+        return None
+    text = f"{exif[0x9003]}.{str(exif.get(0x9291, '')).strip() or '0'}"  # SubSecTimeOriginal
+    start = datetime.strptime(text, "%Y:%m:%d %H:%M:%S.%f")
+    zone = str(exif.get(0x9011, "")).strip()  # OffsetTimeOriginal
+    if zone:
+        start = datetime.fromisoformat(start.isoformat() + zone)
+    return _middle(start, exif.get(0x829A, 0.0))  # ExposureTime
+
+
+def _middle(start: datetime, exposure_s: Any) -> datetime:
+    start = start.replace(tzinfo=UTC) if start.tzinfo is None else start.astimezone(UTC)
+    return start + timedelta(seconds=0.5 * float(exposure_s))
 
 
 def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:

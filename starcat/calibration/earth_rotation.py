@@ -1,0 +1,219 @@
+"""The turning Earth as the truth: how wrong attitudes of a camera are that stands still.
+
+The sky turns over a camera that is fixed to the ground by 15.041 arcsec a second about the pole, and
+nothing else moves. Attitudes with that turn taken out are all the same, and what they differ by is
+their error: no other star tracker, no table and no mark on the ground is needed. Aberration is
+taken out too; refraction is the same in all frames, as they look at one place of the air. An error
+of the clock that all times share drops out.
+
+Where the camera was moved between frames, each place that it looked to is a set of its own.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from starcat.arrays import Array
+from starcat.calibration.calibrate import Calibration
+from starcat.calibration.fit import turn_derivatives
+from starcat.errors import CalibrationError, ConfigError, reason
+from starcat.geometry.attitude import solve_wahba_svd
+from starcat.images.image_file import KNOWS_TIME, time_in_file
+from starcat.sky.observer import Observer
+
+EARTH_RATE_ARCSEC_S = 15.041067  # turn of the Earth against the stars (IERS Conventions 2010)
+_MOVED_DEG = 0.5  # a camera that turned farther than that was moved
+_ARCSEC = np.degrees(1.0) * 3600.0
+# Two components are within this sum of squares as often as one is within three errors: 99.73 %.
+_THREE_SIGMA = 11.83
+
+
+@dataclass(frozen=True)
+class TurnedFrame:
+    """One frame against the mean of its set."""
+
+    name: str
+    time: str  # middle of the exposure, UTC
+    set_number: int  # from 1
+    error_arcsec: tuple[float, float, float]  # rotation about x, y and z of the camera
+    sigma_arcsec: tuple[float, float, float]  # that the centroids' noise leads to expect
+    clock_s: float  # what its time would have to be changed by to agree best
+    # Mean square, in expected errors, of the two components that no change of the time explains.
+    chi2: float
+
+
+@dataclass(frozen=True)
+class EarthRotation:
+    """What attitudes of a fixed camera differ by, the turn of the Earth taken out.
+
+    Of sets of a single frame nothing is known, and they are left out. ``rms_arcsec`` is about x, y
+    and z of the camera. Errors of the times are in what is about the axis of the Earth, and
+    ``chi2``, the mean of those of the frames, is without that: about 1 where the errors are what
+    the centroids lead to expect. ``rate_arcsec_s`` is the turn that the frames themselves show.
+    """
+
+    frames: tuple[TurnedFrame, ...]
+    n_sets: int
+    rms_arcsec: tuple[float, float, float]
+    expected_arcsec: tuple[float, float, float]
+    about_pole_arcsec: float
+    chi2: float
+    rate_arcsec_s: float
+    rate_error_arcsec_s: float
+
+    @property
+    def within(self) -> int:
+        """Frames that are within three expected errors, whatever their times are wrong by."""
+        return sum(2.0 * one.chi2 <= _THREE_SIGMA for one in self.frames)
+
+
+def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, datetime]:
+    """Return the time of each frame by its name: of a table, or of the pictures themselves."""
+    if table is not None:
+        return _times_of_table(table)
+    times = {path.stem: time_in_file(path) for path in paths if path.suffix.lower() in KNOWS_TIME}
+    found = {name: time for name, time in times.items() if time is not None}
+    if not found:
+        raise ConfigError(
+            "no frame says when it was taken (EXIF DateTimeOriginal, FITS DATE-OBS); give --times "
+            "with a CSV file of the columns frame and time"
+        )
+    return found
+
+
+def _times_of_table(path: Path) -> dict[str, datetime]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = reason(error) if isinstance(error, OSError) else str(error)
+        raise ConfigError(f"{path}: cannot be read ({why})") from error
+    if not rows or not {"frame", "time"} <= rows[0].keys():
+        raise ConfigError(f"{path}: expected a header with frame and time, and a line a frame")
+    times = {}
+    for number, row in enumerate(rows, start=2):
+        try:
+            time = datetime.fromisoformat(row["time"].strip())
+        except (AttributeError, ValueError):
+            raise ConfigError(
+                f"{path}: line {number}: time is {row['time']!r}; expected UTC such as "
+                "2026-11-22T10:00:00.25"
+            ) from None
+        times[row["frame"]] = time.replace(tzinfo=UTC) if time.tzinfo is None else time
+    return times
+
+
+def earth_rotation(calibration: Calibration, times: Mapping[str, datetime]) -> EarthRotation:
+    """Compare the attitudes of calibrated frames with the turn of the Earth."""
+    names = [frame.name for frame in calibration.frames if frame.status == "identified"]
+    timed = sorted((times[name], k, name) for k, name in enumerate(names) if name in times)
+    if len(timed) < 2:
+        raise CalibrationError(
+            f"{len(timed)} of {len(names)} identified frames have a time; expected two or more: "
+            "times are by the names of frames, those of pictures without the suffix"
+        )
+    fixed = np.stack([_on_earth(calibration, k, time) for time, k, _ in timed])
+    sets = _sets(fixed)
+    kept = [rows for rows in sets if len(rows) > 1]
+    if not kept:
+        raise CalibrationError(
+            f"the camera looked elsewhere in each of {len(timed)} frames; expected two or more "
+            f"that agree to {_MOVED_DEG:g} deg when the turn of the Earth is taken out"
+        )
+    return _compared(calibration, timed, fixed, kept)
+
+
+def _on_earth(calibration: Calibration, number: int, time: datetime) -> Array:
+    """Return the attitude of a frame against the ground: body = matrix @ ground."""
+    fit, observer = calibration.fit, Observer.at(time)
+    rows = fit.seen.frame == number
+    body = calibration.camera.directions_from_pixels(fit.seen.centroids_px[rows])
+    matrix = solve_wahba_svd(body, observer.apparent(fit.seen.icrs[rows]))
+    jd = 2440587.5, time.timestamp() / 86_400.0  # UTC for UT1: the difference is the same in all
+    ground = erfa.c2t06a(*observer.tt_jd, *jd, 0.0, 0.0)
+    return np.asarray(matrix @ ground.T)
+
+
+def _sets(fixed: Array) -> list[list[int]]:
+    """Return the rows of attitudes one after the other that are the same but for their errors."""
+    sets: list[list[int]] = [[0]]
+    for row in range(1, len(fixed)):
+        turn = Rotation.from_matrix(fixed[row] @ fixed[row - 1].T).magnitude()
+        if np.degrees(turn) > _MOVED_DEG:
+            sets.append([])
+        sets[-1].append(row)
+    return sets
+
+
+def _compared(
+    calibration: Calibration, timed: list[tuple[datetime, int, str]], fixed: Array, sets: list[Any]
+) -> EarthRotation:
+    frames, errors, sigmas, poles, since = [], [], [], [], []
+    for number, rows in enumerate(sets, start=1):
+        mean = Rotation.from_matrix(fixed[rows]).mean().as_matrix()
+        error = Rotation.from_matrix(fixed[rows] @ mean.T).as_rotvec() * _ARCSEC
+        seconds = np.array([timed[row][0].timestamp() for row in rows])
+        poles.append(error @ mean[:, 2])
+        since.append(seconds - seconds.mean())
+        errors.append(error)
+        for row, one in zip(rows, error, strict=True):
+            # The mean of n frames follows each of them by a part of n.
+            covariance = (1.0 - 1.0 / len(rows)) * _covariance(calibration, timed[row][1])
+            sigmas.append(np.sqrt(np.diag(covariance)))
+            frames.append(_frame(timed[row], number, one, covariance, mean[:, 2]))
+    error, pole, dt = (np.concatenate(part) for part in (errors, poles, since))
+    free = len(error) - len(sets)
+    slope = float(pole @ dt / (dt @ dt)) if dt.any() else 0.0
+    spread = float(np.sqrt(np.sum((pole - slope * dt) ** 2) / max(free - 1, 1)))
+    return EarthRotation(
+        tuple(frames),
+        len(sets),
+        _xyz(np.sqrt((error**2).sum(axis=0) / free)),
+        _xyz(np.sqrt((np.array(sigmas) ** 2).sum(axis=0) / free)),
+        float(np.sqrt(pole @ pole / free)),
+        float(np.mean([frame.chi2 for frame in frames])),
+        EARTH_RATE_ARCSEC_S - slope,
+        spread / float(np.sqrt(dt @ dt)) if dt.any() else float("inf"),
+    )
+
+
+def _frame(
+    timed: tuple[datetime, int, str], number: int, error: Array, covariance: Array, pole: Array
+) -> TurnedFrame:
+    time, _, name = timed
+    weight = np.linalg.inv(covariance)
+    turn = float(pole @ weight @ error / (pole @ weight @ pole))
+    left = error - turn * pole
+    said = time.astimezone(UTC).isoformat().replace("+00:00", "Z")
+    return TurnedFrame(
+        name,
+        said,
+        number,
+        _xyz(error),
+        _xyz(np.sqrt(np.diag(covariance))),
+        -turn / EARTH_RATE_ARCSEC_S,
+        0.5 * float(left @ weight @ left),
+    )
+
+
+def _xyz(values: Array) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _covariance(calibration: Calibration, number: int) -> Array:
+    """Return the covariance of an attitude about x, y and z of the camera, square arcseconds."""
+    fit = calibration.fit
+    rows = fit.seen.frame == number
+    body = fit.seen.icrs[rows] @ fit.seen.matrices[number].T
+    slope = turn_derivatives(fit.values, body).reshape(-1, 3)
+    return np.asarray(np.linalg.inv(slope.T @ slope) * (fit.noise_px * _ARCSEC) ** 2)
