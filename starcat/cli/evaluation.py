@@ -57,6 +57,13 @@ TolerancePx = Annotated[
     float | None,
     typer.Option(min=0.01, max=200, help="Default: three times the position noise, or 1."),
 ]
+Ecss = Annotated[
+    Path | None,
+    typer.Option(metavar="SENSOR.toml", help="Star sensor: its figures as of ECSS-E-ST-60-20C."),
+]
+EcssExample = Annotated[
+    bool, typer.Option("--ecss-example", help="Print a sensor with every key explained.")
+]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of records and reports.")]
 
 
@@ -79,12 +86,17 @@ def evaluate(
     tolerance_px: TolerancePx = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frames.")] = 1,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer frames.")] = False,
+    ecss: Ecss = None,
+    ecss_example: EcssExample = False,
     inputs: Input = None,
     output: Output = Path("dist/evaluation"),
     workers: Annotated[int, typer.Option(min=1, max=64, help="Processes.")] = 2,
     json: Json = False,
 ) -> None:
     """Measure how often simulated frames are identified, or reproduce the five papers.
+
+    With --ecss frames of a star sensor are simulated from electrons to attitude, and its errors,
+    acquisition and robustness reported; --frames are then the pointings of each trial.
 
     Finished trials are kept in the output folder and not run again. Of several values of a
     quantity each is tried in turn, a single value holds for all trials; without any, each
@@ -96,6 +108,11 @@ def evaluate(
     from starcat.evaluation.sweep import plan_sweep, sweep_values
     from starcat.specs.camera_file import read_camera
 
+    if ecss_example:
+        from starcat.evaluation.ecss.sensor import example_toml
+
+        typer.echo(example_toml(), nl=False)
+        return
     if (artifact is None) == (paper is None):
         raise ConfigError("give either an artifact or --paper")
     values = sweep_values(
@@ -103,6 +120,14 @@ def evaluate(
         drop_probability=drop_probability, k1=k1, roll_deg=roll_deg, scale=scale,
         limit_mag=limit_mag,
     )  # fmt: skip
+    if artifact is not None and ecss is not None:
+        if values or camera or tolerance_px:
+            raise ConfigError(
+                "--ecss goes with --frames, --method, --seed, --quick, --workers and --output "
+                "only; what a sensor is tried with is in its file"
+            )
+        _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json)
+        return
     given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
     with progress_bars() as progress:
         if artifact is None:
@@ -116,6 +141,24 @@ def evaluate(
             )  # fmt: skip
             found = evaluate_artifact(sweep, output, workers=workers, progress=progress)
     print_evaluation(found, as_json=json)
+
+
+def _evaluate_sensor(
+    artifact: Path, ecss: Path, output: Path, method: str | None, frames: int | None, seed: int,
+    quick: bool, workers: int, as_json: bool,
+) -> None:  # fmt: skip
+    from starcat.evaluation.ecss.pages import tables_of
+    from starcat.evaluation.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
+    from starcat.evaluation.ecss.sensor import read_sensor
+
+    sensor = read_sensor(ecss)
+    with progress_bars() as progress:
+        content, page = evaluate_sensor(
+            artifact, sensor, output, method=method, seed=seed, workers=workers,
+            pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
+        )  # fmt: skip
+    show(as_json, content, lambda: _print(tables_of(content)["checklist"]))
+    say(f"wrote {page}")
 
 
 def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
