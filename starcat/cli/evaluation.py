@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,8 +62,24 @@ Ecss = Annotated[
     Path | None,
     typer.Option(metavar="SENSOR.toml", help="Star sensor: its figures as of ECSS-E-ST-60-20C."),
 ]
+
+
+def _print_example(is_wanted: bool) -> None:
+    from starcat.evaluation.ecss.sensor import example_toml
+
+    if is_wanted:
+        typer.echo(example_toml(), nl=False)
+        raise typer.Exit
+
+
 EcssExample = Annotated[
-    bool, typer.Option("--ecss-example", help="Print a sensor with every key explained.")
+    bool,
+    typer.Option(
+        "--ecss-example",
+        callback=_print_example,
+        is_eager=True,
+        help="Print a sensor with every key explained.",
+    ),
 ]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of records and reports.")]
 
@@ -95,12 +112,9 @@ def evaluate(
 ) -> None:
     """Measure how often simulated frames are identified, or reproduce the five papers.
 
-    With --ecss frames of a star sensor are simulated from electrons to attitude, and its errors,
-    acquisition and robustness reported; --frames are then the pointings of each trial.
-
-    Finished trials are kept in the output folder and not run again. Of several values of a
-    quantity each is tried in turn, a single value holds for all trials; without any, each
-    quantity takes its usual values.
+    Finished trials are kept in the output folder and not run again. Of several values of a quantity
+    each is tried in turn, a single one holds for all; without any, each takes its usual values.
+    With --ecss a star sensor is simulated from electrons to attitude, --frames pointings a trial.
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
@@ -108,25 +122,15 @@ def evaluate(
     from starcat.evaluation.sweep import plan_sweep, sweep_values
     from starcat.specs.camera_file import read_camera
 
-    if ecss_example:
-        from starcat.evaluation.ecss.sensor import example_toml
-
-        typer.echo(example_toml(), nl=False)
-        return
     if (artifact is None) == (paper is None):
         raise ConfigError("give either an artifact or --paper")
     values = sweep_values(
         noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, false_share=false_share,
         drop_probability=drop_probability, k1=k1, roll_deg=roll_deg, scale=scale,
-        limit_mag=limit_mag,
-    )  # fmt: skip
-    if artifact is not None and ecss is not None:
-        if values or camera or tolerance_px:
-            raise ConfigError(
-                "--ecss goes with --frames, --method, --seed, --quick, --workers and --output "
-                "only; what a sensor is tried with is in its file"
-            )
-        _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json)
+        limit_mag=limit_mag)  # fmt: skip
+    if ecss is not None:
+        others = bool(values or camera or tolerance_px)
+        _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json, others)
         return
     given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
     with progress_bars() as progress:
@@ -144,20 +148,28 @@ def evaluate(
 
 
 def _evaluate_sensor(
-    artifact: Path, ecss: Path, output: Path, method: str | None, frames: int | None, seed: int,
-    quick: bool, workers: int, as_json: bool,
+    artifact: Path | None, ecss: Path, output: Path, method: str | None, frames: int | None,
+    seed: int, quick: bool, workers: int, as_json: bool, has_others: bool,
 ) -> None:  # fmt: skip
     from starcat.evaluation.ecss.pages import tables_of
     from starcat.evaluation.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
     from starcat.evaluation.ecss.sensor import read_sensor
 
+    if artifact is None or has_others:
+        raise ConfigError(
+            "--ecss goes with an artifact, --frames, --method, --seed, --quick, --workers and "
+            "--output only; what a sensor is tried with is in its file"
+        )
     sensor = read_sensor(ecss)
     with progress_bars() as progress:
         content, page = evaluate_sensor(
             artifact, sensor, output, method=method, seed=seed, workers=workers,
             pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
         )  # fmt: skip
-    show(as_json, content, lambda: _print(tables_of(content)["checklist"]))
+    checklist = tables_of(content)["checklist"]
+    rows = tuple((subject, value) for subject, _, _, value, *_ in checklist.rows)
+    short = replace(checklist, title="Star sensor", heads=("subject", "value"), rows=rows)
+    show(as_json, content, _print, short)
     say(f"wrote {page}")
 
 

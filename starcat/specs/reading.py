@@ -140,10 +140,7 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
 
 
 def what_is_wrong(
-    error: ValidationError,
-    origin: str,
-    model: type[BaseModel] = BuildSpec,
-    kind: str = "spec",
+    error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
 ) -> ConfigError:
     """Return the error about the first wrong key; a misspelt one first, since it is missing too."""
     wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")

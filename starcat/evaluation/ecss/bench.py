@@ -41,6 +41,7 @@ from starcat.sky.observer import Observer
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")
 _LIMIT_BEYOND_MAG = 0.3
+_MOST_ELECTRONS = 1e15  # numpy draws none above 9e18
 _STEP_SIGMA = 0.5  # a trail is drawn as spots at most so far apart, in standard deviations
 
 
@@ -156,7 +157,7 @@ class Bench:
     def recorded(self, mean_e: Array, generator: np.random.Generator) -> NDArray[np.uint16]:
         """Return what the converter makes of mean electrons."""
         sensor = self.sensor
-        electrons = generator.poisson(mean_e).astype(np.float64)
+        electrons = generator.poisson(np.minimum(mean_e, _MOST_ELECTRONS)).astype(np.float64)
         np.minimum(electrons, sensor.full_well_e, out=electrons)
         electrons += sensor.read_noise_e * generator.standard_normal(electrons.shape)
         adu = np.rint(electrons / sensor.gain_e_adu + sensor.offset_adu)
@@ -228,11 +229,16 @@ class Bench:
         drawn = generator.choice(self.matcher.database.mag, condition.false_stars)
         return np.vstack([places, false]), np.append(mag, drawn)
 
+    def smear_px(self, rate_deg_s: float) -> float:
+        """Return the length of a trail."""
+        moved = math.radians(rate_deg_s) * self.sensor.exposure_s
+        return moved * self.camera.focal_length_px
+
     def _steps(self, rate_deg_s: float) -> Array:
         """Return the angles of a trail from its middle, radians."""
         moved = math.radians(rate_deg_s) * self.sensor.exposure_s
-        smear_px = moved * self.camera.focal_length_px
-        count = max(1, math.ceil(smear_px / (_STEP_SIGMA * self.sensor.psf_sigma_px)))
+        step_px = _STEP_SIGMA * self.sensor.psf_sigma_px
+        count = max(1, math.ceil(self.smear_px(rate_deg_s) / step_px))
         return np.asarray(moved * ((np.arange(count) + 0.5) / count - 0.5))
 
     def trail_px(self, rate_deg_s: float, generator: np.random.Generator) -> tuple[Pixels, float]:

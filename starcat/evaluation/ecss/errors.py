@@ -24,7 +24,7 @@ _STEP_PX = 0.5
 LOW_ORBIT_KM_S = 7.6
 
 CONTRIBUTORS = {
-    "sampling": "pixel spatial error: sampling of the spot",
+    "sampling": "pixel spatial error: sampling of the spot, full well",
     "prnu": "pixel spatial error: PRNU",
     "dsnu": "pixel spatial error: DSNU",
     "blends": "neighbouring stars in the window",

@@ -286,9 +286,11 @@ def _title(content: Content) -> str:
 
 
 def _lead(content: Content) -> str:
+    pointings = content["trials"][NOMINAL]["pointings"]
     return (
-        f"Figures in the terms of {STANDARD}, of {content['frames']:,} simulated frames, by "
-        "starcat evaluate --ecss. It is a report of a simulation, no statement of compliance."
+        f"Figures in the terms of {STANDARD}, of {content['frames']:,} simulated frames: starcat "
+        f"evaluate {content['artifact']} --ecss SENSOR.toml --frames {pointings} --seed "
+        f"{content['seed']}. It is a report of a simulation, no statement of compliance."
     )
 
 
@@ -300,7 +302,7 @@ def draw_noise(content: Content) -> Figure:
     with own_style(STYLE):
         figure = Figure(figsize=(7.2, 4.0))
         headline(figure, "Noise of a star by magnitude", "one axis, between frames, 1 \u03c3")
-        axes = figure.add_axes((0.105, 0.13, 0.65, 0.69))
+        axes = figure.add_axes((0.105, 0.13, 0.615, 0.69))
         axes.grid(axis="y", color="#e3e7ea")
         rates = dict.fromkeys(one["rate_deg_s"] for one in stars)
         for number_, rate in enumerate(rates):

@@ -16,139 +16,122 @@ from starcat.specs.keys import toml_value
 from starcat.specs.product_sections import Mag, Section
 from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
 
+Positive = Annotated[float, Field(gt=0.0, le=1e15)]
+Size = Annotated[float, Field(ge=0.0, le=1e15)]
+Efficiency = Annotated[float, Field(gt=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Size = Annotated[float, Field(ge=0.0, le=1e9)]
 Signed = Annotated[float, Field(ge=-1e6, le=1e6)]
 Rate = Annotated[float, Field(ge=0.0, le=30.0)]
 Angle = Annotated[float, Field(ge=0.0, le=180.0)]
+Sigma = Annotated[float, Field(ge=0.3, le=10.0)]
 Flux = Annotated[float, Field(ge=0.0, le=1e7)]
 Spots = Annotated[int, Field(ge=0, le=1000)]
+Several = Field(max_length=8)
 Triple = tuple[Signed, Signed, Signed]
 
-NONE_KNOWN: Triple = (0.0, 0.0, 0.0)
+LEFT_OUT = ("zero_point_e_s", "limit_mag")
+"""Keys that the example shows as comments."""
+
+
+def _key(default: Any, description: str, example: Any = None) -> Any:
+    """Return a key: its default (an ellipsis for none), meaning with unit, and an example."""
+    return Field(default, description=description, examples=None if example is None else [example])
 
 
 class Sensor(Section):
-    """A star sensor."""
+    """A star sensor; light, detector, what it does with a frame, what is not known, trials."""
 
-    # light
-    zero_point_e_s: float | None = Field(
-        None, gt=0.0, le=1e15,
-        description="electrons/s of a star of magnitude 0 in the band of the artifact; or else "
-        "aperture_mm and quantum_efficiency",
-    )  # fmt: skip
-    aperture_mm: float | None = Field(
-        None, gt=0.0, le=2000.0, description="diameter of the aperture, mm", examples=[20.0]
+    zero_point_e_s: Positive | None = _key(
+        None,
+        "electrons/s of a star of magnitude 0 in the band of the artifact; or else aperture_mm and "
+        "quantum_efficiency",
+        6.0e6,
     )
-    quantum_efficiency: float | None = Field(
-        None, gt=0.0, le=1.0, examples=[0.5],
-        description="electrons per photon, transmission of the optics included",
-    )  # fmt: skip
-    photons_s_mm2: float = Field(
-        38_200.0, gt=0.0, le=1e9,
-        description="photons/s and mm2 of a star of magnitude 0; the default is Liebe's 19,100 "
-        "electrons (2002) at a quantum efficiency of 0.5",
-    )  # fmt: skip
-    exposure_s: float = Field(gt=0.0, le=60.0, description="exposure, s", examples=[0.1])
-    psf_sigma_px: float = Field(
-        ge=0.3, le=10.0, description="standard deviation of the Gaussian spot, px", examples=[0.8]
+    aperture_mm: Positive | None = _key(None, "diameter of the aperture, mm", 20.0)
+    quantum_efficiency: Efficiency | None = _key(
+        None, "electrons per photon, transmission of the optics included", 0.5
     )
-    pixel_um: float = Field(gt=0.0, le=1000.0, description="pixel, um", examples=[12.0])
-    # detector
-    read_noise_e: float = Field(ge=0.0, le=1e4, description="read noise, electrons", examples=[8.0])
-    full_well_e: float = Field(
-        gt=0.0, le=1e9, description="electrons that a pixel holds", examples=[50_000.0]
+    photons_s_mm2: Positive = _key(
+        38_200.0,
+        "photons/s and mm2 of a star of magnitude 0; the default is Liebe's 19,100 electrons "
+        "(2002) at a quantum efficiency of 0.5",
     )
-    gain_e_adu: float = Field(
-        gt=0.0, le=1e6, description="electrons of a step of the converter", examples=[12.5]
+    exposure_s: Positive = _key(..., "exposure, s", 0.1)
+    psf_sigma_px: Sigma = _key(..., "standard deviation of the Gaussian spot, px", 0.8)
+    pixel_um: Positive = _key(..., "pixel, um", 12.0)
+    read_noise_e: Size = _key(..., "read noise, electrons", 8.0)
+    full_well_e: Positive = _key(..., "electrons that a pixel holds", 50_000.0)
+    gain_e_adu: Positive = _key(..., "electrons of a step of the converter", 12.5)
+    bits: Annotated[int, Field(ge=6, le=16)] = _key(12, "bits of the converter")
+    offset_adu: Size = _key(50.0, "level without light, steps")
+    dark_e_s: Size = _key(0.0, "dark current of a pixel, electrons/s", 50.0)
+    sky_e_s: Size = _key(0.0, "stray light and sky in a pixel, electrons/s", 100.0)
+    prnu: Share = _key(0.0, "photo response non-uniformity, standard deviation, share", 0.01)
+    dsnu_e_s: Size = _key(0.0, "dark signal non-uniformity, standard deviation, electrons/s", 20.0)
+    hot_pixel_share: Share = _key(
+        0.0, "share of hot pixels at end of life, unknown to the sensor", 0.001
     )
-    bits: int = Field(12, ge=6, le=16, description="bits of the converter")
-    offset_adu: float = Field(50.0, ge=0.0, le=60_000.0, description="level without light, steps")
-    dark_e_s: Size = Field(0.0, description="dark current of a pixel, electrons/s", examples=[50.0])
-    sky_e_s: Size = Field(
-        0.0, description="stray light and sky in a pixel, electrons/s", examples=[100.0]
+    hot_pixel_e_s: Size = _key(
+        20_000.0, "mean dark current of a hot pixel (exponential), electrons/s"
     )
-    prnu: Share = Field(
-        0.0, description="photo response non-uniformity, standard deviation, share", examples=[0.01]
+    threshold_sigma: Annotated[float, Field(ge=2.0, le=100.0)] = _key(
+        5.0, "threshold of detection, standard deviations"
     )
-    dsnu_e_s: Size = Field(
-        0.0, description="dark signal non-uniformity, standard deviation, electrons/s",
-        examples=[20.0],
-    )  # fmt: skip
-    hot_pixel_share: Share = Field(
-        0.0, description="share of hot pixels at end of life, unknown to the sensor",
-        examples=[0.001],
-    )  # fmt: skip
-    hot_pixel_e_s: Size = Field(
-        20_000.0, description="mean dark current of a hot pixel (exponential), electrons/s"
+    limit_mag: Mag | None = _key(
+        None, "fainter spots are not used, mag; default: 0.3 beyond the artifact's", 6.3
     )
-    # what the sensor does with a frame
-    threshold_sigma: float = Field(
-        5.0, ge=2.0, le=100.0, description="threshold of detection, standard deviations"
+    most_spots: Annotated[int, Field(ge=4, le=10_000)] = _key(64, "brightest spots that are used")
+    update_rate_hz: Positive = _key(..., "frames/s", 5.0)
+    processing_s: Size = _key(0.0, "from the end of an exposure to the attitude, s", 0.2)
+    alignment_arcsec: Triple = _key(
+        (0.0, 0.0, 0.0), "error of the alignment about x, y, z, arcsec: bias", [5.0, -3.0, 10.0]
     )
-    limit_mag: Mag | None = Field(
-        None, description="fainter spots are not used, mag; default: 0.3 beyond the artifact's",
-        examples=[6.3],
-    )  # fmt: skip
-    most_spots: int = Field(64, ge=4, le=10_000, description="brightest spots that are used")
-    update_rate_hz: float = Field(gt=0.0, le=1000.0, description="frames/s", examples=[5.0])
-    processing_s: float = Field(
-        0.0, ge=0.0, le=600.0, description="from the end of an exposure to the attitude, s",
-        examples=[0.2],
-    )  # fmt: skip
-    # what is not known
-    alignment_arcsec: Triple = Field(
-        NONE_KNOWN, description="error of the alignment about x, y, z, arcsec: bias",
-        examples=[[5.0, -3.0, 10.0]],
-    )  # fmt: skip
-    thermo_elastic_arcsec: Triple = Field(
-        NONE_KNOWN, description="thermo-elastic error about x, y, z, arcsec: reported as stated",
-        examples=[[1.0, 1.0, 2.0]],
-    )  # fmt: skip
-    principal_point_error_px: tuple[Signed, Signed] = Field(
-        (0.0, 0.0), description="true principal point less the known one, x and y, px: bias",
-        examples=[[0.05, -0.02]],
-    )  # fmt: skip
-    focal_length_error: float = Field(
-        0.0, ge=-0.1, le=0.1, description="true focal length over the known one, less 1",
-        examples=[1e-5],
-    )  # fmt: skip
-    distortion_error_px: float = Field(
-        0.0, ge=-100.0, le=100.0, description="unknown distortion (k1) at the farthest corner, px",
-        examples=[0.05],
-    )  # fmt: skip
-    catalog_error_arcsec: float = Field(
-        0.0, ge=0.0, le=60.0, description="error of a position on each axis at the epoch of the "
-        "mission, standard deviation, arcsec", examples=[0.05],
-    )  # fmt: skip
-    velocity_error_km_s: float = Field(
-        0.0, ge=0.0, le=1000.0, description="error of the velocity that aberration is corrected "
-        "with, standard deviation on each axis, km/s", examples=[0.01],
-    )  # fmt: skip
-    # what it is tried with
-    rates_deg_s: tuple[Rate, ...] = Field(
-        (0.0, 0.1, 0.5, 1.0), max_length=8, description="rates across the boresight, deg/s"
+    thermo_elastic_arcsec: Triple = _key(
+        (0.0, 0.0, 0.0),
+        "thermo-elastic error about x, y, z, arcsec: reported as stated",
+        [1.0, 1.0, 2.0],
     )
-    false_stars: tuple[Spots, ...] = Field(
-        (5, 20), max_length=8, description="false stars in a frame, as bright as guide stars"
+    principal_point_error_px: tuple[Signed, Signed] = _key(
+        (0.0, 0.0), "true principal point less the known one, x and y, px: bias", [0.05, -0.02]
     )
-    missing_shares: tuple[Share, ...] = Field(
-        (0.1, 0.3), max_length=8, description="shares of the stars that are missing"
+    focal_length_error: Annotated[float, Field(ge=-0.1, le=0.1)] = _key(
+        0.0, "true focal length over the known one, less 1", 1e-5
     )
-    radiation_cm2_s: tuple[Flux, ...] = Field(
-        (100.0, 1000.0), max_length=8, description="particles that leave a spot, per cm2 and s"
+    distortion_error_px: Annotated[float, Field(ge=-100.0, le=100.0)] = _key(
+        0.0, "unknown distortion (k1) at the farthest corner, px", 0.05
     )
-    radiation_e: float = Field(
-        3000.0, gt=0.0, le=1e7, description="mean charge of a particle (exponential), electrons"
+    catalog_error_arcsec: Annotated[float, Field(ge=0.0, le=60.0)] = _key(
+        0.0,
+        "error of a position on each axis at the epoch of the mission, standard deviation, arcsec",
+        0.05,
     )
-    radiation_track_px: float = Field(
-        3.0, ge=0.0, le=1000.0, description="mean length of a track (exponential), px"
+    velocity_error_km_s: Annotated[float, Field(ge=0.0, le=1000.0)] = _key(
+        0.0,
+        "error of the velocity that aberration is corrected with, standard deviation on each axis, "
+        "km/s",
+        0.01,
     )
-    exclusion_deg: tuple[Angle, Angle, Angle] = Field(
-        (30.0, 25.0, 15.0), description="angles of exclusion of Sun, Earth, Moon, deg: for 42"
+    rates_deg_s: Annotated[tuple[Rate, ...], Several] = _key(
+        (0.0, 0.1, 0.5, 1.0), "rates across the boresight, deg/s"
     )
-    confidence: float = Field(
-        0.997, gt=0.5, lt=1.0, description="confidence at which errors are stated"
+    false_stars: Annotated[tuple[Spots, ...], Several] = _key(
+        (5, 20), "false stars in a frame, as bright as guide stars"
+    )
+    missing_shares: Annotated[tuple[Share, ...], Several] = _key(
+        (0.1, 0.3), "shares of the stars that are missing"
+    )
+    radiation_cm2_s: Annotated[tuple[Flux, ...], Several] = _key(
+        (100.0, 1000.0), "particles that leave a spot, per cm2 and s"
+    )
+    radiation_e: Positive = _key(3000.0, "mean charge of a particle (exponential), electrons")
+    radiation_track_px: Annotated[float, Field(ge=0.0, le=1000.0)] = _key(
+        3.0, "mean length of a track (exponential), px"
+    )
+    exclusion_deg: tuple[Angle, Angle, Angle] = _key(
+        (30.0, 25.0, 15.0), "angles of exclusion of Sun, Earth, Moon, deg: for 42"
+    )
+    confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = _key(
+        0.997, "confidence at which errors are stated"
     )
 
     @model_validator(mode="after")
@@ -204,15 +187,13 @@ def example_toml() -> str:
     """Return a sensor with every key explained: its meaning, unit and default."""
     lines = ["# A star sensor: starcat evaluate ARTIFACT --ecss SENSOR.toml"]
     for name, field in Sensor.model_fields.items():
-        told = "required" if field.is_required() else f"default: {_text(field.default)}"
-        text = (
-            field.description
-            if "default" in str(field.description)
-            else (f"{field.description} ({told})")
-        )
-        value = field.examples[0] if field.examples else field.default
-        lines += ["", *(f"# {line}" for line in textwrap.wrap(str(text), 94))]
-        lines.append(f"# {name} = 6.0e7" if value is None else f"{name} = {_text(value)}")
+        text, value = str(field.description), (field.examples or [field.default])[0]
+        if field.is_required():
+            text += " (required)"
+        elif "default" not in text:
+            text += f" (default: {_text(field.default)})"
+        lines += ["", *(f"# {line}" for line in textwrap.wrap(text, 94))]
+        lines.append(f"{'# ' * (name in LEFT_OUT)}{name} = {_text(value)}")
     return "\n".join(lines) + "\n"
 
 

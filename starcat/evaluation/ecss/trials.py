@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Matrix, Pixels
+from starcat.errors import ConfigError
 from starcat.evaluation.campaign import side_by_side
 from starcat.evaluation.ecss.bench import (
     Bench,
@@ -54,6 +55,7 @@ class Trial:
 def trials_of(bench: Bench, pointings: int) -> list[Trial]:
     """Return all trials of a sensor, the nominal one first and the worst of the sky last."""
     sensor = bench.sensor
+    _check_trails(bench)
     conditions = {
         **{f"{r:g} deg/s": Condition(rate_deg_s=r) for r in sensor.rates_deg_s if r},
         **{f"{n} false stars": Condition(false_stars=n) for n in sensor.false_stars},
@@ -61,7 +63,7 @@ def trials_of(bench: Bench, pointings: int) -> list[Trial]:
            for s in sensor.missing_shares},
         **{f"{f:,g} particles/cm2/s": Condition(radiation_cm2_s=f)
            for f in sensor.radiation_cm2_s},
-        "hot pixels at end of life": Condition(is_old=True),
+        **({"hot pixels at end of life": Condition(is_old=True)} if sensor.hot_pixel_share else {}),
         "a planet in the field": Condition(has_planet=True),
     }  # fmt: skip
     worst = worst_boresights(bench)
@@ -70,6 +72,18 @@ def trials_of(bench: Bench, pointings: int) -> list[Trial]:
         *(Trial(n, c, pointings, 2 if c.rate_deg_s else 1) for n, c in conditions.items()),
         Trial(WORST, Condition(), pointings, 2, boresights=worst),
     ]
+
+
+def _check_trails(bench: Bench) -> None:
+    most_px = 0.5 * min(bench.shape) - _PITCH_PX
+    for rate in (0.0, *bench.sensor.rates_deg_s):
+        if (smear_px := bench.smear_px(rate)) > most_px:
+            text = (
+                f"rates_deg_s: {rate:g} deg/s draws trails of {smear_px:.0f} px in "
+                f"{bench.sensor.exposure_s:g} s; expected at most {most_px:.0f} px on this "
+                "detector: state slower rates or a shorter exposure"
+            )
+            raise ConfigError(text, key="rates_deg_s", value=rate)
 
 
 NOMINAL, WORST = "nominal", "worst 1 % of the sky"
@@ -143,7 +157,7 @@ def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
     """
     key = zlib.crc32(f"{mag:g} {rate_deg_s:g}".encode())
     generator = np.random.default_rng([bench.seed, key])
-    smear_px = math.radians(rate_deg_s) * bench.sensor.exposure_s * bench.camera.focal_length_px
+    smear_px = bench.smear_px(rate_deg_s)
     reach = _REACH_PX + 0.5 * smear_px
     grid = [
         np.arange(0.5, size / (_PITCH_PX + smear_px) - 0.5) * (_PITCH_PX + smear_px)
