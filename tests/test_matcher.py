@@ -267,7 +267,9 @@ def test_the_agreement_of_a_cluster_alone_is_refused(sky_of, random_directions):
     place = CAMERA.pixels_from_directions(database.directions @ matrix.T)
     stars = np.flatnonzero(CAMERA.contains(place))
     outside = stars[stars < 1200]
-    place[outside] = np.random.default_rng(37).random((len(outside), 2)) * 1024.0
+    generator = np.random.default_rng(37)
+    place += generator.normal(scale=0.3, size=place.shape)
+    place[outside] = generator.random((len(outside), 2)) * 1024.0
     found = agreement_of(matrix, observe(place[stars], CAMERA, 2.0), database)
     assert found.n_matched >= 10
     assert found.false_match_probability == 1.0

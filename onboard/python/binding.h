@@ -11,7 +11,7 @@ typedef struct {
   double fold_radius;
 } starcat_camera;
 typedef struct {
-  double tolerance_px, noise_px, noise_mag, log_chance;
+  double tolerance_px, noise_px, noise_mag, log_chance, fov_error;
   uint32_t max_steps;
 } starcat_options;
 typedef struct { ...; } starcat_result;

@@ -320,7 +320,7 @@ def _options(settings: Settings) -> Any:
     chance = math.log(max(settings.max_false_match_probability, 1e-300))
     # The library takes 0 for a noise that is not stated.
     stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
-    options = [settings.tolerance_px, *stated, chance, MAX_STEPS]
+    options = [settings.tolerance_px, *stated, chance, 0.0, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 

@@ -30,6 +30,9 @@ _THREE_SIGMA = 3.0
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
+SURE_CORNER = 0.5
+"""Largest error of a corner, in tolerances, that stars may leave which determine their frame."""
+
 _UNIT = np.eye(3)
 
 
@@ -150,6 +153,7 @@ def explained_fraction(
     matched: Directions,
     stars: Directions,
     residual_rad: float,
+    pose: Pose,
     observation: Observation,
     enough: float = 1.0,
 ) -> float:
@@ -162,13 +166,33 @@ def explained_fraction(
     of_stars = weighted_share(covariance, stars)
     if of_stars >= enough:
         return of_stars
-    of_centroids = weighted_share(covariance, observation.body)
+    of_centroids = weighted_share(covariance, pose.body)
     if of_centroids <= of_stars:
         return of_stars
-    # Three of the 2n components went into the attitude, a fourth into the scale.
-    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - len(covariance)))
-    corner_rad = deviation_rad * corner_deviation(covariance, observation.camera)
+    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, pose.camera)
     return of_stars if corner_rad > observation.tolerance_rad else of_centroids
+
+
+def determines_frame(
+    matched: Directions, residual_rad: float, camera: Camera, tolerance_rad: float
+) -> bool:
+    """Return whether stars alone put every corner of a frame where it is.
+
+    That is so if its error is a small part of the tolerance even where the focal length is not
+    trusted but fitted.
+    """
+    try:
+        covariance: Array = np.linalg.inv(information(matched, with_scale=True)).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return False
+    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, camera)
+    return corner_rad <= SURE_CORNER * tolerance_rad
+
+
+def _corner_error_rad(covariance: Array, n: int, residual_rad: float, camera: Camera) -> float:
+    # Three of the 2n components went into the attitude, a fourth into the scale.
+    deviation_rad = residual_rad * math.sqrt(n / (2 * n - len(covariance)))
+    return deviation_rad * corner_deviation(covariance, camera)
 
 
 def information(directions: Array, *, with_scale: bool = False) -> Array:
