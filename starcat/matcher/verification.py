@@ -166,8 +166,7 @@ def _worth_trying(
     if len(candidates) > alone:
         matrices, factors = first_poses(candidates[alone:], observation, database.directions)
         count = agreeing_centroids(matrices, observation, database, factors)
-        order = np.argsort(-count, kind="stable")
-        for row in order[count[order] >= MIN_STARS].tolist():
+        for row in np.flatnonzero(count >= MIN_STARS).tolist():
             yield pose_at(matrices[row], float(factors[row]), observation)
 
 
