@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -172,6 +172,32 @@ class MatchResult:
         default=None, repr=False, compare=False
     )
 
+    @classmethod
+    def later(cls, status: Status, make: Callable[[], MatchResult]) -> MatchResult:
+        """Return the answer that ``make`` gives, which is called when more than that is asked."""
+        answer = cls.__new__(cls)
+        content = answer.__dict__
+        content["status"], content["_make"] = status, make
+        return answer
+
+    def _complete(self) -> dict[str, Any]:
+        """Make what is not made yet; return all that there is."""
+        content = vars(self)
+        make = content.get("_make")
+        if make is not None:
+            for name, value in vars(make()).items():
+                content.setdefault(name, value)
+            content.pop("_make", None)
+        return content
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            content = self._complete()
+            if name not in content:
+                raise AttributeError(f"'MatchResult' object has no attribute {name!r}")
+            return content[name]
+
     @property
     def ok(self) -> bool:
         """Whether the frame was identified."""
@@ -194,7 +220,8 @@ class MatchResult:
     @cached_property
     def q_body_from_icrs(self) -> NDArray[np.float64]:
         """Scalar-last attitude, shape (4,); NaN unless identified."""
-        return quaternion_from_matrix(self.matrix)
+        own = self._complete().get("_quaternion")
+        return quaternion_from_matrix(self.matrix) if own is None else own
 
     @cached_property
     def _angles(self) -> tuple[float, float, float]:
@@ -316,8 +343,9 @@ class MatchResult:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: the stars, not the database they are of."""
-        known = vars(self).get("refusal", None if callable(self.why) else self.why)
-        content = {**vars(self), "frame": None, "database": None, "why": known}
+        made = self._complete()
+        known = made.get("refusal", None if callable(self.why) else self.why)
+        content = {**made, "frame": None, "database": None, "why": known}
         if self.database is not None:
             content["star_ids"] = self.star_ids
             if self.frame is not None and self.camera is not None:
@@ -362,6 +390,11 @@ class MatchResult:
         )
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
+
+# A default in the class would hide what is not made yet; the constructor has its own.
+for _field in fields(MatchResult):
+    if _field.name in vars(MatchResult):
+        delattr(MatchResult, _field.name)
 
 NO_MATRIX = np.full((3, 3), np.nan)
 NO_MATRIX.flags.writeable = False
