@@ -741,7 +741,7 @@ def test_a_stated_noise_is_three_of_the_tolerance(small_artifact):
     found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
     assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
     assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
-    again = replace(found, max_batches=7)
+    again = replace(found, max_steps=7)
     assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
 
 

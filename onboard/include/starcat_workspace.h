@@ -9,6 +9,9 @@
 #define STARCAT_MOST_CENTROIDS 32
 #define STARCAT_MOST_PAIRS (STARCAT_MOST_CENTROIDS * (STARCAT_MOST_CENTROIDS - 1) / 2)
 
+/* Nearest centroids that a centroid makes triangles with in a crowded frame. */
+#define STARCAT_NEIGHBOURS 20
+
 /* Which star each centroid of a frame is under an attitude. */
 typedef struct {
   starcat_real matrix[9];
@@ -39,6 +42,10 @@ struct starcat_workspace {
   /* Separations of pairs of centroids k > i, at k (k - 1) / 2 + i. */
   starcat_real separation_rad[STARCAT_MOST_PAIRS];
   uint16_t heap[STARCAT_MOST_PAIRS];
+
+  /* The nearest centroids of each one in a crowded frame, which has no separations of pairs. */
+  uint16_t neighbour[STARCAT_MAX_CENTROIDS][STARCAT_NEIGHBOURS];
+  uint32_t is_crowded;
 
   /* The stars around the field of an attitude, and where it puts them. */
   uint32_t n_near;

@@ -29,6 +29,10 @@ typedef struct {
   double matrix[3][3];
   double residual_rad;
   double log_chance;
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
   double seconds;
 } starcat_answer;
 typedef struct {

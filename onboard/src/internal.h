@@ -41,6 +41,8 @@
 #define SC_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
 #define SC_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define SC_FEW_CENTROIDS 12u
+#define SC_SPREAD_CENTROIDS 400u /* that make triangles with their neighbours, the first ones */
+#define SC_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
 
 /* A camera as a call uses it. */
 typedef struct {

@@ -14,6 +14,7 @@ typedef struct {
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
   int poor; /* in the second round, those that the first has left out */
+  uint32_t left; /* triangles that may still be looked up */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -21,7 +22,9 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
 }
 
 real sc_side(const sc_call *call, uint32_t i, uint32_t j) {
-  return call->work->separation_rad[pair_of(i, j)];
+  const starcat_workspace *w = call->work;
+  return w->is_crowded != 0u ? sc_angle_of_chord(sc_chord_square(w->body[i], w->body[j]))
+                             : w->separation_rad[pair_of(i, j)];
 }
 
 /* Whether a triangle has no side as short as `least` and no angle as narrow as one of a cosine
@@ -43,7 +46,7 @@ static int is_well_shaped(const real sides[3], real least, real cosine) {
 }
 
 /* Look a triangle up if it is of this round. Returns 1 if the search can end. */
-static int take(sc_call *call, const search *s, uint32_t i, uint32_t j, uint32_t k) {
+static int take(sc_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
   const uint32_t triple[3] = {i, j, k};
   const real sides[3] = {sc_side(call, j, k), sc_side(call, i, k), sc_side(call, i, j)};
   const int good = is_well_shaped(sides, s->least_side_rad, SC_COS_MIN_ANGLE);
@@ -56,6 +59,10 @@ static int take(sc_call *call, const search *s, uint32_t i, uint32_t j, uint32_t
   if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, SC_COS_LEAST_ANGLE)) {
     return 0;
   }
+  if (s->left == 0u) {
+    return 1;
+  }
+  s->left--;
   return s->look_up(call, triple, sides);
 }
 
@@ -68,7 +75,7 @@ static void separate(sc_call *call, uint32_t k) {
 }
 
 /* Triangles by brightness: those whose faintest centroid is the brightest come first. */
-static int by_brightness(sc_call *call, const search *s) {
+static int by_brightness(sc_call *call, search *s) {
   for (uint32_t k = 0; k < s->count; k++) {
     if (s->poor == 0) {
       separate(call, k);
@@ -109,7 +116,7 @@ static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
 }
 
 /* All triangles whose longest side is that of a pair. */
-static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
+static int with_longest_side(sc_call *call, search *s, uint16_t pair) {
   const starcat_workspace *w = call->work;
   uint32_t q = 1;
   while ((q + 1u) * q / 2u <= pair) {
@@ -130,7 +137,7 @@ static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
 
 /* Triangles by their longest side, the shortest first: the most fields hold these whole. The
  * pairs are sorted no further than they are needed. */
-static int by_longest_side(sc_call *call, const search *s) {
+static int by_longest_side(sc_call *call, search *s) {
   starcat_workspace *w = call->work;
   uint32_t count = s->count * (s->count - 1u) / 2u;
   if (s->poor == 0) {
@@ -159,10 +166,86 @@ static int by_longest_side(sc_call *call, const search *s) {
   return 0;
 }
 
-void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+/* List the nearest centroids of one, the nearest first. Returns how many. */
+static uint32_t list_neighbours(sc_call *call, uint32_t i, uint32_t count) {
+  starcat_workspace *w = call->work;
+  real square[STARCAT_NEIGHBOURS];
+  uint32_t n = 0;
+  for (uint32_t k = 0; k < count; k++) {
+    const real apart = sc_chord_square(w->body[i], w->body[k]);
+    if ((k == i) || ((n == STARCAT_NEIGHBOURS) && !(apart < square[n - 1u]))) {
+      continue;
+    }
+    uint32_t at = n < STARCAT_NEIGHBOURS ? n++ : n - 1u;
+    while ((at > 0u) && (apart < square[at - 1u])) {
+      square[at] = square[at - 1u];
+      w->neighbour[i][at] = w->neighbour[i][at - 1u];
+      at--;
+    }
+    square[at] = apart;
+    w->neighbour[i][at] = (uint16_t)k;
+  }
+  return n;
+}
+
+/* Whether two centroids are neighbours of a third, of ranks that come before others: then their
+ * triangle has been taken. */
+static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, uint32_t b,
+                      uint32_t first, uint32_t second, int is_before) {
+  uint32_t low = STARCAT_NEIGHBOURS, high = STARCAT_NEIGHBOURS;
+  for (uint32_t n = 0; n <= second; n++) {
+    const uint32_t one = w->neighbour[owner][n];
+    if ((one == a) || (one == b)) {
+      high = low < STARCAT_NEIGHBOURS ? n : high;
+      low = low < STARCAT_NEIGHBOURS ? low : n;
+    }
+  }
+  if (high == STARCAT_NEIGHBOURS) {
+    return 0;
+  }
+  return (high < second) || (low < first) || ((low == first) && (is_before != 0));
+}
+
+/* Triangles of near centroids from all over a crowded frame: every centroid's two nearest
+ * neighbours, then of every centroid the first and third nearest, the second and third, and so on.
+ * A database holds the triangles of the brightest stars of its fields; in one place of a crowded
+ * frame most are of the same few stars. */
+static int by_neighbours(sc_call *call, search *s) {
   const starcat_workspace *w = call->work;
-  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0};
+  uint32_t most = 0;
+  for (uint32_t i = 0; i < s->count; i++) {
+    most = list_neighbours(call, i, s->count);
+    if (!sc_spend(call->work, s->count)) {
+      return 1;
+    }
+  }
+  for (uint32_t second = 1; second < most; second++) {
+    for (uint32_t first = 0; first < second; first++) {
+      for (uint32_t i = 0; i < s->count; i++) {
+        const uint32_t a = w->neighbour[i][first], b = w->neighbour[i][second];
+        const uint32_t low = a < b ? a : b, high = a < b ? b : a;
+        if (!is_earlier(w, a, i, b, first, second, a < i) &&
+            !is_earlier(w, b, i, a, first, second, b < i) &&
+            (take(call, s, i < low ? i : low, i < low ? low : (i < high ? i : high),
+                  i < high ? high : i) != 0)) {
+          return 1;
+        }
+      }
+    }
+  }
+  return 0;
+}
+
+void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+  starcat_workspace *w = call->work;
+  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0, SC_MOST_TRIANGLES};
   s.least_side_rad = SC_MIN_SIDE_PX / call->focal_px;
+  w->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (w->has_magnitudes == 0u);
+  if (w->is_crowded != 0u) {
+    s.count = s.count < SC_SPREAD_CENTROIDS ? s.count : SC_SPREAD_CENTROIDS;
+    (void)by_neighbours(call, &s);
+    return;
+  }
   if (s.count > STARCAT_MOST_CENTROIDS) {
     s.count = STARCAT_MOST_CENTROIDS;
   }

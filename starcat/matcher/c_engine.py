@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -23,8 +23,9 @@ from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, Frames
+from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import MatchResult, Refusal, Status, no_match
+from starcat.matcher.result import MatchResult, Reason, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
@@ -36,19 +37,21 @@ except ImportError:  # the wheel was built without a compiler
     _onboard = None
 
 
-MAX_STEPS = 2_000_000_000
-"""Steps for one frame: on the ground the limit is the caller's patience, not a clock."""
+MAX_STEPS = 300_000_000
+"""Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
 
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
-OUT_OF_STEPS = -14
-"""What the library returns where a budget was used up."""
-
 STATUSES: dict[int, Status] = {
-    0: "identified", 1: "no_match", 2: "too_few_stars", OUT_OF_STEPS: "no_match",
+    0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match",
 }  # fmt: skip
-"""What a frame came to, by the number that the library returns."""
+"""What a frame came to, by the number that the library returns: -14 where the steps are used up."""
+
+REASONS: tuple[Reason, ...] = (
+    "chance", "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "steps",
+)  # fmt: skip
+"""Why there is no answer, by the number of the library."""
 
 NOT_OPENED = {
     -4: "it is of a version of the format that the library does not read",
@@ -71,10 +74,6 @@ def library_version() -> str | None:
     if _onboard is None:
         return None
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
-
-
-Explain = Callable[[Prior | None, Frame], Refusal | None]
-"""Searches a frame again and says why it gets no answer, which the library does not."""
 
 
 @lru_cache(maxsize=1)
@@ -194,21 +193,21 @@ class CEngine:
         self.directions = _double_pointer(directions)
         self.database = database
 
-    def search(self, camera: Camera, settings: Settings, explain: Explain | None = None) -> Search:
+    def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
         """Return what asks the library about frames of a camera."""
-        return Search(self, camera, settings, explain)
+        return Search(self, camera, settings, fov_error)
 
 
 class Search:
     """The C library with an image, a camera and settings; threads may share it."""
 
     def __init__(
-        self, engine: CEngine, camera: Camera, settings: Settings, explain: Explain | None
+        self, engine: CEngine, camera: Camera, settings: Settings, fov_error: float
     ) -> None:
-        self.camera, self._settings = camera, settings
-        self._database, self._explain = engine.database, explain
+        self.camera, self._settings, self._fov_error = camera, settings, fov_error
+        self._database = engine.database
         # The library is given addresses: what stands there has to be kept.
-        self._kept = engine, _camera(camera), _options(settings)
+        self._kept = engine, _camera(camera), _options(settings, fov_error)
         addresses = [engine.image, *self._kept[1:], engine.rows, engine.directions]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
         self._one, self._null = _onboard.lib.starcat_one, _onboard.ffi.NULL
@@ -299,7 +298,16 @@ class Search:
         }
         code, dropped = int(found["status"]), _dropped(star)
         if STATUSES[code] != "identified":
-            return no_match(len(star), dropped, self._why(code, frame, prior), **facts)
+            return no_match(len(star), dropped, _refusal_of(found, prior), **facts)
+        camera, error_px = frame.camera, None
+        if self._fov_error:
+            camera = camera.with_focal_length(float(found["focal_length_px"]))
+            error_px = focal_length_error_px(
+                camera.directions_from_pixels(frame.centroids_px[star >= 0]),
+                camera.focal_length_px,
+                float(found["residual_rad"]),
+                self._settings.noise_px,
+            )
         answer = MatchResult(
             "identified",
             np.maximum(star, -1),
@@ -307,22 +315,31 @@ class Search:
             float(found["residual_rad"]) * ARCSEC,
             math.exp(found["log_chance"]),
             dropped,
-            frame.camera,
+            camera,
+            error_px,
             **facts,
         )
         # The library's own, which rounds otherwise than the one that the matrix makes.
         vars(answer)["_quaternion"] = found["q_body_from_icrs"].copy()
         return answer
 
-    def _why(
-        self, code: int, frame: Frame, prior: Prior | None
-    ) -> Refusal | Callable[[], Refusal | None] | None:
-        """Return why a frame has no answer, or what finds it out."""
-        if code == OUT_OF_STEPS:
-            return Refusal("steps")
-        if STATUSES[code] == "too_few_stars":
-            return Refusal("too_few_stars")
-        return None if self._explain is None else partial(self._explain, prior, frame)
+
+def _refusal_of(found: np.void, prior: Prior | None) -> Refusal:
+    """Return why the library has no answer."""
+    reason = REASONS[int(found["reason"])]
+    if reason == "too_few_stars":
+        return Refusal(reason)
+    if prior is not None and (reason == "no_candidate" or not found["log_chance"] < 0.0):
+        return Refusal("prior")
+    if reason == "no_candidate":
+        return Refusal(reason)
+    return Refusal(
+        reason,
+        int(found["n_matched"]),
+        math.exp(found["log_chance"]),
+        float(found["share"]),
+        int(found["n_usable"]),
+    )
 
 
 class _Memory:
@@ -363,11 +380,11 @@ def _camera(camera: Camera) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _options(settings: Settings) -> Any:
+def _options(settings: Settings, fov_error: float) -> Any:
     chance = math.log(max(settings.max_false_match_probability, 1e-300))
     # The library takes 0 for a noise that is not stated.
     stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
-    options = [settings.tolerance_px, *stated, chance, 0.0, MAX_STEPS]
+    options = [settings.tolerance_px, *stated, chance, fov_error, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 

@@ -119,20 +119,19 @@ def _by_scale(body: Array) -> Array:
 
 
 def focal_length_error_px(
-    pose: Pose, matched: Rows, residual_rad: float, observation: Observation
+    matched: Directions, focal_length_px: float, residual_rad: float, noise_px: float | None
 ) -> float:
     """Return the standard error of a focal length that was fitted with an attitude."""
-    focal_px, n = pose.camera.focal_length_px, len(matched)
     try:
-        covariance = np.linalg.inv(information(pose.body[matched], with_scale=True))
+        covariance = np.linalg.inv(information(matched, with_scale=True))
     except np.linalg.LinAlgError:
         return math.inf
-    if observation.settings.noise_px is not None:
-        sigma_rad = observation.settings.noise_px / focal_px
+    if noise_px is not None:
+        sigma_rad = noise_px / focal_length_px
     else:
-        free = 2 * n - 4
-        sigma_rad = residual_rad * math.sqrt(n / free) * _student(free) / _THREE_SIGMA
-    return focal_px * sigma_rad * math.sqrt(max(0.0, float(covariance[3, 3])))
+        free = 2 * len(matched) - 4
+        sigma_rad = residual_rad * math.sqrt(len(matched) / free) * _student(free) / _THREE_SIGMA
+    return focal_length_px * sigma_rad * math.sqrt(max(0.0, float(covariance[3, 3])))
 
 
 def _student(free: int) -> float:

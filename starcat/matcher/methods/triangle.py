@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.settings import LOOKUP, TriangleOrder
+from starcat.matcher.settings import LOOKUP, MOST_TRIANGLES, TriangleOrder
 
 LEAST_ANGLE_DEG = 4.0
 """Smallest angle of a triangle that is tried at all."""
@@ -156,7 +156,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
     Liao and Zhang 2024 (S4), sections 2 and 3.
     """
-    triangles = select_triangles(observation)
+    triangles = select_triangles(observation)[:MOST_TRIANGLES]
     done = step = 0
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
