@@ -238,12 +238,16 @@ class Search:
             memory.address,
         )
         record, stars = memory.answer[:], memory.stars[: 4 * count]
+        q_found = None if prior is None else _onboard.ffi.unpack(memory.q_found, 4)
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        return MatchResult.later(
+        found = MatchResult.later(
             STATUSES[code], self._answer_of_bytes, record, stars, px, mags, prior
         )
+        if prior is None:
+            return found
+        return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
 
     def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
         """Identify the stars of frames; None where the library does not take one of them."""
@@ -334,6 +338,7 @@ class _Memory:
         self.address = ffi.new("starcat_memory *")
         self.answer = ffi.buffer(ffi.addressof(self.address, "answer"))
         self.stars = ffi.buffer(ffi.addressof(self.address, "star"))
+        self.q_found = self.address.answer.q_body_from_icrs
 
 
 _FREE: list[_Memory] = []
