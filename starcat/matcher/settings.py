@@ -123,7 +123,7 @@ class Settings:
         more than 3.5 of it, and agreements of magnitudes count as evidence.
     engine : {"auto", "c", "numpy"}
         ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
-        and ``pyramid`` with the default selection: with triangles twenty times as fast from
+        and ``pyramid`` with the default selection: with triangles forty times as fast from
         Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` where
         it can serve.
     min_share : float
