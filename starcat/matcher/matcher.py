@@ -197,7 +197,7 @@ class Matcher(Settings, _WithDatabase):
         elif error := self._checked_fov_error(fov_error):
             search = partial(search, fov_error=error)
         elif (in_c := self._in_c(camera)) and (found := in_c.one(px, mags, near)):
-            return near.checked(found, camera, self.tolerance_px) if near else found
+            return found
         return self._timed(as_frame(px, camera, mags), search)
 
     def identify_many(
