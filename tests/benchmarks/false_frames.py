@@ -215,7 +215,7 @@ def part_of_the_frame(generator: Generator, scene: Scene) -> Trial:
 
 
 def at_a_cluster(generator: Generator, scene: Scene) -> Trial:
-    """Return a frame with a cluster such as the Pleiades, where many of the other stars are missing."""
+    """Return a frame with a cluster such as the Pleiades, and many other stars missing."""
     u, camera = scene.database.directions, scene.camera
     crowd = scene.database.cached(_neighbours).astype(np.float64) ** 3
     star = u[generator.choice(len(u), p=crowd / crowd.sum())]
