@@ -147,11 +147,11 @@ class BatchResult(Sequence[MatchResult]):
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
-        return MatchResult.later(STATUSES[self._codes[frame]], partial(self._answer, frame))
+        return MatchResult.later(STATUSES[self._codes[frame]], self._answer, frame)
 
     def __iter__(self) -> Iterator[MatchResult]:
         for frame, code in enumerate(self._codes):
-            yield MatchResult.later(STATUSES[code], partial(self._answer, frame))
+            yield MatchResult.later(STATUSES[code], self._answer, frame)
 
     def _answer(self, n: int) -> MatchResult:
         stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
@@ -237,11 +237,16 @@ class Search:
             memory.address,
         )
         record, stars = memory.answer[:], memory.stars[: 4 * count]
+        q_found = None if prior is None else _onboard.ffi.unpack(memory.q_found, 4)
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        make = partial(self._answer_of_bytes, record, stars, px, mags, prior)
-        return MatchResult.later(STATUSES[code], make)
+        found = MatchResult.later(
+            STATUSES[code], self._answer_of_bytes, record, stars, px, mags, prior
+        )
+        if prior is None:
+            return found
+        return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
 
     def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
         """Identify the stars of frames; None where the library does not take one of them."""
@@ -350,6 +355,7 @@ class _Memory:
         self.address = ffi.new("starcat_memory *")
         self.answer = ffi.buffer(ffi.addressof(self.address, "answer"))
         self.stars = ffi.buffer(ffi.addressof(self.address, "star"))
+        self.q_found = self.address.answer.q_body_from_icrs
 
 
 _FREE: list[_Memory] = []

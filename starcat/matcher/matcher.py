@@ -198,7 +198,7 @@ class Matcher(Settings, _WithDatabase):
         # The library does not search for both at once.
         in_c = None if error and near else self._in_c(camera, error)
         if in_c and (found := in_c.one(px, mags, near)):
-            return near.checked(found, camera, self.tolerance_px) if near else found
+            return found
         search = partial(solve, fov_error=error, prior=near)
         return self._timed(as_frame(px, camera, mags), search)
 

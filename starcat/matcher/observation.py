@@ -75,14 +75,16 @@ def as_arrays(
 ) -> tuple[Pixels, Array | None]:
     """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
-    given = given.reshape(0, 2) if given.size == 0 else given
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+    if given.shape[1:] != (2,):
+        if given.size:
+            raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+        given = given.reshape(0, 2)
     if magnitudes is None:
         return given, None
-    mag = numbers_of("magnitudes", magnitudes, f"({len(given)},)")
-    if mag.shape != (len(given),):
-        one_each = f"({len(given)},), one a centroid"
+    shape = given.shape[:1]
+    mag = numbers_of("magnitudes", magnitudes, shape)
+    if mag.shape != shape:
+        one_each = f"{shape}, one a centroid"
         raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
     return given, mag
 
@@ -129,7 +131,7 @@ def _joined(
     return (counts, px, mag) if fits else None
 
 
-def numbers_of(name: str, values: ArrayLike, shape: str) -> Array:
+def numbers_of(name: str, values: ArrayLike, shape: str | tuple[int, ...]) -> Array:
     """Return an argument as an array of real numbers."""
     if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
         return values

@@ -173,20 +173,23 @@ class MatchResult:
     )
 
     @classmethod
-    def later(cls, status: Status, make: Callable[[], MatchResult]) -> MatchResult:
-        """Return the answer that ``make`` gives, which is called when more than that is asked."""
+    def later(
+        cls, status: Status, make: Callable[..., MatchResult], *arguments: Any
+    ) -> MatchResult:
+        """Return the answer of ``make(*arguments)``, called when more than the status is asked."""
         answer = cls.__new__(cls)
         content = answer.__dict__
-        content["status"], content["_make"] = status, make
+        content["status"], content["_make"] = status, (make, arguments)
         return answer
 
     def _complete(self) -> dict[str, Any]:
         """Make what is not made yet; return all that there is."""
         content = vars(self)
-        make = content.get("_make")
-        if make is not None:
-            for name, value in vars(make()).items():
-                content.setdefault(name, value)
+        unmade = content.get("_make")
+        if unmade is not None:
+            make, arguments = unmade
+            # What another thread has made meanwhile stays.
+            content.update({**vars(make(*arguments)), **content})
             content.pop("_make", None)
         return content
 
