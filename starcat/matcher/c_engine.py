@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from importlib import import_module
 from typing import Any, overload
 
@@ -147,21 +147,19 @@ class BatchResult(Sequence[MatchResult]):
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
-        return MatchResult.later(STATUSES[self._codes[frame]], self._answer, frame)
+        return MatchResult.later(STATUSES[self._codes[frame]], self._facts, frame)
 
     def __iter__(self) -> Iterator[MatchResult]:
         for frame, code in enumerate(self._codes):
-            yield MatchResult.later(STATUSES[code], self._answer, frame)
+            yield MatchResult.later(STATUSES[code], self._facts, frame)
 
-    def _answer(self, n: int) -> MatchResult:
+    def _facts(self, n: int) -> dict[str, Any]:
         stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
-        return self.search.answer(self.records[n], stars, self.frames[n])
+        return self.search.facts(self.records[n], stars, self.frames[n])
 
 
 def _dropped(star: NDArray[np.int32]) -> Dropped:
     """Return row and reason of every centroid that was not used, repeats last."""
-    if star.min(initial=-1) >= -1:
-        return ()
     rows = np.flatnonzero(star < -1)
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
     return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
@@ -242,7 +240,7 @@ class Search:
         if code not in STATUSES:
             return None
         found = MatchResult.later(
-            STATUSES[code], self._answer_of_bytes, record, stars, px, mags, prior
+            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, prior
         )
         if prior is None:
             return found
@@ -279,59 +277,57 @@ class Search:
         answers = BatchResult(records, star_index, frames, self)
         return answers if answers.is_whole else None
 
-    def _answer_of_bytes(
+    def _facts_of_bytes(
         self, record: bytes, stars: bytes, px: bytes, mags: bytes | None, prior: Prior | None
-    ) -> MatchResult:
+    ) -> dict[str, Any]:
+        star = np.frombuffer(stars, np.int32)
         frame = Frame(
-            np.frombuffer(px).reshape(-1, 2),
+            np.ndarray((len(star), 2), np.float64, px),
             None if mags is None else np.frombuffer(mags),
             self.camera,
         )
-        found = np.frombuffer(record, _answer_dtype())[0]
-        return self.answer(found, np.frombuffer(stars, np.int32), frame, prior)
+        return self.facts(np.frombuffer(record, _answer_dtype())[0], star, frame, prior)
 
-    def answer(
-        self, found: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
-    ) -> MatchResult:
-        """Return the answer to a frame, from a record and the stars as `BatchResult` has them."""
-        facts: dict[str, Any] = {
+    def facts(
+        self, record: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
+    ) -> dict[str, Any]:
+        """Return the fields of an answer, from a record and stars as `BatchResult` has them."""
+        found: dict[str, Any] = dict(zip(record.dtype.names or (), record.item(), strict=True))
+        has_dropped = found["n_usable"] < len(star)
+        facts = {
+            "dropped": _dropped(star) if has_dropped else (),
             "origin": "lost_in_space" if prior is None else "tracking",
-            "time_s": float(found["seconds"]),
+            "time_s": found["seconds"],
             "frame": frame,
             "database": self._database,
             "noise_px": self._settings.noise_px,
         }
-        code, dropped = int(found["status"]), _dropped(star)
-        if STATUSES[code] != "identified":
-            return no_match(len(star), dropped, _refusal_of(found, prior), **facts)
+        if STATUSES[found["status"]] != "identified":
+            return vars(no_match(len(star), why=_refusal_of(found, prior), **facts))
         camera, error_px = frame.camera, None
         if self._fov_error:
-            camera = camera.with_focal_length(float(found["focal_length_px"]))
+            camera = camera.with_focal_length(found["focal_length_px"])
             error_px = focal_length_error_px(
                 camera.directions_from_pixels(frame.centroids_px[star >= 0]),
                 camera.focal_length_px,
-                float(found["residual_rad"]),
+                found["residual_rad"],
                 self._settings.noise_px,
             )
-        answer = MatchResult(
-            "identified",
-            np.maximum(star, -1),
-            found["matrix"].copy(),
-            float(found["residual_rad"]) * ARCSEC,
-            math.exp(found["log_chance"]),
-            dropped,
-            camera,
-            error_px,
-            **facts,
-        )
-        # The library's own, which rounds otherwise than the one that the matrix makes.
-        vars(answer)["_quaternion"] = found["q_body_from_icrs"].copy()
-        return answer
+        return facts | {
+            "star_index": np.maximum(star, -1) if has_dropped else star.copy(),
+            "matrix": found["matrix"].copy(),
+            "residual_arcsec": found["residual_rad"] * ARCSEC,
+            "false_match_probability": math.exp(found["log_chance"]),
+            "camera": camera,
+            "focal_length_error_px": error_px,
+            # The library's own, which rounds otherwise than the one that the matrix makes.
+            "_quaternion": found["q_body_from_icrs"].copy(),
+        }
 
 
-def _refusal_of(found: np.void, prior: Prior | None) -> Refusal:
+def _refusal_of(found: dict[str, Any], prior: Prior | None) -> Refusal:
     """Return why the library has no answer."""
-    reason = REASONS[int(found["reason"])]
+    reason = REASONS[found["reason"]]
     if reason == "too_few_stars":
         return Refusal(reason)
     if prior is not None and (reason == "no_candidate" or not found["log_chance"] < 0.0):
@@ -339,11 +335,7 @@ def _refusal_of(found: np.void, prior: Prior | None) -> Refusal:
     if reason == "no_candidate":
         return Refusal(reason)
     return Refusal(
-        reason,
-        int(found["n_matched"]),
-        math.exp(found["log_chance"]),
-        float(found["share"]),
-        int(found["n_usable"]),
+        reason, found["n_matched"], math.exp(found["log_chance"]), found["share"], found["n_usable"]
     )
 
 

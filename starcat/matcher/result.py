@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -174,9 +174,9 @@ class MatchResult:
 
     @classmethod
     def later(
-        cls, status: Status, make: Callable[..., MatchResult], *arguments: Any
+        cls, status: Status, make: Callable[..., dict[str, Any]], *arguments: Any
     ) -> MatchResult:
-        """Return the answer of ``make(*arguments)``, called when more than the status is asked."""
+        """Return an answer whose other fields ``make(*arguments)`` gives when one is asked for."""
         answer = cls.__new__(cls)
         content = answer.__dict__
         content["status"], content["_make"] = status, (make, arguments)
@@ -189,7 +189,7 @@ class MatchResult:
         if unmade is not None:
             make, arguments = unmade
             # What another thread has made meanwhile stays.
-            content.update({**vars(make(*arguments)), **content})
+            content.update(_DEFAULTS | make(*arguments) | content)
             content.pop("_make", None)
         return content
 
@@ -394,10 +394,11 @@ class MatchResult:
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
 
+_DEFAULTS = {one.name: one.default for one in fields(MatchResult) if one.default is not MISSING}
+
 # A default in the class would hide what is not made yet; the constructor has its own.
-for _field in fields(MatchResult):
-    if _field.name in vars(MatchResult):
-        delattr(MatchResult, _field.name)
+for _name in _DEFAULTS:
+    delattr(MatchResult, _name)
 
 NO_MATRIX = np.full((3, 3), np.nan)
 NO_MATRIX.flags.writeable = False
