@@ -160,7 +160,7 @@ static int invert_angles(const sc_information *matched, sc_information *covarian
 
 /* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
  * whether its stars determine the whole frame, even where the focal length is not trusted. */
-void sc_weigh(const sc_call *call, const real m[9], starcat_agreement *found) {
+void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found) {
   const starcat_workspace *w = call->work;
   const real n = (real)found->n_matched;
   sc_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
@@ -178,7 +178,7 @@ void sc_weigh(const sc_call *call, const real m[9], starcat_agreement *found) {
   if (is_whole) {
     corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(4.0))) *
              corner_deviation(&with_scale, &call->camera);
-    found->is_firm = corner <= SC_SURE_CORNER * call->tolerance_rad;
+    found->is_firm = corner <= SC_SURE_CORNER * tolerance_rad;
   }
   if (found->n_matched >= w->n_within) {
     return;
@@ -208,7 +208,7 @@ void sc_weigh(const sc_call *call, const real m[9], starcat_agreement *found) {
 }
 
 /* Whether the frame differs in scale from the stars that it matches: a wrong focal length. */
-int sc_is_scaled(const sc_call *call, uint32_t n_matched) {
+int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px) {
   const starcat_workspace *w = call->work;
   const real n = (real)n_matched;
   real mean_x = R(0.0), mean_y = R(0.0), off_x = R(0.0), off_y = R(0.0);
@@ -235,7 +235,7 @@ int sc_is_scaled(const sc_call *call, uint32_t n_matched) {
       STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                    call->camera.half_height * call->camera.half_height);
   const real moved = excess < R(0.0) ? -excess * corner_px : excess * corner_px;
-  if (!(moved > call->tolerance_px)) {
+  if (!(moved > tolerance_px)) {
     return 0;
   }
   for (uint32_t i = 0; i < w->count; i++) {

@@ -116,8 +116,8 @@ real sc_log_ways(const sc_call *call, uint32_t n);
 /* chance.c */
 real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);
 void sc_inform(sc_information *h, const real b[3]);
-void sc_weigh(const sc_call *call, const real m[9], starcat_agreement *found);
-int sc_is_scaled(const sc_call *call, uint32_t n_matched);
+void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found);
+int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
 int sc_spend(starcat_workspace *work, uint32_t steps);

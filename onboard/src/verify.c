@@ -216,8 +216,8 @@ static void withhold(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
-/* Judge the fit that is in the workspace. */
-static void judge(const sc_call *call, const real m[9], uint32_t matched,
+/* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
+static void judge(const sc_call *call, const real m[9], uint32_t matched, real factor,
                   starcat_agreement *found) {
   starcat_workspace *w = call->work;
   real square_px = R(0.0), square_rad = R(0.0);
@@ -250,11 +250,11 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched,
   found->log_bound = sc_log_chance(call, square_px, matched);
   found->log_chance = found->log_bound;
   if (found->log_bound < R(0.0)) {
-    sc_weigh(call, m, found);
+    sc_weigh(call, m, factor * call->tolerance_rad, found);
     if ((found->share < SC_MIN_SHARE) &&
         !((found->is_firm != 0u) && (found->log_bound <= SC_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
-    } else if (sc_is_scaled(call, matched)) {
+    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px)) {
       withhold(found, STARCAT_REASON_SCALE);
     }
   }
@@ -321,7 +321,7 @@ static void try_rivals(sc_call *call) {
     real m[9];
     begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], w->rival_of[n], m);
-    judge(call, m, fit(call, m, &AS_GIVEN), &w->wider);
+    judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
     if (w->wider.log_chance < w->found.log_chance) {
       w->found = w->wider;
       return;
@@ -360,7 +360,7 @@ static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) 
         ((real)nearer[k] >= SC_OVER_CHANCE * r.last * r.last * (real)count)) {
       real m[9];
       begin_at(call, &w->found, m);
-      judge(call, m, fit(call, m, &r), &w->wider);
+      judge(call, m, fit(call, m, &r), r.last, &w->wider);
       if (is_better(&w->wider, &w->found)) {
         w->found = w->wider;
       }
@@ -376,7 +376,7 @@ static void try_other_scales(sc_call *call) {
   real m[9];
   begin_at(call, &w->found, m);
   sc_allow_scales(call, SC_OTHER_SCALES);
-  judge(call, m, fit(call, m, &ROUGH), &w->wider);
+  judge(call, m, fit(call, m, &ROUGH), R(1.0), &w->wider);
   sc_allow_scales(call, R(0.0));
   const real moved = corner_px * (call->focal - R(1.0));
   sc_set_focal(call, R(1.0));
@@ -399,7 +399,7 @@ int sc_try(sc_call *call, const real m[9], real focal) {
   }
   w->n_tried++;
   sc_set_focal(call, focal);
-  judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), found);
+  judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
   count_nearer(call, nearer);
   if (found->log_chance < R(0.0)) {
@@ -412,7 +412,7 @@ int sc_try(sc_call *call, const real m[9], real focal) {
     /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
      * edge of a cluster may have spoilt an attitude that is nearly right. */
     begin_at(call, found, attitude);
-    judge(call, attitude, fit(call, attitude, &WIDER), &w->wider);
+    judge(call, attitude, fit(call, attitude, &WIDER), R(1.0), &w->wider);
     if (w->wider.log_chance < found->log_chance) {
       *found = w->wider;
     }

@@ -303,7 +303,7 @@ class Search:
             "noise_px": self._settings.noise_px,
         }
         if STATUSES[found["status"]] != "identified":
-            return vars(no_match(len(star), why=_refusal_of(found, prior), **facts))
+            return vars(no_match(len(star), refusal=_refusal_of(found, prior), **facts))
         camera, error_px = frame.camera, None
         if self._fov_error:
             camera = camera.with_focal_length(found["focal_length_px"])

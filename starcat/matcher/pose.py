@@ -241,19 +241,20 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
     return math.sqrt(max(0.0, variance))
 
 
-def is_scaled(predicted_px: Pixels, centroids_px: Pixels, observation: Observation) -> bool:
+def is_scaled(
+    predicted_px: Pixels, centroids_px: Pixels, camera: Camera, tolerance_px: float
+) -> bool:
     """Return whether a frame differs in scale from the stars that it matches.
 
     A frame of another scale means that the camera's focal length is wrong. The attitude may be
     right, but towards the edge of the frame stars are taken for their neighbours.
     """
-    camera = observation.camera
     inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
     extent = float(np.vdot(inner, inner))
     offset = centroids_px - predicted_px
     excess = float(np.vdot(inner, offset)) / extent
     corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
-    if abs(excess) * corner_px <= observation.tolerance_px:
+    if abs(excess) * corner_px <= tolerance_px:
         return False
     left = offset - excess * inner
     left -= left.sum(axis=0) / len(left)

@@ -292,6 +292,7 @@ class _Fit:
     star: Rows  # of each centroid a row of ``near``, -1 where none
     matched: Rows  # centroids with a star
     square_px: Array
+    last: float  # the last reach, in units of the final one
 
 
 def _refine(
@@ -318,7 +319,7 @@ def _refine(
             break
         before = after
         pose = fit(pose, matched, u[star[matched]], observation)
-    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
+    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px, last)
 
 
 def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
@@ -351,10 +352,16 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
     withheld: Withheld = None
     is_firm = True
     if chance < 1.0:
-        is_firm = determines_frame(seen, residual_rad, pose.camera, observation.tolerance_rad)
+        tolerance_rad = refined.last * observation.tolerance_rad
+        is_firm = determines_frame(seen, residual_rad, pose.camera, tolerance_rad)
         if share < observation.settings.min_share and not (is_firm and chance <= FIRM_CHANCE):
             withheld = "share_of_frame"
-        elif is_scaled(refined.predicted_px[star], observation.centroids_px[matched], observation):
+        elif is_scaled(
+            refined.predicted_px[star],
+            observation.centroids_px[matched],
+            pose.camera,
+            refined.last * observation.tolerance_px,
+        ):
             withheld = "scale"
     return Agreement(pose, index, residual_rad, chance, share, withheld, is_firm)
 
