@@ -521,6 +521,18 @@ IDENTIFY_OPTIONS: Cases = {
     "noise of magnitudes that is none": lambda place: (
         lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
     ),
+    "tolerance of centroids that is none": lambda place: (
+        lambda: Matcher.open(place.artifact, tolerance_px=-1.0)
+    ),
+    "probability that is none": lambda place: (
+        lambda: Matcher.open(place.artifact, max_false_match_probability=2.0)
+    ),
+    "centroids that are no numbers": lambda place: (
+        lambda: Matcher.open(place.artifact).identify([["a", "b"]])
+    ),
+    "centroids of three numbers": lambda place: (
+        lambda: Matcher.open(place.artifact).identify([[1.0, 2.0, 3.0]])
+    ),
     "option unknown": run("build --ouput {out}"),
     "unknown unit in a data-source file": misspelt_unit,
     "WCS of centroids": identify("--wcs {out}/copy.fits"),
@@ -619,13 +631,9 @@ def json_frames(text: str) -> Callable[[Place], Call]:
     return run("identify {artifact} {folder}/frames.json", {"frames.json": text})
 
 
-def draw_trails(place: Place) -> None:
-    image, along = np.full((512, 512), 100, dtype=np.uint16), np.arange(20)
-    image[::2] += 3
-    for number in range(12):
-        rows, columns = 40 * number + 20 + along // 2, 30 * number + 30 + along
-        image[rows, columns] += np.uint16(2000 + 200 * number)
-    write_image(place.folder / "frame.fits", image)
+def empty_folder(place: Place) -> Call:
+    (place.folder / "empty").mkdir()
+    return run("identify {artifact} {folder}/empty")(place)
 
 
 def write_ones(place: Place) -> None:
@@ -680,7 +688,15 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "image that is none": run(
         "identify {artifact} {folder}/frame.png", {"frame.png": "no picture"}
     ),
-    "image that shows trails": run(IDENTIFY_FITS, draw_trails),
+    "pattern without a file": run("identify {artifact} {folder}/*.png"),
+    "folder without frames": empty_folder,
+    "picture of many files": run(
+        "identify {artifact} {folder}/a.csv {folder}/a.csv --picture {folder}/a.png",
+        {"a.csv": "x_px,y_px\n1,2\n"},
+    ),
+    "contact sheet of another kind": run(
+        "identify {artifact} {folder}/a.csv --contact-sheet a.svg", {"a.csv": "x_px,y_px\n1,2\n"}
+    ),
     "dark frame of another size": run("identify {artifact} {black} --dark {small_black}"),
     "mask without a hole": run(
         "identify {artifact} {folder}/frame.png --mask {folder}/frame.png", write_ones

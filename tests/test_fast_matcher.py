@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import TriangleOrder
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 pytestmark = pytest.mark.skipif(
     not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
@@ -180,6 +181,80 @@ def test_answers_do_not_depend_on_threads_or_on_company(sky):
     assert [found.status for found in four[5:8]] == four.status[5:8]
     with pytest.raises(IndexError):
         one[600]
+
+
+def test_frames_may_be_given_as_one_frame_may(sky):
+    matcher = Matcher(sky, engine="c")
+    frame, other = frames(sky, 2)
+    px = [
+        frame.centroids_px.tolist(),
+        [],
+        np.round(other.centroids_px).astype(int),
+        np.asfortranarray(frame.centroids_px),
+        np.repeat(frame.centroids_px, 2, axis=1)[:, ::2],
+        frame.centroids_px.astype(np.float32),
+    ]
+    mags = [frame.mag.tolist(), [], None, frame.mag[::-1][::-1], frame.mag, frame.mag]
+    for known in (None, mags):
+        found = matcher.identify_many(px, magnitudes=known)
+        for number, given_px in enumerate(px):
+            alone = matcher.identify(given_px, magnitudes=known and known[number])
+            assert_same(found[number], alone)
+    assert [answer.ok for answer in found] == [True, False, True, True, True, True]
+    assert len(matcher.identify_many([])) == 0
+    for wrong in ([[1.0, 2.0, 3.0]], [1.0, 2.0], 5.0):
+        with pytest.raises(ValueError, match="expected"):
+            matcher.identify_many([frame.centroids_px, wrong])
+    with pytest.raises(ValueError, match=r"magnitudes have shape \(1,\); expected"):
+        matcher.identify_many([frame.centroids_px], magnitudes=[[1.0]])
+
+
+def told(answer: MatchResult) -> list[str]:
+    """Return all that an answer says."""
+    facts = (answer.matrix, answer.q_body_from_icrs, answer.stars, answer.dropped, answer.frame)
+    return [answer.status, repr(answer), *map(repr, facts), *map(str, answer.star_ids)]
+
+
+def test_an_answer_keeps_its_values_when_the_next_frame_comes(sky):
+    matcher = Matcher(sky, engine="c")
+    some = frames(sky, 12, HARD, seed=5)
+    expected = [told(matcher.identify(one.centroids_px, magnitudes=one.mag)) for one in some]
+    px, mag = np.empty((100, 2)), np.empty(100)
+    found = []
+    for one in some:  # the caller's memory is used again too
+        count = len(one.mag)
+        px[:count], mag[:count] = one.centroids_px, one.mag
+        found.append(matcher.identify(px[:count], magnitudes=mag[:count]))
+    px[:], mag[:] = -1.0, 99.0
+    assert [told(answer) for answer in found] == expected
+
+
+def test_threads_that_share_a_matcher_get_the_answers_of_one(sky):
+    matcher = Matcher(sky, engine="c")
+    some = frames(sky, 200, HARD, seed=7)
+
+    def ask(frame: Frame) -> MatchResult:
+        return matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+
+    expected = [told(ask(frame)) for frame in some]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(ask, some))
+        assert list(pool.map(told, found)) == expected
+
+
+def test_an_answer_that_nobody_has_looked_at_is_whole(sky):
+    matcher = Matcher(sky, engine="c")
+    (frame,) = frames(sky, 1)
+    expected = matcher.identify(frame.centroids_px)
+    found = pickle.loads(pickle.dumps(matcher.identify(frame.centroids_px)))
+    assert_same(found, expected)
+    assert found.stars.star == expected.stars.star
+    again = replace(matcher.identify(frame.centroids_px), residual_arcsec=1.0)
+    assert (again.residual_arcsec, again.camera) == (1.0, sky.camera)
+    assert again.star_ids.tolist() == expected.star_ids.tolist()
+    assert type(again) is type(expected) is MatchResult
+    with pytest.raises(AttributeError, match="no attribute 'attitude'"):
+        _ = expected.attitude
 
 
 # --- Engines

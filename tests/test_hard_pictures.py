@@ -9,11 +9,18 @@ from hard_pictures import KINDS, MORE_KINDS, Scene, in_file_steps, scene_light, 
 from scipy.spatial import cKDTree
 
 from starcat.errors import ConfigError
+from starcat.geometry.attitude import random_attitudes
 from starcat.images.background import subtract_background
 from starcat.images.centroiding import find_spots
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import IdentifyOptions, LocalInputs, measure
+from starcat.images.solve_files import (
+    FOV_ERROR_OF_IMAGES,
+    IdentifyOptions,
+    LocalInputs,
+    identify_file,
+    measure,
+)
 from starcat.images.spot_width import best_widths
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
@@ -142,11 +149,93 @@ def elongated(sky: tuple[np.ndarray, np.ndarray], by_px: np.ndarray) -> np.ndarr
     return render_image(parts.reshape(-1, 2), faint, SIZE, Optics(), 4)
 
 
-def test_trails_are_told_and_refused():
+@pytest.mark.parametrize("length_px", [15.0, 60.0])
+def test_streaks_are_measured_at_their_middles(length_px):
+    places = grid(50, 100, 3.0)
+    sky = places, np.random.default_rng(5).uniform(2.0, 4.0, len(places))
+    spots = find_spots(elongated(sky, length_px * np.array([0.8, 0.6])), gain_e_per_adu=1.0)
+    assert spots.streak is not None
+    assert spots.streak.length_px == pytest.approx(length_px, rel=0.06)
+    distance, index = cKDTree(spots.centroids_px).query(places)
+    near = distance < 1.5
+    assert near.sum() >= 11
+    pull = (spots.centroids_px[index] - places)[near] / spots.sigma_px[index][near, None]
+    assert 0.5 < np.median(pull**2) / 0.455 < 2.0
+
+
+def test_stated_widths_measure_streaks_as_stars():
     image = elongated(stars(25, 3, 4.0), np.array([12.0, 9.0]))
-    with pytest.raises(ConfigError, match=r"trails of 1[4-7] px.*expose shorter"):
-        find_spots(image)
-    assert len(find_spots(image, psf_sigma_px=1.5)) > 10
+    spots = find_spots(image, psf_sigma_px=1.5)
+    assert spots.streak is None
+    assert len(spots) > 10
+
+
+# Errors of centroids
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.2, 2.5])
+@pytest.mark.parametrize(
+    ("faintest", "background_e"), [(6.0, 20.0), (7.5, 20.0), (6.0, 1000.0)],
+    ids=["bright", "faint", "bright sky"],
+)  # fmt: skip
+def test_the_errors_of_centroids_are_what_is_said_of_them(sigma, faintest, background_e):
+    rng = np.random.default_rng(int(10 * sigma))
+    axis = np.arange(25, 590, 36)
+    places = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2) + rng.uniform(-1, 1, (256, 2))
+    mag = rng.uniform(faintest - 2.5, faintest, len(places))
+    optics = Optics(psf_sigma_px=sigma, full_well_e=1e9, background_e=background_e)
+    spots = find_spots(render_image(places, mag, (620, 620), optics, 3), gain_e_per_adu=1.0)
+    distance, index = cKDTree(places).query(spots.centroids_px)
+    near = distance < 3.0
+    pull = (spots.centroids_px - places[index])[near] / spots.sigma_px[near, None]
+    # The standard deviation of the mean of 300 squares and more is 0.08.
+    assert near.sum() > 150
+    assert 0.8 < (pull**2).mean() < 1.25
+
+
+def test_an_image_without_light_has_no_errors_of_centroids():
+    assert len(find_spots(np.zeros((40, 40)))) == 0
+
+
+# What is measured once more
+
+
+def test_faint_stars_among_many_hot_pixels_are_found_without_those():
+    places, mag = stars(40, 11, 4.0)
+    optics = Optics(psf_sigma_px=1.3, hot_pixels=3600, zero_point_e=50_000.0)
+    image = render_image(places, mag, SIZE, optics, 12)
+
+    def found(**how: object) -> tuple[int, int]:
+        spots = find_spots(image, **how)
+        distance, _ = cKDTree(places).query(spots.centroids_px) if len(spots) else (np.empty(0), 0)
+        return int((distance < 1.0).sum()), len(spots)
+
+    assert found()[0] < 10
+    right, count = found(without_hot_pixels=True)
+    assert right >= 35
+    assert count < 60
+
+
+def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path):
+    matcher = Matcher.open(small_artifact)
+    camera, matrix = matcher.database.camera, random_attitudes(1, np.random.default_rng(4))[0]
+    body = matcher.database.directions @ matrix.T
+    seen = np.flatnonzero(body[:, 2] > 0.9)
+    places, mag = camera.pixels_from_directions(body[seen]), matcher.database.mag[seen]
+    optics = Optics(psf_sigma_px=1.3, hot_pixels=8000, zero_point_e=80_000.0)
+    path = tmp_path / "faint.png"
+    size = camera.width_px, camera.height_px
+    write_image(path, render_image(places, mag, size, optics, 5))
+    measured = measure(path)
+    [frame] = measured.frames
+    first = matcher.identify(
+        frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR_OF_IMAGES
+    )
+    assert not first.ok
+    [answer] = identify_file(path, matcher)
+    assert answer.result.ok
+    turned = answer.result.matrix @ matrix.T
+    assert np.degrees(np.linalg.norm(turned - np.eye(3)) / np.sqrt(2.0)) < 0.1
 
 
 def test_long_spots_of_a_lens_are_no_trails():

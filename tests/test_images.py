@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import logging
 import struct
@@ -606,6 +607,49 @@ def test_jpeg_is_written_and_read(tmp_path):
     assert (tmp_path / "b.jpeg").stat().st_size < (tmp_path / "a.jpg").stat().st_size
 
 
+HEIC = base64.b64decode(
+    "AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAX1tZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAA"
+    "AAAAAAAAACJpbG9jAAAAAERAAAEAAQAAAAABoQABAAAAAAAAA+sAAAAjaWluZgAAAAAAAQAAABVpbmZlAgAAAAABAABo"
+    "dmMxAAAAAA5waXRtAAAAAAABAAAA/WlwcnAAAADdaXBjbwAAAHZodmNDAQNwAAAAkAAAAAAAHvAA/P34+AAADwNgAAEA"
+    "GEABDAH//wNwAAADAJAAAAMAAAMAHroCQGEAAQAqQgEBA3AAAAMAkAAAAwAAAwAeoCCBBZbq5Ka5uAhoMCAAAAMDIAAA"
+    "AwAhYgABAAZEAcFzwIkAAAATY29scm5jbHgAAQANAAaAAAAAFGlzcGUAAAAAAAAAQAAAAEAAAAAoY2xhcAAAAEAAAAAB"
+    "AAAAMAAAAAEAAAAAAAAAAv////AAAAACAAAAEHBpeGkAAAAAAwgICAAAABhpcG1hAAAAAAAAAAEAAQWBAgMFhAAAA/Nt"
+    "ZGF0AAAD5ygBrwT4QZqYUGXgi2/2+evTnn0GBDAFUCF6ZXbTwuit+SPH8fyzlMv/9xtw+Tt5HkyZ+oxughpwHUXMCEut"
+    "nof/48W5I8nIDXUk0P4oKwACvXBs4NuCC98HWzcUB8LI775OsijrqvuaGSKLMf7rP2A1Pou12D4y8pKSBeHaw1D8Hj8P"
+    "pw0yl+Bn3RMbqUlHUOUQK/UxYy5f9uqT0mxBS3l2eE/1S6QIBo/N/2b0LLufs5S9vk+Fb39+fo9ZknJIv5Dz/tPxkAeu"
+    "OUREccGraqJGnLudxnkeeA2X+Yb98DWJkKDYqvVCmZQuGUqf3y4lgOaMDToA27gDQeEd/fjfpxRYXVFRk976MhilBIsK"
+    "yLcFbWzbw9KLivAxm1ZgsjDS7quJqB+81xPACfCVm/cNlqjcNwSL++wv6svSQqnPTv4z88oSKxsdB/OVMHrenyifBoUv"
+    "B7YDj4NEHH7E7krmZ38L4IzyM+I/gkP2IqKgJBfkCDFAKBu/CJuaOxNs3aSAQCpUQ2jjqKCnfCmYczxzlo2BubUlarma"
+    "qW4e7HvL8oLF2fN136cEA6KCe2z6Mvtavi47J12h8tibRURnjlXAQMswsJR5kTMt5ovtc0805TYHdK4ZxvGi3qIiuaiB"
+    "LIG2CRSrutky/RhTx0W+ySdjqCkDCoVux3p4xaXzW0d2hO/1WHZ5aDWYq+bFMcaqrbKiKJa+H/Crsnu0w49lgBGbGB/q"
+    "G1otEzXPn+olEJ7/tkKACS/vOvReeU8ZZ4d3GycUv6oVKmj1FkPVqI3hf/EHWTK02CyJm3DWjYWSGtO23UxwViirz9/C"
+    "WGQHvxOjOo9jrlShcIrpogtaZlHL8FLhgxvEBqvOZIa6N++xTFkPO8nv3Jk7wgVQUeGOcKQDGwjuDv4KzJP9XW+qW7sm"
+    "cfLJO5IE7RKBh/Hv0SOL6VYvxCCjsBcqbChXY5w/6WSAcurgju5kCU4vj6hG6pbRJQv1KppROtTnjLFi/7dCAPkkkuQJ"
+    "czsY2fx1Zu1I9RvE/Uh00dwtgkIvgyl+gel8ZiBMlzWMz6o9Ibe6L9A+Xo2Nk7uO/kU07ktXJlluaDIIky+MenEr+L5e"
+    "D/vnu59kbfqu9Mg/f6WyB3RPE3SbPEU6pWxrMPoLb9wMxxeBDnSU7AmquN5uR4UqETQ7Kl7ndK/MMaLf++LZAsvDBT41"
+    "esyIBt75Y4s7d8XROcBtuL2Q+QDAC84r/4zyr18NICmNjB0q9SY2rTV9ul2h03LR88Ci7KWSJMWKo5G9VYiWWQK8CLtI"
+    "rw+lUbDiAINC9z729fj6Yble99LUJyLouWe8rTVyON4Kxti7lHCbgA=="
+)
+"""64 x 48 px of 8 bits, stars at 12.3, 20.6 and 40.2, 8.4; written by pillow-heif 1.8.1."""
+
+
+def test_heic_of_a_telephone_is_read(tmp_path):
+    pytest.importorskip("pi_heif", reason="pi-heif, of the extra images, is not installed")
+    (tmp_path / "a.heic").write_bytes(HEIC)
+    image = read_image(tmp_path / "a.heic")
+    assert image.shape == (48, 64)
+    assert image[20, 12] > 200.0
+    assert image[8, 40] > 100.0
+    assert np.median(image) < 30.0
+
+
+def test_heic_without_its_library_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    (tmp_path / "a.heic").write_bytes(HEIC)
+    with pytest.raises(ConfigError, match=r"HEIC needs the package pi-heif .*\[images\]"):
+        read_image(tmp_path / "a.heic")
+
+
 @pytest.mark.parametrize(
     ("name", "data", "word"),
     [
@@ -616,9 +660,9 @@ def test_jpeg_is_written_and_read(tmp_path):
         ("a.tif", tiff(GREY16, "<", 1)[:900], "TIFF|variety"),
         ("a.tif", b"II*\0xyz", "TIFF|variety"),
         ("a.gz", b"\x1f\x8bxyz", "damaged gzip file"),
-        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG, TIFF or JPEG"),
+        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG, TIFF, JPEG or HEIC"),
         ("a.jpg", b"\xff\xd8\xff\xe0", "damaged, or a variety"),
-        ("a.fits", b"", "neither FITS nor PNG, TIFF or JPEG"),
+        ("a.fits", b"", "neither FITS nor PNG, TIFF, JPEG or HEIC"),
     ],
 )
 def test_damaged_and_unknown_files_are_refused(name, data, word, tmp_path):

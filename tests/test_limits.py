@@ -47,7 +47,8 @@ def test_a_share_of_the_frame_that_is_too_small_is_told_and_can_be_allowed(
     others_px = generator.uniform(0.0, 1024.0, (30, 2))
     seen = camera.directions_from_pixels(np.concatenate([cluster_px, others_px]))
     sky = sky_of(np.concatenate([random_directions(1200, 1), seen]))
-    px = np.concatenate([cluster_px, generator.uniform(0.0, 1024.0, (30, 2))])
+    noisy_px = cluster_px + generator.normal(scale=0.3, size=cluster_px.shape)
+    px = np.concatenate([noisy_px, generator.uniform(0.0, 1024.0, (30, 2))])
     for min_share, withheld in ((1.0 / 3.0, "share_of_frame"), (0.0, None)):
         observation = observe(px, camera, 2.0, min_share=min_share)
         found = agree(pose_at(np.eye(3), 1.0, observation), observation, sky)
@@ -107,6 +108,35 @@ def test_limits_that_are_none_are_refused(sky):
     ):
         with pytest.raises(ConfigError, match=text):
             Matcher(sky, **given)
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "expected"),
+    [
+        ("tolerance_px", 200.0, "a number above 0, at most 200"),
+        ("noise_px", 50.0, "a number above 0, at most 50"),
+        ("noise_mag", 10.0, "a number above 0, at most 10"),
+        ("max_false_match_probability", 1.0, "0 to 1"),
+        ("min_share", 1.0, "0 to 1"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(sky, name, most, expected):
+    for value in (np.nextafter(most, np.inf), -1.0, np.nan, np.inf, "1", True, np.ones(2)):
+        with pytest.raises(ConfigError, match=f"{name} is .*; expected {expected}$"):
+            Matcher(sky, **{name: value})
+    for value in (most, np.float32(most), 5e-324):
+        assert getattr(Matcher(sky, **{name: value}), name) == value
+    if expected.startswith("0"):
+        assert getattr(Matcher(sky, **{name: 0}), name) == 0
+    else:
+        with pytest.raises(ConfigError, match=f"{name} is 0; expected {expected}$"):
+            Matcher(sky, **{name: 0})
+
+
+@pytest.mark.parametrize("value", [-0.1, 0.6, np.nan, "0.1", np.ones(2)])
+def test_an_error_of_the_field_out_of_range_is_refused(sky, value):
+    with pytest.raises(ConfigError, match=r"fov_error is .*; expected 0 to 0\.5"):
+        Matcher(sky).identify(np.zeros((5, 2)), fov_error=value)
 
 
 def test_frames_that_no_answer_belongs_to_get_none(sky):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from slew import is_near, slew, wrong_by
 
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher import c_engine
@@ -157,12 +158,15 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
         ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
         ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], "1", "above 0, at most 20"),
+        ([0.0, 0.0, [0.0], 1.0], 1.0, "prior is no array of real numbers"),
+        ([0.0, 0.0, 0.0, np.inf], 1.0, "expected a quaternion"),
         ([0.0, 0.0, 0.0, 1.0], None, "prior_error_deg is missing"),
         (None, 1.0, "prior is missing"),
     ],
 )
 def test_a_prior_that_is_none_is_refused(sky, prior, error_deg, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ConfigError, match=words):
         Matcher(sky).identify(np.zeros((5, 2)), prior=prior, prior_error_deg=error_deg)
 
 
@@ -174,6 +178,9 @@ def test_the_length_of_the_prior_does_not_matter(sky):
         for scale in (1.0, -3.0)
     )
     np.testing.assert_allclose(one.q_body_from_icrs, other.q_body_from_icrs, atol=1e-12)
+    for scale in (1e200, 1e-300):  # the squares are beyond all numbers
+        found = matcher.identify(frame.centroids_px, prior=scale * prior, prior_error_deg=0.2)
+        np.testing.assert_allclose(one.q_body_from_icrs, found.q_body_from_icrs, atol=1e-12)
 
 
 # --- Sequences

@@ -11,34 +11,38 @@ typedef struct {
   double fold_radius;
 } starcat_camera;
 typedef struct {
-  double tolerance_px, noise_px, noise_mag, log_chance;
+  double tolerance_px, noise_px, noise_mag, log_chance, fov_error;
   uint32_t max_steps;
 } starcat_options;
-typedef struct { ...; } starcat_result;
-struct starcat_workspace { ...; };
-typedef struct starcat_workspace starcat_workspace;
 typedef struct {
-  uint32_t count;
-  const int64_t *starts;
-  const double *x_px;
-  const double *y_px;
-  const double *magnitudes;
-  const double *q_prior;
-  double uncertainty_rad;
+  const starcat_image *image;
+  const starcat_camera *camera;
+  const starcat_options *options;
+  const int32_t *rows;
   const double *directions;
-} starcat_frames;
+} starcat_search;
 typedef struct {
   int32_t status;
   int32_t n_matched;
   int64_t steps;
   double q_body_from_icrs[4];
-  double matrix[9];
+  double matrix[3][3];
   double residual_rad;
   double log_chance;
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
   double seconds;
 } starcat_answer;
+typedef struct {
+  starcat_answer answer;
+  int32_t star[...];
+  ...;
+} starcat_memory;
 #define STARCAT_MAX_CENTROIDS ...
 #define STARCAT_MAX_STARS ...
 const char *starcat_version(void);
 int starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
-void starcat_many(const starcat_image *image, const starcat_camera *camera, const starcat_options *options, const starcat_frames *frames, starcat_answer *answers, int32_t *stars, starcat_workspace *work, starcat_result *result);
+int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px, const void *magnitudes, const void *q_prior, double uncertainty_rad, starcat_memory *memory);
+void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop, const int64_t *starts, const double *pairs_px, const double *magnitudes, starcat_answer *answers, int32_t *stars, starcat_memory *memory);

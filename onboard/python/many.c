@@ -1,8 +1,9 @@
-/* Many frames in one call, so that a program in Python pays for a call once, and its other threads
- * run meanwhile. Not part of the library that flies.
+/* One frame or many in one call, so that a program in Python pays little for a call, and its other
+ * threads run meanwhile. Not part of the library that flies.
  *
  * SPDX-License-Identifier: MIT
  */
+#include <string.h>
 #include <time.h>
 
 #include "internal.h"
@@ -19,68 +20,101 @@ static double now_s(void) {
 }
 
 /* Fit the attitude once more, with directions that were not rounded. */
-static void fit_again(const double *directions, const starcat_workspace *work,
-                      starcat_result *result) {
-  double body[STARCAT_MAX_CENTROIDS][3] = {{0}}, icrs[STARCAT_MAX_CENTROIDS][3] = {{0}};
+static void fit_again(const double *directions, starcat_memory *memory) {
+  const starcat_workspace *work = &memory->work;
+  const double(*seen)[3] = work->best.focal == 1.0 ? work->body : work->scaled;
+  starcat_result *result = &memory->result;
   double square = 0.0;
   uint32_t n = 0;
   for (uint32_t i = 0; i < work->count; i++) {
     if (work->best.star[i] >= 0) {
       for (size_t k = 0; k < 3u; k++) {
-        body[n][k] = work->body[i][k];
-        icrs[n][k] = directions[3u * (size_t)work->best.star[i] + k];
+        memory->body[n][k] = seen[i][k];
+        memory->icrs[n][k] = directions[3u * (size_t)work->best.star[i] + k];
       }
       n++;
     }
   }
-  sc_refine(result->matrix, &body[0][0], &icrs[0][0], NULL, n, 4);
+  sc_refine(result->matrix, &memory->body[0][0], &memory->icrs[0][0], NULL, n, 4);
   sc_quaternion(result->matrix, result->q_body_from_icrs);
   sc_matrix(result->q_body_from_icrs, result->matrix);
   for (uint32_t i = 0; i < n; i++) {
     double turned[3];
-    sc_turn(result->matrix, icrs[i], turned);
-    square += sc_chord_square(body[i], turned);
+    sc_turn(result->matrix, memory->icrs[i], turned);
+    square += sc_chord_square(memory->body[i], turned);
   }
   result->residual_rad = sqrt(square / (double)n);
 }
 
-void starcat_many(const starcat_image *image, const starcat_camera *camera,
-                  const starcat_options *options, const starcat_frames *frames,
-                  starcat_answer *answers, int32_t *stars, starcat_workspace *work,
-                  starcat_result *result) {
-  for (uint32_t n = 0; n < frames->count; n++) {
-    const int64_t start = frames->starts[n], stop = frames->starts[n + 1u];
-    const double *magnitudes = frames->magnitudes;
-    const starcat_frame frame = {(uint32_t)(stop - start), frames->x_px + start,
-                                 frames->y_px + start,
-                                 magnitudes == NULL ? NULL : magnitudes + start};
-    starcat_answer *answer = answers + n;
-    const double begun_s = now_s();
-    const starcat_status status =
-        frames->q_prior == NULL
-            ? starcat_identify(image, camera, options, &frame, work, result)
-            : starcat_track(image, camera, options, &frame, frames->q_prior + 4u * (size_t)n,
-                            frames->uncertainty_rad, work, result);
-    answer->seconds = now_s() - begun_s;
-    answer->status = (int32_t)status;
-    answer->steps = (int64_t)result->steps;
-    const int has_stars = (status >= 0) || (status == STARCAT_E_BUDGET);
-    for (int64_t i = 0; has_stars && (i < stop - start); i++) {
-      stars[start + i] = result->star[i];
-    }
-    if (status == STARCAT_IDENTIFIED) {
-      if (frames->directions != NULL) {
-        fit_again(frames->directions, work, result);
-      }
-      answer->n_matched = (int32_t)result->n_matched;
-      answer->residual_rad = result->residual_rad;
-      answer->log_chance = result->log_chance;
-      for (size_t k = 0; k < 9u; k++) {
-        answer->matrix[k] = result->matrix[k];
-      }
-      for (size_t k = 0; k < 4u; k++) {
-        answer->q_body_from_icrs[k] = result->q_body_from_icrs[k];
-      }
-    }
+/* What the library found, as Python wants it. */
+static void tell(const starcat_result *result, starcat_answer *answer) {
+  answer->n_usable = (int32_t)result->n_usable;
+  answer->reason = (int32_t)result->reason;
+  if (result->reason != STARCAT_REASON_NONE) {
+    answer->n_matched = (int32_t)result->best_n_matched;
+    answer->log_chance = result->best_log_chance;
+    answer->share = result->best_share;
+    return;
+  }
+  answer->n_matched = (int32_t)result->n_matched;
+  answer->focal_length_px = result->focal_length_px;
+  answer->residual_rad = result->residual_rad;
+  answer->log_chance = result->log_chance;
+  memcpy(answer->matrix, result->matrix, sizeof answer->matrix);
+  memcpy(answer->q_body_from_icrs, result->q_body_from_icrs, sizeof answer->q_body_from_icrs);
+}
+
+static int identify(const starcat_search *search, uint32_t count, const double *pairs_px,
+                    const double *magnitudes, const double *q_prior, double uncertainty_rad,
+                    starcat_answer *answer, int32_t *star, starcat_memory *memory) {
+  const starcat_frame frame = {count, memory->x_px, memory->y_px, magnitudes};
+  starcat_result *result = &memory->result;
+  memset(answer, 0, sizeof *answer);
+  if (count > STARCAT_MAX_CENTROIDS) {
+    answer->status = STARCAT_E_TOO_MANY_CENTROIDS;
+    return answer->status;
+  }
+  for (size_t i = 0; i < count; i++) {
+    memory->x_px[i] = pairs_px[2u * i];
+    memory->y_px[i] = pairs_px[2u * i + 1u];
+  }
+  const double begun_s = now_s();
+  const starcat_status status =
+      q_prior == NULL ? starcat_identify(search->image, search->camera, search->options, &frame,
+                                         &memory->work, result)
+                      : starcat_track(search->image, search->camera, search->options, &frame,
+                                      q_prior, uncertainty_rad, &memory->work, result);
+  answer->seconds = now_s() - begun_s;
+  answer->status = (int32_t)status;
+  answer->steps = (int64_t)result->steps;
+  const int has_stars = (status >= 0) || (status == STARCAT_E_BUDGET);
+  for (uint32_t i = 0; i < count; i++) {
+    const int32_t row = has_stars ? result->star[i] : STARCAT_NO_STAR;
+    star[i] = row < 0 ? row : search->rows[row];
+  }
+  if ((status == STARCAT_IDENTIFIED) && (search->directions != NULL)) {
+    fit_again(search->directions, memory);
+  }
+  if (has_stars) {
+    tell(result, answer);
+  }
+  return answer->status;
+}
+
+int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+                const void *magnitudes, const void *q_prior, double uncertainty_rad,
+                starcat_memory *memory) {
+  return identify(search, count, pairs_px, magnitudes, q_prior, uncertainty_rad, &memory->answer,
+                  memory->star, memory);
+}
+
+void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
+                  const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                  starcat_answer *answers, int32_t *stars, starcat_memory *memory) {
+  for (uint32_t n = first; n < stop; n++) {
+    const int64_t start = starts[n];
+    (void)identify(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
+                   magnitudes == NULL ? NULL : magnitudes + start, NULL, 0.0, answers + n,
+                   stars + start, memory);
   }
 }

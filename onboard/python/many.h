@@ -1,4 +1,4 @@
-/* Many frames in one call, for the ground: see many.c.
+/* One frame or many in one call, for the ground: see many.c.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -7,34 +7,54 @@
 
 #include "starcat.h"
 
-/* Frames, one after the other: the centroids of frame n are rows starts[n] to starts[n + 1]. */
+/* What every frame of a camera is asked with. */
 typedef struct {
-  uint32_t count;
-  const int64_t *starts;
-  const double *x_px;
-  const double *y_px;
-  const double *magnitudes; /* null: none known */
-  const double *q_prior;    /* four a frame; null: lost in space */
-  double uncertainty_rad;
+  const starcat_image *image;
+  const starcat_camera *camera;
+  const starcat_options *options;
+  const int32_t *rows;      /* of the image's stars in the database */
   const double *directions; /* of the image's stars before they were rounded; null: the image's */
-} starcat_frames;
+} starcat_search;
 
-/* The answer to one frame. */
+/* The answer to one frame. Python makes its record of these fields by their names. */
 typedef struct {
   int32_t status;
   int32_t n_matched;
   int64_t steps;
   double q_body_from_icrs[4];
-  double matrix[9];
+  double matrix[3][3];
   double residual_rad;
-  double log_chance;
+  double log_chance; /* if not identified, of the best agreement */
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
   double seconds; /* that the library took */
 } starcat_answer;
 
-/* Identify the stars of many frames: an answer a frame, a number a centroid. */
-void starcat_many(const starcat_image *image, const starcat_camera *camera,
-                  const starcat_options *options, const starcat_frames *frames,
-                  starcat_answer *answers, int32_t *stars, starcat_workspace *work,
-                  starcat_result *result);
+/* Memory of one call at a time: what it works in, and what starcat_one leaves in it. */
+typedef struct {
+  starcat_answer answer;
+  int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
+  double x_px[STARCAT_MAX_CENTROIDS];
+  double y_px[STARCAT_MAX_CENTROIDS];
+  double body[STARCAT_MAX_CENTROIDS][3];
+  double icrs[STARCAT_MAX_CENTROIDS][3];
+  starcat_workspace work;
+  starcat_result result;
+} starcat_memory;
+
+/* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
+ * doubles: x and y of each centroid, magnitudes or null, four of a quaternion. Returns the status
+ * that the answer in the memory has too. */
+int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+                const void *magnitudes, const void *q_prior, double uncertainty_rad,
+                starcat_memory *memory);
+
+/* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
+ * The centroids of frame n are those from starts[n] to starts[n + 1]. */
+void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
+                  const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                  starcat_answer *answers, int32_t *stars, starcat_memory *memory);
 
 #endif

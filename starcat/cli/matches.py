@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from starcat.cli.console import print_json, print_json_line, print_table, print_things
-from starcat.errors import NotIdentifiedError
+from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
+from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer, facts
 from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame
@@ -29,6 +30,8 @@ class Tally:
     identified: int = 0
     first: FrameAnswer | None = None
     unidentified: list[str] = field(default_factory=list)
+    files: int = 0
+    unusable: list[str] = field(default_factory=list)
 
     def add(self, name: str, status: str) -> None:
         """Count a frame."""
@@ -47,6 +50,15 @@ class Tally:
                 f"{missing:,} of {self.frames:,} frames not identified "
                 f"({', '.join(self.unidentified)}{more}); 'refusal' of each says why, and what to "
                 "try"
+            )
+
+    def expect_all_usable(self) -> None:
+        """Raise `ConfigError` unless every file of a batch could be used."""
+        if self.unusable:
+            more = "; ..." if len(self.unusable) > NAMED else ""
+            raise ConfigError(
+                f"{len(self.unusable):,} of {self.files:,} files cannot be used: "
+                f"{'; '.join(self.unusable[:NAMED])}{more}"
             )
 
 
@@ -73,6 +85,33 @@ def print_answers(
         _print_many(kept, database)
     print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
     return tally
+
+
+def print_batch(
+    items: Iterable[BatchItem], database: Database, *, as_lines: bool
+) -> tuple[Tally, list[BatchItem]]:
+    """Print the answers to many files: a line of JSON each as soon as it is there, or a table."""
+    tally, done, notes = Tally(), list[BatchItem](), Counter[str]()
+    for item in items:
+        done.append(item)
+        tally.files += 1
+        notes.update(item.notes)
+        if item.error is not None:
+            tally.unusable.append(str(item.error))
+            if as_lines:
+                said = {"status": "unusable", "message": str(item.error)}
+                print_json_line({"file": str(item.path), "frame": item.path.stem, **said})
+        for answer in item.answers:
+            tally.add(answer.frame.name, answer.result.status)
+            if as_lines:
+                print_json_line({"file": str(item.path), **answer.content()})
+    kept = [] if as_lines else [answer for item in done for answer in item.answers]
+    if kept:
+        _print_many(kept, database)
+    print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
+    for note, count in notes.items():
+        say(f"{note} ({count} of {tally.files} files)")
+    return tally, done
 
 
 def print_contents(
@@ -162,7 +201,8 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
         )
     names = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
     heads = (*names, "origin") if is_tracked else names
-    print_table(f"{len(answers)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    counted = f"{len(answers)} frames" if len(answers) > 1 else "1 frame"
+    print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
 
 
 def print_sky_in_time(known: Sequence[tuple[str, SkyInTime]]) -> None:

@@ -10,17 +10,23 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_things, progress_bars, say, show
+from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
-    from starcat.images.solve_files import FileAnswers
+    from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs
+    from starcat.matcher.matcher import Matcher
 
 app = typer.Typer()
 
 Folder = Annotated[Path, typer.Argument(help="The folder <name>-<version>.")]
-FrameFile = Annotated[
-    Path,
-    typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
+FrameFiles = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="INPUT...",
+        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC), folders of "
+        "them, or patterns in quotes ('night/*.jpg').",
+    ),
 ]
 CameraFile = Annotated[
     Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
@@ -44,6 +50,12 @@ Flip = Annotated[
 ]
 Picture = Annotated[
     Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
+]
+
+
+ContactSheet = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.png", help="One picture of all frames, identified stars ringed."),
 ]
 
 
@@ -95,7 +107,7 @@ def simulate(
 def identify(
     context: typer.Context,
     artifact: Folder,
-    file: FrameFile,
+    files: FrameFiles,
     method: opt.MethodName = None,
     camera: CameraFile = None,
     tolerance_px: TolerancePx = None,
@@ -117,6 +129,7 @@ def identify(
     dark: opt.Dark = None,
     mask: opt.Mask = None,
     picture: Picture = None,
+    contact_sheet: ContactSheet = None,
     time: opt.Time = None,
     velocity: opt.Velocity = None,
     orbit: opt.Orbit = None,
@@ -130,21 +143,61 @@ def identify(
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
+    Of several files, a folder or a pattern the answers are one table, or with --json a line of
+    JSON each. The exit code is then 2 if a file cannot be used, after the answers of the others;
+    otherwise 0, or 6 with --fail-on-no-match if a frame is not identified.
+
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    if context.obj is not None:
+    from starcat.images.batch import files_of, is_batch
+
+    if is_batch(files) or contact_sheet is not None:
+        _check_batch(context, picture, wcs)
+        tally = _identify_batch(files_of(files), artifact, context, as_lines=ndjson or json)
+    elif context.obj is not None:
         from starcat.cli.remote import identify_remotely
 
-        identify_remotely(context, artifact.name, file)
+        identify_remotely(context, artifact.name, Path(files[0]))
         return
-    answers = _file_answers(file, artifact, context.params)
-    tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
+    else:
+        answers = _file_answers(Path(files[0]), artifact, context.params)
+        tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
     if fail_on_no_match:
         tally.expect_all_identified()
 
 
-def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
-    from starcat.images.solve_files import IdentifyOptions, LocalInputs, identify_file, open_matcher
+def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None) -> None:
+    if context.obj is not None:
+        raise ConfigError("--server takes one file at a time, and no --contact-sheet")
+    for name, path in (("--picture", picture), ("--wcs", wcs)):
+        if path is not None:
+            raise ConfigError(
+                f"{name} is for one file; of many, --contact-sheet FILE.png draws all frames"
+            )
+
+
+def _identify_batch(
+    paths: list[Path], artifact: Path, context: typer.Context, *, as_lines: bool
+) -> Tally:
+    from starcat.cli.matches import print_batch
+    from starcat.images.batch import identify_files
+    from starcat.images.contact_sheet import check_sheet, write_contact_sheet
+
+    sheet = context.params["contact_sheet"]
+    check_sheet(sheet)
+    matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
+    items = identify_files(paths, matcher, chosen, local)
+    tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
+    if sheet is not None:
+        write_contact_sheet(sheet, kept)
+    tally.expect_all_usable()
+    return tally
+
+
+def _matcher_and_inputs(
+    artifact: Path, given: Mapping[str, Any]
+) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
+    from starcat.images.solve_files import IdentifyOptions, LocalInputs, open_matcher
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
@@ -156,7 +209,13 @@ def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileA
         **{name: given[name] for name in ("dark", "mask", "track")},
         observer=observer,
     )
-    return identify_file(file, matcher, chosen, local)
+    return matcher, chosen, local
+
+
+def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
+    from starcat.images.solve_files import identify_file
+
+    return identify_file(file, *_matcher_and_inputs(artifact, given))
 
 
 def _print_file_answers(
@@ -165,9 +224,8 @@ def _print_file_answers(
     from starcat.cli.matches import print_answers
     from starcat.images.image_file import expect_room_for_wcs
 
-    is_picture = answers.measured.image is not None
     if wcs is not None:
-        expect_room_for_wcs(wcs, answers.path, is_picture=is_picture)
+        expect_room_for_wcs(wcs, answers.path, is_picture=answers.is_image)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
     is_any = tally.identified > 0

@@ -62,7 +62,7 @@ FrameSize = Annotated[
 ]
 FovError = Annotated[
     str | None,
-    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 2% for images."),
+    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5% for images."),
 ]
 MinShare = Annotated[
     float | None,

@@ -33,11 +33,15 @@ _EXCESS_SIGMA_PX = (1.0, 4.0)
 _CUT_SHARE = (0.2, 0.985)
 _STAR_NOISE = 4.5
 _FLAT_EXCESS = 0.3  # smoothed pixels with so little of the noise of white ones are flat, not noisy
+_MOST_EXCESS = 10.0
 # Noise is white up to the first; the background has structure beyond the second.
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
 _HOT_NOISE = 4.0
 # A hot pixel's neighbours have less than this part of the light that a star would give them.
 _HOT_PART = 0.25
+# The median of a star's 8 neighbours is more than this part of its brightest pixel, if its spot is
+# wider than 0.6 px; that of a hot pixel is not, even where some neighbours are hot too.
+_HOT_MEDIAN_PART, _HOT_ROUNDS = 0.15, 3
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ class Levels:
     # whether there is next to no noise: what compression left of it are steps
     is_flat: bool = False
     box_px: int = _BOX_PX  # side of the boxes in which the background was found
+    # noise of pixels that are smoothed by a pixel, over what white noise would leave of it
+    excess: float = 1.0
 
 
 def load_sep() -> Any:
@@ -95,7 +101,7 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
         noise = np.maximum(levels.noise, _step(raw[~mask]))
         return replace(levels, noise=noise, is_flat=True)
     if max(excess) < _WHITE_EXCESS:
-        return levels
+        return levels  # white, within what a few boxes tell
     # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
     smooth = gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
     for box in _BOXES_PX:
@@ -103,7 +109,7 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
         fine, coarse = _excess(levels)
         if coarse < _CLOUD_EXCESS * fine:
             break
-    return replace(levels, is_rough=True)
+    return replace(levels, is_rough=True, excess=float(np.clip(fine, 1.0, _MOST_EXCESS)))
 
 
 def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> Levels:
@@ -214,6 +220,23 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     above = levels.above.copy()
     above[y[hot], x[hot]] = neighbours[hot] / 8.0
     return replace(levels, above=above)
+
+
+def mask_hot_pixels(levels: Levels) -> Levels:
+    """Replace bright pixels among dark ones by the median of those, clusters of them included.
+
+    Many of them seem to be noise, so that the background is measured once more without them. It
+    costs stars whose light falls on one pixel, so it is for images that have no answer else.
+    """
+    for _ in range(_HOT_ROUNDS):
+        above = levels.above.copy()
+        y, x = np.nonzero(above > _HOT_NOISE * levels.noise)
+        around = pixels_around(above, x, y).reshape(-1, 9)
+        neighbours = np.median(np.delete(around, 4, axis=1), axis=1)
+        hot = neighbours < _HOT_MEDIAN_PART * around[:, 4]
+        above[y[hot], x[hot]] = neighbours[hot]
+        levels = _leveled(levels.raw + (above - levels.above), levels.mask)
+    return levels
 
 
 def pixels_around(image: Grey, x: NDArray[np.int64], y: NDArray[np.int64]) -> Grey:

@@ -2,7 +2,8 @@
 
 Input is one grey image, output are centroids and brightness, brightest first. Background,
 detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
-which the extra ``images`` brings. Trails are detected and refused; blooming is not handled.
+which the extra ``images`` brings. Stars that are streaks are measured at their middles
+(`streaks.py`); blooming is not handled.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from starcat.images.background import (
     PIXEL_VARIANCE,
     Levels,
     load_sep,
+    mask_hot_pixels,
     pixels_around,
     repair_hot_pixels,
     subtract_background,
 )
+from starcat.images.spot_noise import centroid_sigma_px, electrons_per_step, noise_at
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
+from starcat.images.streaks import Streak, measured_streaks, refined, streak_of
 
 _log = logging.getLogger(__name__)
 
@@ -34,9 +38,6 @@ _ROOM, _ROOM_SHARE = 300_000, 0.3
 _MOST_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
 # The threshold is raised by this factor, so many times, where the room does not do.
 _RAISE, _TRIES = 1.5, 4
-_FEWEST, _MOST = 5, 30
-_LONG = 2.5  # length over width from which a spot is long, by standard deviations along its axes
-_ALIGNED = 0.9  # length of the mean of unit vectors with twice the angle: 1 if all are parallel
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA = 2.0
 # A plateau: pixels that differ by no more than read noise, and by half a per cent.
@@ -51,7 +52,10 @@ class Spots:
     centroids_px: Pixels
     flux: Array  # shape (N,): light above the background, in the units of the image
     mag: Array  # shape (N,): instrumental magnitude, -2.5 log10 flux: its zero point is unknown
+    # shape (N,): standard error of a centroid on each axis, pixels
+    sigma_px: Array
     psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
+    streak: Streak | None = None  # how far the stars moved while the shutter was open
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -63,51 +67,82 @@ def find_spots(
     threshold_sigma: float = 5.0,
     psf_sigma_px: float | None = None,
     most_spots: int | None = None,
+    gain_e_per_adu: float | None = None,
+    without_hot_pixels: bool = False,
 ) -> Spots:
     """Find the spots of an image and measure them.
 
-    Bertin and Arnouts 1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
+    ``gain_e_per_adu``, the electrons of one step of the image, is for the errors of the
+    centroids; by default it is judged from the noise of the sky. ``without_hot_pixels`` is for
+    images with many of them, and costs stars that are as narrow as a pixel. Bertin and Arnouts
+    1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
     given = {"threshold_sigma": threshold_sigma, "psf_sigma_px": psf_sigma_px}
+    given["gain_e_per_adu"] = gain_e_per_adu
     for name, value in {**given, "most_spots": most_spots}.items():
         if value is not None and not 0.0 < value < np.inf:
             text = f"{name} is {value}; expected a positive number"
             raise ConfigError(text, key=name, value=value)
     levels = subtract_background(image)
+    if without_hot_pixels:
+        levels = mask_hot_pixels(levels)
+    gain = gain_e_per_adu or electrons_per_step(levels)
     sigma = psf_sigma_px
     if sigma is None:
         levels = repair_hot_pixels(levels, SIGMA_RANGE_PX[0])
         first = detect(levels, 1.0, threshold_sigma)
         first = first[~_is_saturated(levels, first)]
-        _refuse_trails(first)
+        streak = streak_of(first, levels.raw.shape)
+        if streak is not None:
+            return _streaked(levels, streak, threshold_sigma, gain, most_spots)
         sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["peak"])
     levels = repair_hot_pixels(levels, sigma)
     found = detect(levels, float(sigma), threshold_sigma)
     if psf_sigma_px is None:
         places = np.stack([found["x"], found["y"]], axis=1)
         found = found[~is_sharp(levels, places, float(sigma))]
-    return _measured(levels, found, float(sigma), most_spots)
+    return _measured(levels, found, float(sigma), gain, most_spots)
 
 
-def _refuse_trails(found: NDArray[Any]) -> None:
-    length = trail_px(found)
-    if length is not None:
-        raise ConfigError(
-            f"the stars are trails of {length:.0f} px in one direction, whose ends are not known "
-            "to a pixel; expose shorter or follow the sky, or state the width of a star "
-            "(--psf-sigma-px 1.5) to measure the middles all the same"
-        )
+def _streaked(
+    levels: Levels, streak: Streak, threshold: float, gain: float, most: int | None
+) -> Spots:
+    for is_final in (False, True):
+        filtered, noise = streak.filtered(levels)
+        found = extract(filtered, threshold, noise, levels.mask)
+        if not is_final:
+            first = found[np.argsort(-found["peak"], kind="stable")]
+            places = np.stack([first["xpeak"], first["ypeak"]], axis=1).astype(np.float64)
+            streak = refined(levels, streak, places)
+    centroids, flux, sigma_px = measured_streaks(levels, filtered, found, streak, gain)
+    return _in_order(centroids, flux, sigma_px, streak.psf_sigma_px, most, streak)
 
 
-def _measured(levels: Levels, found: NDArray[Any], sigma: float, most: int | None) -> Spots:
+def _measured(
+    levels: Levels, found: NDArray[Any], sigma: float, gain: float, most: int | None
+) -> Spots:
     seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
-    centroids = _windowed(levels, found, max(seen, _NARROWEST_WINDOW_PX))
+    window = max(seen, _NARROWEST_WINDOW_PX)
+    centroids = _windowed(levels, found, window)
     x, y = (centroids - 0.5).T
     radius = _APERTURE_SIGMA * seen
     part, _, _ = load_sep().sum_circle(levels.above, x, y, radius, mask=levels.mask, subpix=0)
     flux = part / (1.0 - np.exp(-0.5 * _APERTURE_SIGMA**2))
+    sigma_px = centroid_sigma_px(flux, noise_at(levels, centroids), seen, gain, window)
+    return _in_order(centroids, flux, sigma_px, sigma, most)
+
+
+def _in_order(
+    centroids: Array,
+    flux: Array,
+    sigma_px: Array,
+    psf_sigma_px: float,
+    most: int | None,
+    streak: Streak | None = None,
+) -> Spots:
     order = brightest_first(flux, centroids)[: np.count_nonzero(flux > 0.0)][:most]
-    return Spots(centroids[order], flux[order], -2.5 * np.log10(flux[order]), sigma)
+    mag = -2.5 * np.log10(flux[order])
+    return Spots(centroids[order], flux[order], mag, sigma_px[order], psf_sigma_px, streak)
 
 
 def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
@@ -152,7 +187,7 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
         least, kernel = threshold, None
     for attempt in range(_TRIES):
         try:
-            return _extract(image, least * _RAISE**attempt, noise, levels.mask, kernel)
+            return extract(image, least * _RAISE**attempt, noise, levels.mask, kernel)
         except Exception as error:  # sep raises nothing more special when a buffer is full
             _log.info("at %.3g sigma: %s", threshold * _RAISE**attempt, error)
     raise ConfigError(
@@ -163,12 +198,12 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     )
 
 
-def _extract(
+def extract(
     image: NDArray[np.float32],
     least: float,
     noise: NDArray[np.float32],
     mask: Mask,
-    kernel: Array | None,
+    kernel: Array | None = None,
 ) -> NDArray[Any]:
     """Call sep.
 
@@ -200,18 +235,3 @@ def _filtered(levels: Levels, profile: Array) -> tuple[NDArray[np.float32], NDAr
     known = levels.noise * np.float32((profile**2).sum())
     noise = np.maximum(background.rms(dtype=np.float32), known)
     return image - background.back(dtype=np.float32), noise
-
-
-def trail_px(found: NDArray[Any]) -> float | None:
-    """Return the length of trails."""
-    bright = found[np.argsort(-found["flux"], kind="stable")[:_MOST]]
-    if len(bright) < _FEWEST:
-        return None
-    long, wide = bright["a"].astype(np.float64), bright["b"].astype(np.float64)
-    is_long = long > _LONG * np.maximum(wide, 0.3)
-    if is_long.mean() <= 0.5:
-        return None
-    if abs(np.exp(2j * bright["theta"][is_long].astype(np.float64)).mean()) < _ALIGNED:
-        return None
-    # The variance of a bar along itself is a twelfth of its length squared.
-    return float(np.median(np.sqrt(12.0 * (long**2 - wide**2)[is_long])))

@@ -1,12 +1,14 @@
 """Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
+HEIC, as telephones write it, is read too, and not written.
+
 A dark frame, dead pixels and a mosaic of colours are taken out of such an array, and copies of
 files are written that say where in the sky each pixel is.
 
 What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
 FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
-by imagecodecs, which the extra ``images`` brings. Stacks of other numbers of planes are refused,
-unless one of them is chosen.
+by imagecodecs, and HEIC by pi-heif, which the extra ``images`` brings. Stacks of other numbers of
+planes are refused, unless one of them is chosen.
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ _KINDS = {
     b"MM\0+": "TIFF",
     b"\xff\xd8\xff": "JPEG",
 }
+# Brands of the container of HEIC, at byte 8, after its size and "ftyp".
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 # What is written under which suffix.
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
@@ -71,11 +75,17 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     """
     data = _unpacked(path)
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
+    if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
+        kind = "HEIC"
     if kind is None:
-        raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
+        raise ConfigError(
+            f"{path}: neither FITS nor PNG, TIFF, JPEG or HEIC; convert it to one of these"
+        )
     try:
         if kind == "FITS":
             values, upside_down = _read_fits(data, path, plane)
+        elif kind == "HEIC":
+            values, upside_down = _grey_of_heic(data), False
         else:
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
                 values, upside_down = _grey_of_picture(data), False
@@ -174,6 +184,20 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
             return 65_535 - values if is_negative else values
         # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
         return np.asarray(np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE))
+
+
+def _grey_of_heic(data: bytes) -> NDArray[Any]:
+    try:
+        from pi_heif import open_heif
+    except ImportError as error:
+        raise ConfigError(
+            f"HEIC needs the package pi-heif ({error}); {install_command('images')}, or convert "
+            "the picture to PNG"
+        ) from error
+    values = np.asarray(open_heif(io.BytesIO(data), convert_hdr_to_8bit=False))
+    if values.ndim == 2:
+        return values
+    return np.asarray(np.rint(values[..., :3] @ _LUMINANCE))
 
 
 def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:

@@ -33,6 +33,7 @@ from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
 
 if TYPE_CHECKING:
+    from starcat.images.centroiding import Spots
     from starcat.sky.in_time import SkyInTime
     from starcat.sky.observer import Observer
 
@@ -42,12 +43,16 @@ STDIN = Path("-")
 
 # Files that are read as images; all others hold centroids.
 IMAGE_SUFFIXES = (
-    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg",
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
+    ".heif",
 )  # fmt: skip
 
-# Error of the focal length that is allowed for an image where none is stated: who describes a
-# camera by its data sheet is seldom farther off.
-FOV_ERROR_OF_IMAGES = 0.02
+# Error of the focal length that is allowed for an image where none is stated. Data sheets are off
+# by so much: an IMX219 with 48.8 deg on paper has 50.5.
+FOV_ERROR_OF_IMAGES = 0.05
+# How an image without an answer is measured once more: hot pixels masked, to this part of the
+# threshold, with at most so many spots, as noise is among them.
+DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
 CAMERA_NAME = "camera.toml"  # what messages call the text of a camera file
 
 # Options that a matcher is opened with; the others are about a file.
@@ -74,7 +79,7 @@ class IdentifyOptions(BaseModel):
         1e-9, ge=0, le=1, description="Less certain answers are withheld."
     )
     fov_error: float | None = Field(
-        None, ge=0, le=0.5, description="Error of the field that is allowed; 0.02 for images."
+        None, ge=0, le=0.5, description="Error of the field that is allowed; 0.05 for images."
     )
     fov_deg: tuple[float, float] | None = Field(
         None, description="Smallest and largest field across the width, of an unknown camera."
@@ -130,10 +135,15 @@ class LocalInputs:
 
 @dataclass(frozen=True)
 class MeasuredFile:
-    """The centroids of a file, and the image (height, width) that they were found in, if any."""
+    """The centroids of a file, and the image (height, width) that they were found in, if any.
+
+    Of one of many files the image is not kept, but its shape is.
+    """
 
     frames: Sequence[MeasuredFrame]
     image: NDArray[Any] | None = None
+    shape: tuple[int, ...] | None = None  # of the image; None where the file holds centroids
+    spots: Spots | None = None  # with the errors of the centroids; None where a file holds them
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,7 @@ class FrameAnswer:
     frame: MeasuredFrame
     result: MatchResult
     observer: Observer | None = None
+    spots: Spots | None = None  # of an image: those of the frame
 
     @cached_property
     def sky(self) -> SkyInTime | None:
@@ -158,6 +169,8 @@ class FrameAnswer:
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
         found = {"frame": self.frame.name, **facts(self.result), "stars": self._stars()}
+        if self.spots is not None and self.spots.streak is not None:
+            found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
         if self.observer is not None:
             found["in_time"] = None if self.sky is None else self.sky.content()
         return found
@@ -229,21 +242,48 @@ class FileAnswers:
     camera: Camera
     options: IdentifyOptions
     local: LocalInputs
+    tracker: Tracker | None = None  # of a sequence of several files
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the file is an image."""
+        return self.measured.shape is not None
 
     def __iter__(self) -> Iterator[FrameAnswer]:
-        identify, is_image = self._identify(), self.measured.image is not None
+        identify, observer = self._identify(), self.local.observer
         for given in self.measured.frames:
-            turned = self.options.flip and not is_image
+            turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             result = identify(frame.centroids_px, magnitudes=frame.mag)
-            yield FrameAnswer(frame, result, self.local.observer)
+            answer = FrameAnswer(frame, result, observer, self.measured.spots)
+            if self.is_image and not result.ok and not _is_limited(result):
+                answer = self._deeper(identify) or answer
+            yield answer
+
+    def _deeper(self, identify: Callable[..., MatchResult]) -> FrameAnswer | None:
+        """Return the answer of an image that is measured once more; None if there is none."""
+        try:
+            [frame], spots = self._measured_deeper()
+        except ConfigError:  # too much stands out: the first measurement has said what it could
+            return None
+        result = identify(frame.centroids_px, magnitudes=frame.mag)
+        return FrameAnswer(frame, result, self.local.observer, spots) if result.ok else None
+
+    def _measured_deeper(self) -> tuple[Sequence[MeasuredFrame], Spots | None]:
+        changes = {
+            "threshold": max(1.0, DEEPER_THRESHOLD * self.options.threshold),
+            "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
+        }
+        chosen = self.options.model_copy(update=changes)
+        again = measure(self.path, chosen, self.local, without_hot_pixels=True)
+        return again.frames, again.spots
 
     def _identify(self) -> Callable[..., MatchResult]:
         """Return what identifies a frame, its options filled in."""
         matcher, camera, options = self.matcher, self.camera, self.options
-        image, observer = self.measured.image, self.local.observer
-        if image is not None and image.shape != (camera.height_px, camera.width_px):
-            height, width = image.shape
+        shape, observer = self.measured.shape, self.local.observer
+        if shape is not None and shape != (camera.height_px, camera.width_px):
+            height, width = shape
             raise ConfigError(
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
@@ -251,7 +291,7 @@ class FileAnswers:
         fov_error = options.fov_error
         if fov_error is None or options.fov_deg is not None:
             can = matcher.method in SCALE_FREE and matcher.database.image is None
-            is_loose = options.fov_deg is None and image is not None and can
+            is_loose = options.fov_deg is None and shape is not None and can
             fov_error = FOV_ERROR_OF_IMAGES if is_loose else 0.0
         identify = partial(self._search(), camera=camera, fov_error=fov_error)
         if observer is None:
@@ -286,7 +326,7 @@ class FileAnswers:
                 "--fov is for frames of an unknown camera; leave out --track and --prior-q"
             )
         if self.local.track:
-            return Tracker(self.matcher).identify
+            return (self.tracker or Tracker(self.matcher)).identify
         prior, error_deg = list(options.prior_q or ()), options.prior_error_deg
         return partial(self.matcher.identify, prior=prior, prior_error_deg=error_deg)
 
@@ -296,7 +336,12 @@ class FileAnswers:
         """Return what a user should know beside the answers; ``flip`` is what to try."""
         unknown = said_of_columns([first.frame]) if first else None
         notes = [unknown] if unknown else []
-        if self.measured.image is not None and not is_any_identified:
+        if first and first.spots is not None and first.spots.streak is not None:
+            notes.append(
+                f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
+                "attitude are those of the middle of the exposure."
+            )
+        if self.is_image and not is_any_identified:
             notes.append(f"An image that was read upside down is never identified: try {flip}.")
         return notes
 
@@ -317,6 +362,11 @@ class FileAnswers:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
 
 
+def _is_limited(result: MatchResult) -> bool:
+    """Return whether a limit of the search ended it."""
+    return result.refusal is not None and result.refusal.reason in ("time", "steps")
+
+
 def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
     """Open the database of an artifact, or an onboard image, for identifying with some options."""
     given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
@@ -335,17 +385,32 @@ def identify_file(
     """Measure a file, or ``-`` for stdin, and identify its frames when they are asked for."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
-    camera = own.camera or matcher.database.camera
-    if chosen.camera is not None:
-        camera = parse_camera(chosen.camera, Path(CAMERA_NAME))
-    measured = measure(path, chosen, own)
-    if chosen.fov_deg is not None:
-        camera = _camera_of_size(measured, chosen.size_px, camera)
-    return FileAnswers(path, matcher, measured, camera, chosen, own)
+    return answers_of(path, measure(path, chosen, own), matcher, chosen, own)
+
+
+def answers_of(
+    path: Path,
+    measured: MeasuredFile,
+    matcher: Matcher,
+    options: IdentifyOptions,
+    local: LocalInputs,
+    tracker: Tracker | None = None,
+) -> FileAnswers:
+    """Return the answers to a file that is measured."""
+    camera = local.camera or matcher.database.camera
+    if options.camera is not None:
+        camera = parse_camera(options.camera, Path(CAMERA_NAME))
+    if options.fov_deg is not None:
+        camera = _camera_of_size(measured, options.size_px, camera)
+    return FileAnswers(path, matcher, measured, camera, options, local, tracker)
 
 
 def measure(
-    path: Path, options: IdentifyOptions | None = None, local: LocalInputs | None = None
+    path: Path,
+    options: IdentifyOptions | None = None,
+    local: LocalInputs | None = None,
+    *,
+    without_hot_pixels: bool = False,
 ) -> MeasuredFile:
     """Read centroids, or find them in an image."""
     chosen = options or IdentifyOptions()
@@ -363,10 +428,12 @@ def measure(
             threshold_sigma=chosen.threshold,
             psf_sigma_px=chosen.psf_sigma_px,
             most_spots=chosen.most_spots,
+            without_hot_pixels=without_hot_pixels,
         )
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
-    return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
+    frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
+    return MeasuredFile([frame], image, image.shape, spots)
 
 
 def _frames_of_stdin() -> Iterator[MeasuredFrame]:
@@ -399,8 +466,8 @@ def _camera_of_size(
     measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
 ) -> Camera:
     width, height = size_px or (known.width_px, known.height_px)
-    if measured.image is not None:
-        height, width = measured.image.shape
+    if measured.shape is not None:
+        height, width = measured.shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
                 f"the image has {width} x {height} px, --size says {size_px[0]} x {size_px[1]}; "

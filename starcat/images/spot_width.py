@@ -129,7 +129,8 @@ def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
     sigma = sigma[:_MOST_SPOTS]
     # Not of logarithms: clouds are wide, and no width of theirs is as frequent as a star's.
     near = np.abs(np.log(sigma / _densest(np.sort(sigma)))) < np.log(1.35)
-    return float(np.clip(np.median(sigma[near]), *SIGMA_RANGE_PX))
+    # Of two or three widths that differ none is near their mode.
+    return float(np.clip(np.median(sigma[near] if near.any() else sigma), *SIGMA_RANGE_PX))
 
 
 def _densest(values: Array) -> float:

@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import math
 import os
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache
 from importlib import import_module
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame
+from starcat.matcher.observation import Dropped, Frame, Frames
+from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import MatchResult, Origin, Refusal, Status, no_match
+from starcat.matcher.result import MatchResult, Reason, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
@@ -37,19 +37,21 @@ except ImportError:  # the wheel was built without a compiler
     _onboard = None
 
 
-MAX_STEPS = 2_000_000_000
-"""Steps for one frame: on the ground the limit is the caller's patience, not a clock."""
+MAX_STEPS = 300_000_000
+"""Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
 
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
-OUT_OF_STEPS = -14
-"""What the library returns where a budget was used up."""
-
 STATUSES: dict[int, Status] = {
-    0: "identified", 1: "no_match", 2: "too_few_stars", OUT_OF_STEPS: "no_match",
+    0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match",
 }  # fmt: skip
-"""What a frame came to, by the number that the library returns."""
+"""What a frame came to, by the number that the library returns: -14 where the steps are used up."""
+
+REASONS: tuple[Reason, ...] = (
+    "chance", "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "steps",
+)  # fmt: skip
+"""Why there is no answer, by the number of the library."""
 
 NOT_OPENED = {
     -4: "it is of a version of the format that the library does not read",
@@ -60,22 +62,6 @@ NOT_OPENED = {
 
 DROPPED = {-2: "not_finite", -3: "out_of_frame", -4: "duplicate"}
 """Why a centroid was not used, by the number that the library gives it."""
-
-
-ANSWER = np.dtype(
-    [
-        ("status", np.int32),
-        ("n_matched", np.int32),
-        ("steps", np.int64),
-        ("q_body_from_icrs", np.float64, 4),
-        ("matrix", np.float64, (3, 3)),
-        ("residual_rad", np.float64),
-        ("log_chance", np.float64),
-        ("seconds", np.float64),
-    ]
-)
-"""A frame's answer as the library writes it: a key of `STATUSES`, the attitude, the natural
-logarithm of the false-match probability, and the time that the library took."""
 
 
 def is_compiled() -> bool:
@@ -90,25 +76,39 @@ def library_version() -> str | None:
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
 
 
-Explain = Callable[[Frame], "Refusal | None"]
+@lru_cache(maxsize=1)
+def _answer_dtype() -> np.dtype[np.void]:
+    """Return the record of numpy that is ``starcat_answer`` of ``many.h``, byte by byte."""
+    struct = _onboard.ffi.typeof("starcat_answer")
+    fields = dict(struct.fields)
+    return np.dtype(
+        {
+            "names": list(fields),
+            "formats": [_dtype(field.type) for field in fields.values()],
+            "offsets": [field.offset for field in fields.values()],
+            "itemsize": _onboard.ffi.sizeof(struct),
+        }
+    )
+
+
+def _dtype(ctype: Any) -> np.dtype[Any]:
+    if ctype.kind == "array":
+        return np.dtype((_dtype(ctype.item), (ctype.length,)))
+    name: str = ctype.cname
+    return np.dtype("float64" if name == "double" else name.removesuffix("_t"))
 
 
 @dataclass(frozen=True)
 class BatchResult(Sequence[MatchResult]):
     """The answers of the C library to many frames of one camera."""
 
-    # A record of `ANSWER` a frame; attitudes are zeros unless it is identified.
+    # A ``starcat_answer`` a frame, by its names in ``many.h``; attitudes are zeros unless it is
+    # identified.
     records: NDArray[np.void]
-    # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]`` of ``star_index``.
-    starts: NDArray[np.int64]
     # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
     star_index: NDArray[np.int32]
-    frames: Sequence[Frame]
-    database: Database
-    noise_px: float | None = None  # noise of a centroid, where it was stated
-    # Searches a frame again and says why it gets no answer, which the library does not.
-    explain: Explain | None = None
-    origin: Origin = "lost_in_space"  # where the library looked for the stars
+    frames: Frames
+    search: Search
 
     def __len__(self) -> int:
         return len(self.records)
@@ -116,12 +116,17 @@ class BatchResult(Sequence[MatchResult]):
     @property
     def is_whole(self) -> bool:
         """Whether the library took all frames; a camera or limit may be beyond it."""
-        return all(code in STATUSES for code in self.records["status"].tolist())
+        return all(code in STATUSES for code in self._codes)
+
+    @cached_property
+    def _codes(self) -> list[int]:
+        codes: list[int] = self.records["status"].tolist()
+        return codes
 
     @property
     def status(self) -> list[Status]:
         """What each frame came to."""
-        return [STATUSES[code] for code in self.records["status"].tolist()]
+        return [STATUSES[code] for code in self._codes]
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -142,45 +147,19 @@ class BatchResult(Sequence[MatchResult]):
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
-        star = self.star_index[self.starts[frame] : self.starts[frame + 1]]
-        found, asked = self.records[frame], self.frames[frame]
-        facts: dict[str, Any] = {
-            "origin": self.origin,
-            "time_s": float(found["seconds"]),
-            "frame": asked,
-            "database": self.database,
-            "noise_px": self.noise_px,
-        }
-        code, dropped = int(found["status"]), _dropped(star)
-        if STATUSES[code] != "identified":
-            return no_match(len(star), dropped, self._why(code, asked), **facts)
-        answer = MatchResult(
-            "identified",
-            np.maximum(star, -1),
-            found["matrix"].copy(),
-            float(found["residual_rad"]) * ARCSEC,
-            math.exp(found["log_chance"]),
-            dropped,
-            asked.camera,
-            **facts,
-        )
-        # The library's own, which rounds otherwise than the one that the matrix makes.
-        vars(answer)["q_body_from_icrs"] = found["q_body_from_icrs"].copy()
-        return answer
+        return MatchResult.later(STATUSES[self._codes[frame]], self._facts, frame)
 
-    def _why(self, code: int, frame: Frame) -> Refusal | Callable[[], Refusal | None] | None:
-        """Return why a frame has no answer, or what finds it out."""
-        if code == OUT_OF_STEPS:
-            return Refusal("steps")
-        if STATUSES[code] == "too_few_stars":
-            return Refusal("too_few_stars")
-        return None if self.explain is None else partial(self.explain, frame)
+    def __iter__(self) -> Iterator[MatchResult]:
+        for frame, code in enumerate(self._codes):
+            yield MatchResult.later(STATUSES[code], self._facts, frame)
+
+    def _facts(self, n: int) -> dict[str, Any]:
+        stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
+        return self.search.facts(self.records[n], stars, self.frames[n])
 
 
 def _dropped(star: NDArray[np.int32]) -> Dropped:
     """Return row and reason of every centroid that was not used, repeats last."""
-    if star.min(initial=-1) >= -1:
-        return ()
     rows = np.flatnonzero(star < -1)
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
     return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
@@ -200,103 +179,186 @@ class CEngine:
         # Memory of numpy begins at a multiple of 16, as the library wants it; bytes need not.
         words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
         words.view(np.uint8)[: len(data)] = np.frombuffer(data, dtype=np.uint8)
-        self._words, self._image = words, ffi.new("starcat_image *")
-        status = lib.starcat_open(self._image, ffi.from_buffer(words), len(data), 0)
+        self._words, self.image = words, ffi.new("starcat_image *")
+        status = lib.starcat_open(self.image, ffi.from_buffer(words), len(data), 0)
         if status != 0:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
                 f"{NOT_OPENED.get(status, f'error {status}')}; export the artifact for this machine"
             )
-        count = int(self._image.n_stars)
-        own = np.arange(count) if rows is None else rows
-        self._database, self._directions = database, directions
-        # Numbers below 0 say why a centroid has no star; they index this table from its end.
-        self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
+        own = np.arange(int(self.image.n_stars)) if rows is None else rows
+        self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
+        self.directions = _double_pointer(directions)
+        self.database = database
 
-    def accepts(self, count: int) -> bool:
-        """Return whether a frame of so many centroids is small enough."""
-        return count <= int(_onboard.lib.STARCAT_MAX_CENTROIDS)
+    def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
+        """Return what asks the library about frames of a camera."""
+        return Search(self, camera, settings, fov_error)
 
-    def identify(
-        self,
-        frames: Sequence[Frame],
-        settings: Settings,
-        prior: Prior | None = None,
-        threads: int = 1,
-        explain: Explain | None = None,
-    ) -> BatchResult:
-        """Identify the stars of frames of one camera, with a prior of one frame near it."""
-        starts = np.zeros(len(frames) + 1, dtype=np.int64)
-        np.cumsum([len(frame) for frame in frames], out=starts[1:])
-        records, star_index = np.zeros(len(frames), ANSWER), np.full(starts[-1], -1, np.int32)
-        parts = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
-        run = partial(self._run, frames, settings, prior, (starts, records, star_index))
+
+class Search:
+    """The C library with an image, a camera and settings; threads may share it."""
+
+    def __init__(
+        self, engine: CEngine, camera: Camera, settings: Settings, fov_error: float
+    ) -> None:
+        self.camera, self._settings, self._fov_error = camera, settings, fov_error
+        self._database = engine.database
+        # The library is given addresses: what stands there has to be kept.
+        self._kept = engine, _camera(camera), _options(settings, fov_error)
+        addresses = [engine.image, *self._kept[1:], engine.rows, engine.directions]
+        self._address = _onboard.ffi.new("starcat_search *", addresses)
+        self._one, self._null = _onboard.lib.starcat_one, _onboard.ffi.NULL
+        self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
+
+    def one(
+        self, centroids_px: Pixels, magnitudes: Array | None, prior: Prior | None = None
+    ) -> MatchResult | None:
+        """Identify the stars of a frame; None where the library does not take it.
+
+        This is what a call costs beside the library: arrays go there and back as bytes, and the
+        answer is put into words when it is looked at.
+        """
+        count = len(centroids_px)
+        if count > self._most:
+            return None
+        px = centroids_px.tobytes()
+        mags = None if magnitudes is None else magnitudes.tobytes()
+        memory = _FREE.pop() if _FREE else _Memory()
+        code = self._one(
+            self._address,
+            count,
+            px,
+            self._null if mags is None else mags,
+            self._null if prior is None else prior.q_body_from_icrs.tobytes(),
+            0.0 if prior is None else prior.error_rad,
+            memory.address,
+        )
+        record, stars = memory.answer[:], memory.stars[: 4 * count]
+        q_found = None if prior is None else _onboard.ffi.unpack(memory.q_found, 4)
+        _FREE.append(memory)
+        if code not in STATUSES:
+            return None
+        found = MatchResult.later(
+            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, prior
+        )
+        if prior is None:
+            return found
+        return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
+
+    def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
+        """Identify the stars of frames; None where the library does not take one of them."""
+        count, starts = len(frames), frames.starts
+        if np.diff(starts).max(initial=0) > self._most:
+            return None
+        records, star_index = np.zeros(count, _answer_dtype()), np.full(starts[-1], -1, np.int32)
+        ffi = _onboard.ffi
+        arrays = (
+            ffi.from_buffer("int64_t[]", starts),
+            _double_pointer(frames.centroids_px),
+            _double_pointer(frames.magnitudes),
+            ffi.from_buffer("starcat_answer[]", records),
+            ffi.from_buffer("int32_t[]", star_index),
+        )
+
+        def run(first: int) -> None:
+            memory = _FREE.pop() if _FREE else _Memory()
+            stop = min(first + CHUNK, count)
+            _onboard.lib.starcat_many(self._address, first, stop, *arrays, memory.address)
+            _FREE.append(memory)
+
+        parts = range(0, count, CHUNK)
         if threads <= 1 or len(parts) <= 1:
             for part in parts:
                 run(part)
         else:
             with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
                 list(pool.map(run, parts))
-        return BatchResult(
-            records,
-            starts,
-            self._rows[star_index],
-            frames,
-            self._database,
-            settings.noise_px,
-            explain,
-            "lost_in_space" if prior is None else "tracking",
+        answers = BatchResult(records, star_index, frames, self)
+        return answers if answers.is_whole else None
+
+    def _facts_of_bytes(
+        self, record: bytes, stars: bytes, px: bytes, mags: bytes | None, prior: Prior | None
+    ) -> dict[str, Any]:
+        star = np.frombuffer(stars, np.int32)
+        frame = Frame(
+            np.ndarray((len(star), 2), np.float64, px),
+            None if mags is None else np.frombuffer(mags),
+            self.camera,
         )
+        return self.facts(np.frombuffer(record, _answer_dtype())[0], star, frame, prior)
 
-    def _run(
-        self,
-        frames: Sequence[Frame],
-        settings: Settings,
-        prior: Prior | None,
-        answers: tuple[NDArray[np.int64], NDArray[np.void], NDArray[np.int32]],
-        part: range,
-    ) -> None:
-        """Let the library answer some of the frames, in memory of its own."""
-        ffi, lib = _onboard.ffi, _onboard.lib
-        starts, records, star_index = answers
-        some = [frames[n] for n in part]
-        first, last = starts[part.start], starts[part.stop]
-        px = some[0].centroids_px
-        mags = [frame.magnitudes for frame in some if frame.magnitudes is not None]
-        if len(some) > 1:  # one is by far the most frequent call
-            px = np.concatenate([frame.centroids_px for frame in some])
-        arrays = (
-            ("int64_t[]", starts[part.start : part.stop + 1] - first),
-            *(("double[]", column) for column in np.ascontiguousarray(px.T)),
-            ("double[]", np.concatenate(mags) if mags else None),
-            ("double[]", None if prior is None else prior.q_body_from_icrs),
-            ("double[]", self._directions),
-        )
-        *pointers, directions = (
-            ffi.NULL if array is None else ffi.from_buffer(kind, array) for kind, array in arrays
-        )
-        error_rad = 0.0 if prior is None else prior.error_rad
-        lib.starcat_many(
-            self._image,
-            _camera(some[0].camera),
-            _options(settings),
-            ffi.new("starcat_frames *", [len(part), *pointers, error_rad, directions]),
-            ffi.from_buffer("starcat_answer[]", records[part.start : part.stop]),
-            ffi.from_buffer("int32_t[]", star_index[first:last]),
-            *_memory(),
-        )
-
-
-_OF_THREAD = threading.local()
+    def facts(
+        self, record: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
+    ) -> dict[str, Any]:
+        """Return the fields of an answer, from a record and stars as `BatchResult` has them."""
+        found: dict[str, Any] = dict(zip(record.dtype.names or (), record.item(), strict=True))
+        has_dropped = found["n_usable"] < len(star)
+        facts = {
+            "dropped": _dropped(star) if has_dropped else (),
+            "origin": "lost_in_space" if prior is None else "tracking",
+            "time_s": found["seconds"],
+            "frame": frame,
+            "database": self._database,
+            "noise_px": self._settings.noise_px,
+        }
+        if STATUSES[found["status"]] != "identified":
+            return vars(no_match(len(star), refusal=_refusal_of(found, prior), **facts))
+        camera, error_px = frame.camera, None
+        if self._fov_error:
+            camera = camera.with_focal_length(found["focal_length_px"])
+            error_px = focal_length_error_px(
+                camera.directions_from_pixels(frame.centroids_px[star >= 0]),
+                camera.focal_length_px,
+                found["residual_rad"],
+                self._settings.noise_px,
+            )
+        return facts | {
+            "star_index": np.maximum(star, -1) if has_dropped else star.copy(),
+            "matrix": found["matrix"].copy(),
+            "residual_arcsec": found["residual_rad"] * ARCSEC,
+            "false_match_probability": math.exp(found["log_chance"]),
+            "camera": camera,
+            "focal_length_error_px": error_px,
+            # The library's own, which rounds otherwise than the one that the matrix makes.
+            "_quaternion": found["q_body_from_icrs"].copy(),
+        }
 
 
-def _memory() -> tuple[Any, Any]:
-    """Return the memory that this thread's calls work in; half a megabyte, made once."""
-    if not hasattr(_OF_THREAD, "memory"):
+def _refusal_of(found: dict[str, Any], prior: Prior | None) -> Refusal:
+    """Return why the library has no answer."""
+    reason = REASONS[found["reason"]]
+    if reason == "too_few_stars":
+        return Refusal(reason)
+    if prior is not None and (reason == "no_candidate" or not found["log_chance"] < 0.0):
+        return Refusal("prior")
+    if reason == "no_candidate":
+        return Refusal(reason)
+    return Refusal(
+        reason, found["n_matched"], math.exp(found["log_chance"]), found["share"], found["n_usable"]
+    )
+
+
+class _Memory:
+    """The memory that a call works in, half a megabyte, and views of what it leaves there."""
+
+    def __init__(self) -> None:
         ffi = _onboard.ffi
-        _OF_THREAD.memory = ffi.new("starcat_workspace *"), ffi.new("starcat_result *")
-    found: tuple[Any, Any] = _OF_THREAD.memory
-    return found
+        self.address = ffi.new("starcat_memory *")
+        self.answer = ffi.buffer(ffi.addressof(self.address, "answer"))
+        self.stars = ffi.buffer(ffi.addressof(self.address, "star"))
+        self.q_found = self.address.answer.q_body_from_icrs
+
+
+_FREE: list[_Memory] = []
+"""Memory that no call works in at present. A call takes one from here or makes one, so that there
+are as many as there ever were calls at once; taking and putting back are atomic."""
+
+
+def _double_pointer(array: Array | None) -> Any:
+    """Return the address of numbers, which keeps the array; NULL for None."""
+    ffi = _onboard.ffi
+    return ffi.NULL if array is None else ffi.from_buffer("double[]", np.ascontiguousarray(array))
 
 
 @lru_cache(maxsize=16)
@@ -316,11 +378,11 @@ def _camera(camera: Camera) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _options(settings: Settings) -> Any:
+def _options(settings: Settings, fov_error: float) -> Any:
     chance = math.log(max(settings.max_false_match_probability, 1e-300))
     # The library takes 0 for a noise that is not stated.
     stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
-    options = [settings.tolerance_px, *stated, chance, MAX_STEPS]
+    options = [settings.tolerance_px, *stated, chance, fov_error, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 

@@ -14,33 +14,40 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.blind import identify_blind
-from starcat.matcher.c_engine import CEngine, c_engine, is_compiled
+from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
 from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_frame
-from starcat.matcher.prior import Prior, prior_of
-from starcat.matcher.result import MatchResult, Refusal
+from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_arrays, as_frame, as_frames
+from starcat.matcher.prior import prior_of
+from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
+    MAX_STEPS,
     MIN_SHARE,
     Engine,
     Settings,
     TriangleOrder,
     check_scale_free,
     has_default_search,
+    in_range,
 )
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
 WIDE_PX = 4.0
 """With a wider tolerance, ``auto`` is ``numpy``, which tries smaller reaches too."""
+
+
+MOST_CAMERAS = 16
+"""Cameras that a matcher keeps ready for the C library."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ class Matcher(Settings, _WithDatabase):
         noise_mag: float | None = None,
         engine: Engine = "auto",
         min_share: float = MIN_SHARE,
-        max_steps: float = math.inf,
+        max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
@@ -178,18 +185,22 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             If the centroids are not pairs of numbers, the magnitudes are not one each, the
-            prior is no quaternion or its error is missing or out of range.
+            prior is no quaternion, or an error is missing or out of range.
         """
-        frame = as_frame(centroids_px, camera or self.database.camera, magnitudes)
+        camera = camera or self.database.camera
+        px, mags = as_arrays(centroids_px, magnitudes)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
-            return self._timed(frame, partial(identify_blind, fov_deg=fov_deg))
-        if fov_error:
-            error = self._checked_fov_error(fov_error)
-            return self._timed(frame, partial(solve, fov_error=error, prior=near))
-        return self._answers([frame], near)[0]
+            return self._timed(as_frame(px, camera, mags), partial(identify_blind, fov_deg=fov_deg))
+        error = self._checked_fov_error(fov_error)
+        # The library does not search for both at once.
+        in_c = None if error and near else self._in_c(camera, error)
+        if in_c and (found := in_c.one(px, mags, near)):
+            return found
+        search = partial(solve, fov_error=error, prior=near)
+        return self._timed(as_frame(px, camera, mags), search)
 
     def identify_many(
         self,
@@ -221,17 +232,14 @@ class Matcher(Settings, _WithDatabase):
 
         Raises
         ------
-        ValueError
+        ConfigError
             As `identify`, or if there are not as many arrays of magnitudes as frames.
         """
         camera = camera or self.database.camera
-        if magnitudes is not None and len(magnitudes) != len(frames):
-            raise ValueError(f"magnitudes of {len(magnitudes)} frames; expected {len(frames)}")
-        given = [
-            as_frame(frame, camera, None if magnitudes is None else magnitudes[n])
-            for n, frame in enumerate(frames)
-        ]
-        return self._answers(given, threads=threads or os.cpu_count() or 1)
+        given = as_frames(frames, camera, magnitudes)
+        in_c = self._in_c(camera)
+        found = None if in_c is None else in_c.many(given, threads or os.cpu_count() or 1)
+        return [self._timed(frame, solve) for frame in given] if found is None else found
 
     @cached_property
     def _settings(self) -> Settings:
@@ -259,26 +267,27 @@ class Matcher(Settings, _WithDatabase):
             return "it has no other selection, share of the frame and limits than the default ones"
         return f"{self.database.name} has too many stars or features for an onboard image"
 
-    def _answers(
-        self, frames: Sequence[Frame], prior: Prior | None = None, threads: int = 1
-    ) -> Sequence[MatchResult]:
-        """Identify frames in C, or all of them with numpy where the library does not take one."""
-        engine = self._c_engine
-        if engine is not None and all(engine.accepts(len(frame)) for frame in frames):
-            explain = None if self.database.image else partial(self._explain, prior)
-            answers = engine.identify(frames, self._settings, prior, threads, explain)
-            if answers.is_whole and prior is not None:
-                return [prior.checked(answers[0], frames[0].camera, self.tolerance_px)]
-            if answers.is_whole:
-                return answers
-        return [self._timed(frame, partial(solve, prior=prior)) for frame in frames]
+    @cached_property
+    def _searches(self) -> dict[tuple[int, float], Search]:
+        """Those asked for last, by the camera's identity, as each holds its own, and its error."""
+        return {}
 
-    def _explain(self, prior: Prior | None, frame: Frame) -> Refusal | None:
-        """Return why the C library has no answer: what the search with numpy comes to."""
-        # What is unlikely enough for one of the two searches near a prior may not be found by
-        # the other.
-        found = solve(self._settings, self.database, frame, prior=prior)
-        return Refusal("prior") if found.ok and prior is not None else found.refusal
+    def _in_c(self, camera: Camera, fov_error: float = 0.0) -> Search | None:
+        """Return what asks the C library about frames of a camera, where it serves."""
+        key = id(camera), fov_error
+        found = self._searches.get(key)
+        if found is None:
+            engine = self._c_engine
+            if engine is None:
+                return None
+            if len(self._searches) >= MOST_CAMERAS:
+                self._searches.clear()
+            found = self._searches[key] = engine.search(camera, self._settings, fov_error)
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what goes to another process: all but addresses."""
+        return {name: value for name, value in vars(self).items() if name != "_searches"}
 
     def _timed(
         self, frame: Frame, search: Callable[[Settings, Database, Frame], MatchResult]
@@ -295,10 +304,10 @@ class Matcher(Settings, _WithDatabase):
         )
 
     def _checked_fov_error(self, fov_error: float) -> float:
-        why = "an onboard image needs the focal length"
-        self.database.check_has_products(why, key="fov_error", value=fov_error)
+        if type(fov_error) is float and fov_error == 0.0:  # in nearly all calls, so at once
+            return fov_error
+        in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
+        if not fov_error:
+            return 0.0
         check_scale_free(self)
-        if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
-            text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
-            raise ConfigError(text, key="fov_error", value=fov_error)
         return float(fov_error)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
 
@@ -19,6 +21,9 @@ WIDEST_FOV_ERROR = 0.5
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
 ``duplicate``."""
+
+
+FLOAT64 = np.dtype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -33,16 +38,117 @@ class Frame:
         return len(self.centroids_px)
 
 
+@dataclass(frozen=True)
+class Frames(Sequence[Frame]):
+    """Frames of one camera, one after the other."""
+
+    # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``.
+    starts: NDArray[np.int64]
+    centroids_px: Pixels
+    magnitudes: Array | None
+    camera: Camera
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @overload
+    def __getitem__(self, frame: int) -> Frame: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[Frame]: ...
+    def __getitem__(self, frame: int | slice) -> Frame | list[Frame]:
+        if isinstance(frame, slice):
+            return [self[n] for n in range(*frame.indices(len(self)))]
+        frame = range(len(self))[frame]
+        rows = slice(self.starts[frame], self.starts[frame + 1])
+        magnitudes = None if self.magnitudes is None else self.magnitudes[rows]
+        return Frame(self.centroids_px[rows], magnitudes, self.camera)
+
+
 def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | None = None) -> Frame:
-    """Return what a caller gives as a frame; ``ValueError`` unless shapes are as expected."""
-    given = np.asarray(centroids_px, dtype=np.float64)
-    given = given.reshape(0, 2) if given.size == 0 else given
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
-    if mag is not None and mag.shape != (len(given),):
-        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
-    return Frame(given, mag, camera)
+    """Return a copy of what a caller gives as a frame; errors as those of `as_arrays`."""
+    px, mag = as_arrays(centroids_px, magnitudes)
+    return Frame(px.copy(), None if mag is None else mag.copy(), camera)
+
+
+def as_arrays(
+    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
+) -> tuple[Pixels, Array | None]:
+    """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
+    given = numbers_of("centroids_px", centroids_px, "(N, 2)")
+    if given.shape[1:] != (2,):
+        if given.size:
+            raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
+        given = given.reshape(0, 2)
+    if magnitudes is None:
+        return given, None
+    shape = given.shape[:1]
+    mag = numbers_of("magnitudes", magnitudes, shape)
+    if mag.shape != shape:
+        one_each = f"{shape}, one a centroid"
+        raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
+    return given, mag
+
+
+def as_frames(
+    centroids_px: Sequence[ArrayLike], camera: Camera, magnitudes: Sequence[ArrayLike] | None = None
+) -> Frames:
+    """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
+    if magnitudes is not None and len(magnitudes) != len(centroids_px):
+        text = f"magnitudes of {len(magnitudes)} frames; expected {len(centroids_px)}"
+        raise ConfigError(text, key="magnitudes", value=magnitudes)
+    mags = [None] * len(centroids_px) if magnitudes is None else magnitudes
+    joined = _joined(centroids_px, magnitudes)
+    if joined is None:  # one after the other, which finds what is wrong, or not an array
+        each = [as_arrays(*given) for given in zip(centroids_px, mags, strict=True)]
+        px = [np.empty((0, 2)), *(given for given, _ in each)]
+        known = None
+        if magnitudes is not None:
+            # A frame whose magnitudes are None has none that is known.
+            nan = (np.full(len(given), np.nan) if mag is None else mag for given, mag in each)
+            known = np.concatenate([np.empty(0), *nan])
+        joined = [len(given) for given, _ in each], np.concatenate(px), known
+    counts, all_px, all_mags = joined
+    starts = np.zeros(len(counts) + 1, dtype=np.int64)
+    np.cumsum(counts, out=starts[1:])
+    return Frames(starts, all_px, all_mags, camera)
+
+
+def _joined(
+    centroids_px: Sequence[ArrayLike], magnitudes: Sequence[ArrayLike] | None
+) -> tuple[list[int], Pixels, Array | None] | None:
+    """Return the sizes of frames and their arrays joined in one go; None where they do not fit."""
+    try:
+        counts = [len(given) for given in centroids_px]  # type: ignore[arg-type]
+        px, mag = np.asarray(np.concatenate(centroids_px, dtype=np.float64)), None
+        if magnitudes is not None:
+            if [len(given) for given in magnitudes] != counts:  # type: ignore[arg-type]
+                return None
+            mag = np.asarray(np.concatenate(magnitudes, dtype=np.float64))
+    except (TypeError, ValueError):
+        return None
+    total = sum(counts)
+    fits = px.shape == (total, 2) and (mag is None or mag.shape == (total,))
+    return (counts, px, mag) if fits else None
+
+
+def numbers_of(name: str, values: ArrayLike, shape: str | tuple[int, ...]) -> Array:
+    """Return an argument as an array of real numbers."""
+    if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
+        return values
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex numbers")
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
+            key=name,
+            value=values,
+        ) from error
+
+
+def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigError:
+    return ConfigError(f"{what} shape {found.shape}; expected {expected}", key=key, value=found)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ verification of what that proposes is that of any other method.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +19,10 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.observation import Candidates, Observation, numbers_of
 from starcat.matcher.pose import Pose
 from starcat.matcher.result import MatchResult, Refusal, no_match
-from starcat.matcher.settings import LOOKUP, REACH
+from starcat.matcher.settings import LOOKUP, REACH, in_range
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify
 
@@ -47,13 +47,19 @@ class Prior:
     q_body_from_icrs: Array
     error_rad: float
 
-    def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
-        """Return an answer if its attitude is as near to the prior as that says."""
+    def checked(
+        self,
+        answer: MatchResult,
+        camera: Camera,
+        tolerance_px: float,
+        q_found: Sequence[float] | None = None,
+    ) -> MatchResult:
+        """Return an answer if its attitude, ``q_found`` if given, is as near as the error says."""
         if not answer.ok:
             return answer
-        prior_q, found_q = self.q_body_from_icrs.tolist(), answer.q_body_from_icrs.tolist()
-        slack_rad = turn_of_noise_rad(camera, tolerance_px)
-        if math.hypot(*turn_between(prior_q, found_q)) <= self.error_rad + slack_rad:
+        q_found = answer.q_body_from_icrs.tolist() if q_found is None else q_found
+        turn_rad = math.hypot(*turn_between(self.q_body_from_icrs.tolist(), q_found))
+        if turn_rad <= self.error_rad + turn_of_noise_rad(camera, tolerance_px):
             return answer
         names = ("origin", "time_s", "frame", "database", "noise_px")
         facts = {name: getattr(answer, name) for name in names}
@@ -69,18 +75,17 @@ def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | N
         raise ConfigError(
             f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
         )
-    q = np.asarray(quaternion, dtype=np.float64)
-    square = float(q @ q) if q.shape == (4,) else math.nan
-    if not 0.0 < square < math.inf:
+    q = numbers_of("prior", quaternion, "(4,)")
+    parts = q.tolist() if q.shape == (4,) else [math.nan]
+    largest = max(map(abs, parts))
+    if not (all(map(math.isfinite, parts)) and largest > 0.0):
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
         raise ConfigError(text, key="prior", value=quaternion)
-    if not 0.0 < error_deg <= WIDEST_PRIOR_DEG:
-        raise ConfigError(
-            f"prior_error_deg is {error_deg}; expected above 0, at most {WIDEST_PRIOR_DEG:g}",
-            key="prior_error_deg",
-            value=error_deg,
-        )
-    return Prior(q / math.sqrt(square), math.radians(error_deg))
+    in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+    # Its length carries no meaning, and that of four times 1e308 would overflow.
+    scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
+    length = math.hypot(*scaled)
+    return Prior(np.array([part / length for part in scaled]), math.radians(error_deg))
 
 
 def search_near(

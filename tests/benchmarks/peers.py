@@ -102,10 +102,7 @@ def drive_starcat(
     Where the focal length is told wrong by up to ``off``, as much is allowed.
     """
     from starcat.geometry.attitude import matrix_from_quaternion
-    from starcat.matcher.c_engine import c_engine
     from starcat.matcher.matcher import Matcher
-    from starcat.matcher.observation import as_frame
-    from starcat.matcher.prior import prior_of
 
     of_kind = {
         kind: Matcher.open(Path(artifact), method, engine=engine, **(stated or {}).get(kind, {}))
@@ -135,14 +132,7 @@ def drive_starcat(
         return px, mag if magnitudes else None, prior, camera
 
     def inside_s(given: Any) -> float:
-        library = c_engine(matcher.database, method) if engine == "c" else None
-        if library is None:
-            return math.nan
-        px, mag, prior, _ = given
-        near = prior_of(prior, PRIOR_DEG) if track else None
-        frame = as_frame(px, matcher.database.camera, mag)
-        found = library.identify([frame], matcher._settings, near)
-        return float(found.seconds[0])
+        return float(solve(given).time_s) if engine == "c" else math.nan
 
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
@@ -22,7 +23,7 @@ from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
 from starcat.images.image_file import write_image
-from starcat.images.render import Optics, render_image
+from starcat.images.render import Optics, render_image, star_electrons
 from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
 
@@ -86,6 +87,9 @@ class Picture:
     optics: Optics
     scene: Scene
     quality: int | None = None
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera during the exposure
+    haze_mag: float = 0.0  # what haze takes of the stars; a part of that is spread around them
+    mesh_px: float = 0.0  # distance of the spots that a mesh before the lens adds to each star
 
 
 def _optics(rng: Rng, widest_px: float = 2.0, **changes: float | int) -> Optics:
@@ -154,6 +158,108 @@ MORE_KINDS: dict[str, Callable[[Rng], Picture]] = {
 }
 
 
+ZERO_POINT_E_S, SKY_E_S = 6e6, 200.0  # per second: those of the default optics, which take 0.1 s
+
+
+def _exposed(rng: Rng, exposure_s: float, **changes: float | int) -> Optics:
+    light = {"zero_point_e": ZERO_POINT_E_S * exposure_s, "background_e": SKY_E_S * exposure_s}
+    return _optics(rng, **{**light, **changes})
+
+
+def streaked(rng: Rng, rate_deg_s: float, exposure_s: float) -> Picture:
+    """Take a picture while the camera turns about a random axis."""
+    axis = rng.normal(size=3)
+    turn = rate_deg_s * exposure_s * axis / np.linalg.norm(axis)
+    return Picture(_exposed(rng, exposure_s), Scene(), turn_deg=(turn[0], turn[1], turn[2]))
+
+
+def _streaks(rng: Rng) -> Picture:
+    rate, exposure = (10.0 ** rng.uniform(*np.log10(ends)) for ends in ((0.1, 3.0), (0.05, 1.0)))
+    return streaked(rng, rate, exposure)
+
+
+def _haze(rng: Rng) -> Picture:
+    lost = rng.uniform(0.5, 2.5)
+    scene = Scene(town_light_e=10.0 ** rng.uniform(2.0, 3.3), town_light_deg=rng.uniform(0, 360))
+    return Picture(_optics(rng), scene, haze_mag=lost)
+
+
+def _moonlight(rng: Rng) -> Picture:
+    away, toward = rng.uniform(700.0, 2500.0), rng.uniform(0.0, 2.0 * np.pi)
+    place = 512.0 + away * np.array([np.cos(toward), np.sin(toward)])
+    scene = Scene(moon_px=(place[0], place[1]), glow_e=10.0 ** rng.uniform(3.5, 4.5), glow_px=400.0)
+    return Picture(_exposed(rng, 0.1, background_e=10.0 ** rng.uniform(2.5, 3.7)), scene)
+
+
+def _mesh(rng: Rng) -> Picture:
+    return Picture(_optics(rng), Scene(), mesh_px=rng.uniform(4.0, 20.0))
+
+
+def _faint_among_hot(rng: Rng) -> Picture:
+    optics = _optics(
+        rng, hot_pixels=int(10.0 ** rng.uniform(3.3, 4.3)), zero_point_e=rng.uniform(5e4, 1.5e5)
+    )
+    return Picture(optics, Scene())
+
+
+NIGHT_KINDS: dict[str, Callable[[Rng], Picture]] = {
+    "streaks": _streaks,
+    "haze": _haze,
+    "moonlight": _moonlight,
+    "mesh": _mesh,
+    "faint among hot pixels": _faint_among_hot,
+}
+"""What nights have, and cameras that turn."""
+
+MESH_OPEN = 0.75
+"""Part of a mesh's period, along each axis, that lets light through."""
+
+
+def mesh_spots(centroids_px: Array, mag: Array, pitch_px: float) -> tuple[Array, Array]:
+    """Return the orders of diffraction behind a square mesh, turned by 20 deg, as spots."""
+    orders = np.arange(-3, 4)
+    part = (MESH_OPEN * np.sinc(MESH_OPEN * orders)) ** 2
+    m, n = (grid.ravel() for grid in np.meshgrid(orders, orders))
+    turned = np.radians(20.0)
+    x, y = m * np.cos(turned) - n * np.sin(turned), m * np.sin(turned) + n * np.cos(turned)
+    places = centroids_px[:, None] + pitch_px * np.stack([x, y], axis=1)
+    fainter = -2.5 * np.log10(np.outer(part, part).ravel())
+    spots, mags = places.reshape(-1, 2), (mag[:, None] + fainter).ravel()
+    seen = mags < FAINTEST_MAG
+    return spots[seen], mags[seen]
+
+
+FAINTEST_MAG = 9.0
+"""Of stars that are drawn many times: at all times of an exposure, or in all orders of a mesh."""
+
+HALO_PART, HALO_PX = 0.5, 25.0
+"""Part of what haze takes of a star that comes back around it, and how far around."""
+
+
+def _drawn(
+    picture: Picture, body: Array, mag: Array, camera: Camera
+) -> tuple[Array, Array, Array | None]:
+    """Return places and magnitudes of the spots of light of a picture, and haze around them."""
+    places = camera.pixels_from_directions(body)
+    if picture.haze_mag:
+        size, lost = (camera.width_px, camera.height_px), 1.0 - 10.0 ** (-0.4 * picture.haze_mag)
+        stars = star_electrons(places, mag, size, picture.optics)
+        return places, mag + picture.haze_mag, gaussian_filter(HALO_PART * lost * stars, HALO_PX)
+    bright = mag < FAINTEST_MAG
+    if picture.mesh_px:
+        return *mesh_spots(places[bright], mag[bright], picture.mesh_px), None
+    turn = np.radians(picture.turn_deg)
+    if not turn.any():
+        return places, mag, None
+    # The attitude of a picture is that of the middle of its exposure.
+    count = int(np.ceil(2.0 * np.linalg.norm(turn) * camera.focal_length_px)) + 25
+    parts = [
+        camera.pixels_from_directions(Rotation.from_rotvec(part * turn).apply(body[bright]))
+        for part in (np.arange(count) + 0.5) / count - 0.5
+    ]
+    return np.concatenate(parts), np.tile(mag[bright] + 2.5 * np.log10(count), count), None
+
+
 @cache
 def sky() -> tuple[Array, Array]:
     """Directions and magnitudes of all stars of the embedded sky."""
@@ -177,16 +283,26 @@ class Taken:
 
 def take(kind: str, number: int, camera: Camera, folder: Path) -> Taken:
     """Render one picture and write it."""
-    kinds = KINDS | MORE_KINDS
+    kinds = KINDS | MORE_KINDS | NIGHT_KINDS
     rng = np.random.default_rng([2026, list(kinds).index(kind), number])
-    picture, matrix = kinds[kind](rng), random_attitudes(1, rng)[0]
+    return take_picture(kinds[kind](rng), kind, number, rng, camera, folder)
+
+
+def take_picture(
+    picture: Picture, kind: str, number: int, rng: Rng, camera: Camera, folder: Path
+) -> Taken:
+    """Render a picture at a random attitude and write it."""
+    matrix = random_attitudes(1, rng)[0]
     directions, mag = sky()
     body = directions @ matrix.T
     near = np.flatnonzero(body[:, 2] > np.cos(0.6 * camera.diagonal_rad))
     places = camera.pixels_from_directions(body[near])
     size, seed = (camera.width_px, camera.height_px), int(rng.integers(2**31))
     light = scene_light(picture.scene, size, picture.optics.full_well_e, seed)
-    adu = render_image(places, mag[near], size, picture.optics, seed, light)
+    spots, spot_mag, around = _drawn(picture, body[near], mag[near], camera)
+    if around is not None:
+        light += around
+    adu = render_image(spots, spot_mag, size, picture.optics, seed, light)
     image = in_file_steps(adu, picture.scene)
     suffix = ".png" if picture.quality is None else ".jpg"
     path = folder / f"{kind} {number}{suffix}".replace(" ", "_")

@@ -1,0 +1,145 @@
+"""``starcat identify`` with many files: folders, patterns, one table, a line each, one picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from starcat.errors import ConfigError
+from starcat.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
+from starcat.images.contact_sheet import write_contact_sheet
+from starcat.images.render import write_simulated
+from starcat.matcher.database import open_database
+from starcat.matcher.matcher import Matcher
+from starcat.simulation.simulate import Noise, simulate_frames
+
+
+@pytest.fixture(scope="module")
+def night(small_artifact, tmp_path_factory) -> Path:
+    """Six pictures, one of them damaged, one without stars, and a file that is none."""
+    folder, database = tmp_path_factory.mktemp("night"), open_database(small_artifact)
+    eye, noise = database.camera, Noise(0.5)
+    frames = simulate_frames(database.directions, eye, 4, noise, 1, mag=database.mag)
+    for number, frame in enumerate(frames, start=1):
+        write_simulated(folder / f"img_{number}.png", frame, eye, number)
+    (folder / "img_5.png").write_bytes((folder / "img_1.png").read_bytes()[:200])
+    dark = np.random.default_rng(1).normal(100.0, 5.0, (512, 512))
+    Image.fromarray(np.rint(dark).astype(np.uint16)).save(folder / "img_10.png")
+    (folder / "notes.txt").write_text("cloudy at first\n")
+    return folder
+
+
+def test_files_are_those_of_folders_patterns_and_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("b/img_10.JPG", "b/img_2.jpg", "b/frame.csv", "b/.hidden.png", "c/1.csv", "a.png"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).touch()
+    assert [str(path) for path in files_of(["b"])] == ["b/img_2.jpg", "b/img_10.JPG"]
+    assert [str(path) for path in files_of(["c"])] == ["c/1.csv"]
+    assert [str(path) for path in files_of(["a.png", "*.png", "b/*_2*"])] == [
+        "a.png",
+        "b/img_2.jpg",
+    ]
+    assert [is_batch(given) for given in (["b"], ["*.png"], ["a.png", "b.png"])] == [True] * 3
+    assert not is_batch(["a.png"])
+    assert not is_batch(["-"])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [("*.fits", "no file has such a name"), ("-", "goes alone"), ("empty", "neither pictures")],
+)
+def test_inputs_that_are_no_files_are_refused(given, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=words):
+        files_of([given])
+
+
+def test_many_pictures_are_one_table_and_a_file_that_is_none_spoils_no_other(
+    starcat, night, small_artifact, tmp_path
+):
+    sheet = tmp_path / "sheet.png"
+    run = starcat(["identify", small_artifact, night, "--contact-sheet", sheet])
+    assert run.code == 2
+    assert "1 of 6 files cannot be used" in run.err
+    assert "img_5.png" in run.err
+    rows = [line.split() for line in run.out.splitlines() if line.startswith("img_")]
+    assert [row[0] for row in rows] == [f"img_{n}" for n in (1, 2, 3, 4, 10)]
+    assert [row[1] for row in rows] == ["identified"] * 4 + ["too_few_stars"]
+    again = tmp_path / "again.png"
+    write_contact_sheet(
+        again, list(identify_files(files_of([str(night)]), Matcher.open(small_artifact)))
+    )
+    assert sheet.read_bytes() == again.read_bytes()
+
+
+def test_each_answer_of_many_is_a_line_of_json(starcat, night, small_artifact):
+    run = starcat(["identify", small_artifact, f"{night}/img_[!234]*.png", "--json"])
+    assert run.code == 2
+    found = [json.loads(line) for line in run.out.splitlines()]
+    assert [Path(one["file"]).name for one in found] == [f"img_{n}.png" for n in (1, 5, 10)]
+    states = [one["status"] for one in found]
+    assert states == ["identified", "unusable", "too_few_stars"]
+    [alone] = json.loads(starcat(["identify", small_artifact, night / "img_1.png", "--json"]).out)
+    assert found[0]["stars"] == alone["stars"]
+
+
+def test_the_exit_code_of_many_is_that_of_one(starcat, night, small_artifact):
+    asked = [night / "img_1.png", night / "img_10.png"]
+    assert starcat(["identify", small_artifact, *asked]).code == 0
+    run = starcat(["identify", small_artifact, *asked, "--fail-on-no-match"])
+    assert run.code == 6
+    assert "1 of 2 frames not identified (img_10: too_few_stars)" in run.err
+
+
+def test_options_of_one_file_are_refused_for_many(starcat, night, small_artifact, tmp_path):
+    for option, name in (("--picture", "one.png"), ("--wcs", "one.fits")):
+        run = starcat(["identify", small_artifact, night, option, tmp_path / name])
+        assert run.code == 2
+        assert f"{option} is for one file" in run.err
+    run = starcat(["identify", small_artifact, night, "--contact-sheet", "sheet.jpg"])
+    assert run.code == 2
+    assert "a contact sheet is a .png file" in run.err
+
+
+def told(items: list[BatchItem]) -> list[object]:
+    return [
+        (item.path, [answer.content() | {"time_s": 0} for answer in item.answers], str(item.error))
+        for item in items
+    ]
+
+
+def test_processes_change_no_answer(night, small_artifact):
+    matcher, paths = Matcher.open(small_artifact), files_of([str(night)])[2:]
+    alone, several = (list(identify_files(paths, matcher, workers=n)) for n in (0, 2))
+    assert told(alone) == told(several)
+    for one, other in zip(alone, several, strict=True):
+        assert np.array_equal(one.small, other.small)
+
+
+def test_centroid_files_are_a_batch_too(starcat, small_artifact, tmp_path):
+    for seed in (1, 2):
+        starcat(["simulate", small_artifact, "-o", tmp_path / f"{seed}.csv", "--seed", seed])
+    shutil.copy(tmp_path / "1.csv", tmp_path / "3.csv")
+    run = starcat(["identify", small_artifact, tmp_path, "--json", "--track"])
+    found = [json.loads(line) for line in run.out.splitlines()]
+    assert [one["status"] for one in found] == ["identified"] * 3
+    sheet = tmp_path / "sheet.png"
+    assert starcat(["identify", small_artifact, tmp_path, "--contact-sheet", sheet]).code == 0
+    with Image.open(sheet) as drawn:
+        assert drawn.size[0] > 512
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (1000, 37), (3, 5000)])
+def test_a_small_picture_keeps_every_star(shape):
+    image = np.full(shape, 10.0)
+    image[shape[0] // 2, shape[1] // 2] = 1000.0
+    small = small_picture(image)
+    assert max(small.shape) <= 256
+    assert small.max() == 255
