@@ -169,7 +169,13 @@ class Bench:
         found = self._found(image)
         mag = found.mag + 2.5 * math.log10(sensor.zero_point_e / sensor.gain_e_adu)
         kept = np.flatnonzero(mag <= self.limit_mag)[: sensor.most_spots]
-        return Spots(found.centroids_px[kept], found.flux[kept], mag[kept], found.psf_sigma_px)
+        return Spots(
+            found.centroids_px[kept],
+            found.flux[kept],
+            mag[kept],
+            found.sigma_px[kept],
+            found.psf_sigma_px,
+        )
 
     def centroids(self, image: NDArray[np.uint16]) -> Pixels:
         """Return all spots of a frame."""
