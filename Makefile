@@ -70,6 +70,7 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 	$(BIN)/python tests/benchmarks/products.py
 	$(BIN)/python tests/benchmarks/matcher.py
 	$(BIN)/python tests/benchmarks/hostile.py
+	$(BIN)/python tests/benchmarks/false_matches.py --frames 200
 	$(BIN)/python tests/benchmarks/fields.py
 	$(BIN)/python tests/benchmarks/sql.py
 	$(BIN)/python tests/benchmarks/votable.py

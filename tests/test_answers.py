@@ -25,7 +25,6 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.numpy_engine import solve
 from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
@@ -336,23 +335,12 @@ def test_too_few_spots_are_the_reason(sky, engine):
 
 
 @needs_c
-def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
-    searches = []
-    monkeypatch.setattr(
-        "starcat.matcher.matcher.solve",
-        lambda *asked, **more: searches.append(1) or solve(*asked, **more),
-    )
+def test_the_library_says_why_it_has_no_answer(sky):
     px = np.random.default_rng(3).random((8, 2)) * 1024.0
     found = Matcher(sky, engine="c").identify(px)
-    assert (found.status, found.why is None) == ("no_match", False)
-    assert repr(found) == "<MatchResult no_match: 8 spots>"
-    assert not searches
-    why = found.refusal
-    assert why == Matcher(sky, engine="numpy").identify(px).refusal
-    assert why is found.refusal is not None
-    assert len(searches) == 2  # this matcher's, once, and that of numpy
-    assert repr(found) == f"<MatchResult no_match: 8 spots, {why.reason}>"
-    assert why.hint.split(",")[0] in found._repr_html_()
+    assert found.refusal == Matcher(sky, engine="numpy").identify(px).refusal
+    assert repr(found) == f"<MatchResult no_match: 8 spots, {found.refusal.reason}>"
+    assert found.refusal.hint.split(",")[0] in found._repr_html_()
 
 
 @needs_c
@@ -368,7 +356,7 @@ def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
 
 
 @needs_c
-def test_an_onboard_image_tells_the_same_but_why_not(small_artifact, tmp_path):
+def test_an_onboard_image_tells_the_same(small_artifact, tmp_path):
     export_image(small_artifact, "onboard", tmp_path / "db.img")
     ground, flight = Matcher.open(small_artifact), Matcher.open(tmp_path / "db.img")
     frame = a_frame(ground.database, ground.database.camera)
@@ -378,7 +366,8 @@ def test_an_onboard_image_tells_the_same_but_why_not(small_artifact, tmp_path):
     # The directions of an image are rounded, to some milliarcseconds.
     assert np.abs(one.stars.dx_px - other.stars.dx_px).max() < 1e-3
     px = np.random.default_rng(3).random((5, 2)) * 512.0
-    assert (flight.identify(px).status, flight.identify(px).refusal) == ("no_match", None)
+    assert flight.identify(px).status == "no_match"
+    assert flight.identify(px).refusal == ground.identify(px).refusal is not None
     assert "no_match" in flight.identify(px)._repr_html_()
 
 

@@ -86,7 +86,7 @@ def test_a_prior_attitude_is_used(starcat, small_artifact, frames, tmp_path):
         (["--prior-q", "0,0,1", "--prior-error-deg", "1"], "'0,0,1' is not X,Y,Z,W"),
         (["--prior-q", "0,0,0,one", "--prior-error-deg", "1"], "is not X,Y,Z,W, four numbers"),
         (["--prior-q", "0,0,0,0", "--prior-error-deg", "1"], "four finite numbers, not all 0"),
-        (["--prior-q", "0,0,0,1", "--prior-error-deg", "30"], "is 30.0; expected above 0"),
+        (["--prior-q", "0,0,0,1", "--prior-error-deg", "30"], "is 30.0; expected a number above 0"),
         (["--prior-q", "0,0,0,1", "--prior-error-deg", "1", "--track"], "leave out --prior-q"),
         (["--track", "--time", "2026-01-01T00:00:00"], "leave out --time, or --track"),
     ],

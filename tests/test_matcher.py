@@ -267,7 +267,9 @@ def test_the_agreement_of_a_cluster_alone_is_refused(sky_of, random_directions):
     place = CAMERA.pixels_from_directions(database.directions @ matrix.T)
     stars = np.flatnonzero(CAMERA.contains(place))
     outside = stars[stars < 1200]
-    place[outside] = np.random.default_rng(37).random((len(outside), 2)) * 1024.0
+    generator = np.random.default_rng(37)
+    place += generator.normal(scale=0.3, size=place.shape)
+    place[outside] = generator.random((len(outside), 2)) * 1024.0
     found = agreement_of(matrix, observe(place[stars], CAMERA, 2.0), database)
     assert found.n_matched >= 10
     assert found.false_match_probability == 1.0
@@ -739,7 +741,7 @@ def test_a_stated_noise_is_three_of_the_tolerance(small_artifact):
     found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
     assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
     assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
-    again = replace(found, max_batches=7)
+    again = replace(found, max_steps=7)
     assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
 
 

@@ -56,7 +56,7 @@ def matcher(skies, request) -> Matcher:
 
 def hasty(matcher: Matcher) -> Matcher:
     """A matcher that gives up soon, as that in numpy needs seconds for hopeless frames."""
-    return matcher if matcher.engine == "c" else replace(matcher, max_batches=25)
+    return matcher if matcher.engine == "c" else replace(matcher, max_steps=3000)
 
 
 def frames(matcher: Matcher, count: int, noise: Noise | None = None, seed: int = 3) -> list[Frame]:

@@ -13,6 +13,7 @@ from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
 from starcat.matcher.pose import (
+    Pose,
     corner_deviation,
     explained_fraction,
     information,
@@ -143,19 +144,20 @@ def test_a_missed_star_counts_the_more_the_farther_it_is(seed, angle, distance_p
 # --- The share of a frame
 
 
-def seen(centroids_px: np.ndarray) -> Observation:
-    return observe(centroids_px, CAMERA, 2.0)
+def seen(centroids_px: np.ndarray) -> tuple[Pose, Observation]:
+    observation = observe(centroids_px, CAMERA, 2.0)
+    return Pose(np.eye(3), CAMERA, observation.body), observation
 
 
 def test_fewer_stars_or_fewer_centroids_in_the_frame_are_no_fault():
     matched_px, others_px = places(8, 6), places(12, 7)
     all_px = np.concatenate([matched_px, others_px])
     matched, all_rays, residual_rad = rays(matched_px), rays(all_px), 0.5 / CAMERA.focal_length_px
-    assert explained_fraction(matched, all_rays, residual_rad, seen(matched_px)) == pytest.approx(
+    assert explained_fraction(matched, all_rays, residual_rad, *seen(matched_px)) == pytest.approx(
         1.0
     )
-    assert explained_fraction(matched, matched, residual_rad, seen(all_px)) == pytest.approx(1.0)
-    both = explained_fraction(matched, all_rays, residual_rad, seen(all_px))
+    assert explained_fraction(matched, matched, residual_rad, *seen(all_px)) == pytest.approx(1.0)
+    both = explained_fraction(matched, all_rays, residual_rad, *seen(all_px))
     assert both == pytest.approx(weighted_share(covariance_of(matched_px), all_rays))
     assert 0.2 < both < 0.5
 
@@ -165,7 +167,7 @@ def test_a_cluster_alone_does_not_explain_the_frame():
     stars = rays(np.concatenate([cluster_px, outside_px]))
     residual_rad = 0.5 / CAMERA.focal_length_px
     observation = seen(np.concatenate([cluster_px, outside_px]))
-    assert explained_fraction(rays(cluster_px), stars, residual_rad, observation) < 0.05
+    assert explained_fraction(rays(cluster_px), stars, residual_rad, *observation) < 0.05
 
 
 @pytest.mark.parametrize(("residual_px", "is_held"), [(0.1, True), (1.0, False)])
@@ -175,13 +177,13 @@ def test_that_nothing_else_was_seen_counts_if_the_corners_are_held(residual_px, 
     residual_rad = residual_px / CAMERA.focal_length_px
     # About 20 px from the middle of the cluster, ten stars: 640 / (20 sqrt(10)) = 10 times.
     assert 5.0 < corner_deviation(covariance_of(cluster_px), CAMERA) < 15.0
-    found = explained_fraction(rays(cluster_px), stars, residual_rad, seen(cluster_px))
+    found = explained_fraction(rays(cluster_px), stars, residual_rad, *seen(cluster_px))
     assert found == pytest.approx(1.0) if is_held else found < 0.05
 
 
 def test_stars_in_one_place_explain_nothing():
     same = np.tile([0.0, 0.0, 1.0], (5, 1))
-    assert explained_fraction(same, same, 0.0, seen(places(5, 10))) == 0.0
+    assert explained_fraction(same, same, 0.0, *seen(places(5, 10))) == 0.0
 
 
 # --- Scale
@@ -201,7 +203,7 @@ def test_a_frame_is_scaled_if_its_corners_move_farther_than_the_tolerance(factor
         noise = generator.normal(scale=0.3, size=predicted_px.shape)
         for scale in (factor, 1.0 / factor):
             centroids_px = scaled(predicted_px, scale) + noise
-            found.append(is_scaled(predicted_px, centroids_px, seen(places(12, seed))))
+            found.append(is_scaled(predicted_px, centroids_px, CAMERA, 2.0))
     assert all(found) if is_plain else not any(found)
 
 
@@ -212,6 +214,6 @@ def test_a_difference_of_scale_within_the_noise_is_none():
     for seed in range(200):
         predicted_px = places(6, seed, 60.0)
         noisy_px = predicted_px + generator.normal(scale=0.5, size=predicted_px.shape)
-        found.append(is_scaled(predicted_px, noisy_px, seen(noisy_px)))
+        found.append(is_scaled(predicted_px, noisy_px, CAMERA, 2.0))
     # Three deviations, estimated from eight degrees of freedom: 2 %.
     assert np.mean(found) < 0.06

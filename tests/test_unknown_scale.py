@@ -88,7 +88,7 @@ def test_three_standard_errors_of_the_focal_length_hold_the_truth(n):
             pose = fit(pose, rows, stars[seen.rows], seen)
         left = pose.body - stars[seen.rows] @ pose.matrix.T
         residual_rad = math.sqrt(np.vdot(left, left) / len(left))
-        error_px = focal_length_error_px(pose, rows, residual_rad, seen)
+        error_px = focal_length_error_px(pose.body, pose.camera.focal_length_px, residual_rad, None)
         beyond += abs(pose.camera.focal_length_px - CAMERA.focal_length_px) > 3.0 * error_px
     assert beyond <= 8  # 0.27 % of 400 is one
 

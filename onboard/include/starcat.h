@@ -57,6 +57,17 @@ typedef enum {
   STARCAT_E_BUDGET = -14            /* the steps are used up before an answer was found */
 } starcat_status;
 
+/* Why a frame has no answer. */
+typedef enum {
+  STARCAT_REASON_NONE = 0,
+  STARCAT_REASON_TOO_FEW_STARS = 1,
+  STARCAT_REASON_NO_CANDIDATE = 2,  /* no pattern of the frame is in the image */
+  STARCAT_REASON_CHANCE = 3,        /* no attitude fits better than chance */
+  STARCAT_REASON_SHARE = 4,         /* the best agreement explains too little of the frame */
+  STARCAT_REASON_SCALE = 5,         /* the frame is of another scale than the camera */
+  STARCAT_REASON_STEPS = 6          /* the steps were used up */
+} starcat_reason;
+
 /* Results of a centroid beside the row of its star, which is 0 or more. */
 #define STARCAT_NO_STAR (-1)
 #define STARCAT_DROPPED_NOT_FINITE (-2)
@@ -99,6 +110,9 @@ typedef struct {
   starcat_real noise_mag;                /* standard deviation of magnitudes; 0: not stated */
   starcat_real log_chance;               /* natural logarithm of the largest accepted probability
                                             that chance agrees as well */
+  starcat_real fov_error;                /* largest relative error of the focal length, up to 0.5:
+                                            it is then found with the attitude, which the method
+                                            triangle can; 0: it is known */
   uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
@@ -118,6 +132,12 @@ typedef struct {
   uint32_t n_matched;
   uint32_t steps;                        /* steps that were taken */
   uint32_t n_tried;                      /* attitudes that were verified */
+  starcat_real focal_length_px;          /* the given one, or the one that was found */
+  uint32_t reason;                       /* of starcat_reason: why there is no answer */
+  uint32_t n_usable;                     /* centroids that could be used */
+  uint32_t best_n_matched;               /* if not identified: matches of the best agreement, */
+  starcat_real best_log_chance;          /* its bound */
+  starcat_real best_share;               /* and the share of the frame that it explains */
   int32_t star[STARCAT_MAX_CENTROIDS];   /* row in the image, or one of the negative numbers */
 } starcat_result;
 

@@ -9,12 +9,20 @@
 #define STARCAT_MOST_CENTROIDS 32
 #define STARCAT_MOST_PAIRS (STARCAT_MOST_CENTROIDS * (STARCAT_MOST_CENTROIDS - 1) / 2)
 
+/* Nearest centroids that a centroid makes triangles with in a crowded frame. */
+#define STARCAT_NEIGHBOURS 20
+
 /* Which star each centroid of a frame is under an attitude. */
 typedef struct {
   starcat_real matrix[9];
+  starcat_real focal;      /* the camera's focal length, over the one that was given */
   starcat_real residual_rad;
-  starcat_real log_chance;
+  starcat_real log_chance; /* 0 where it is withheld */
+  starcat_real log_bound;  /* the same whether it is withheld or not */
+  starcat_real share;      /* of the frame that it explains; 1 where chance explains it */
   uint32_t n_matched;
+  uint32_t withheld;       /* a reason, 0: not withheld */
+  uint32_t is_firm;        /* whether its stars alone determine the whole frame */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, -1: none */
 } starcat_agreement;
 
@@ -29,10 +37,15 @@ struct starcat_workspace {
   starcat_real brightness[STARCAT_MAX_CENTROIDS]; /* magnitude, a large one where unknown */
   starcat_real square[STARCAT_MAX_CENTROIDS];     /* of the distance from the centre */
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
+  starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length of an attitude */
 
   /* Separations of pairs of centroids k > i, at k (k - 1) / 2 + i. */
   starcat_real separation_rad[STARCAT_MOST_PAIRS];
   uint16_t heap[STARCAT_MOST_PAIRS];
+
+  /* The nearest centroids of each one in a crowded frame, which has no separations of pairs. */
+  uint16_t neighbour[STARCAT_MAX_CENTROIDS][STARCAT_NEIGHBOURS];
+  uint32_t is_crowded;
 
   /* The stars around the field of an attitude, and where it puts them. */
   uint32_t n_near;

@@ -11,7 +11,7 @@ typedef struct {
   double fold_radius;
 } starcat_camera;
 typedef struct {
-  double tolerance_px, noise_px, noise_mag, log_chance;
+  double tolerance_px, noise_px, noise_mag, log_chance, fov_error;
   uint32_t max_steps;
 } starcat_options;
 typedef struct {
@@ -29,6 +29,10 @@ typedef struct {
   double matrix[3][3];
   double residual_rad;
   double log_chance;
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
   double seconds;
 } starcat_answer;
 typedef struct {

@@ -22,13 +22,14 @@ static double now_s(void) {
 /* Fit the attitude once more, with directions that were not rounded. */
 static void fit_again(const double *directions, starcat_memory *memory) {
   const starcat_workspace *work = &memory->work;
+  const double(*seen)[3] = work->best.focal == 1.0 ? work->body : work->scaled;
   starcat_result *result = &memory->result;
   double square = 0.0;
   uint32_t n = 0;
   for (uint32_t i = 0; i < work->count; i++) {
     if (work->best.star[i] >= 0) {
       for (size_t k = 0; k < 3u; k++) {
-        memory->body[n][k] = work->body[i][k];
+        memory->body[n][k] = seen[i][k];
         memory->icrs[n][k] = directions[3u * (size_t)work->best.star[i] + k];
       }
       n++;
@@ -47,7 +48,16 @@ static void fit_again(const double *directions, starcat_memory *memory) {
 
 /* What the library found, as Python wants it. */
 static void tell(const starcat_result *result, starcat_answer *answer) {
+  answer->n_usable = (int32_t)result->n_usable;
+  answer->reason = (int32_t)result->reason;
+  if (result->reason != STARCAT_REASON_NONE) {
+    answer->n_matched = (int32_t)result->best_n_matched;
+    answer->log_chance = result->best_log_chance;
+    answer->share = result->best_share;
+    return;
+  }
   answer->n_matched = (int32_t)result->n_matched;
+  answer->focal_length_px = result->focal_length_px;
   answer->residual_rad = result->residual_rad;
   answer->log_chance = result->log_chance;
   memcpy(answer->matrix, result->matrix, sizeof answer->matrix);
@@ -82,10 +92,10 @@ static int identify(const starcat_search *search, uint32_t count, const double *
     const int32_t row = has_stars ? result->star[i] : STARCAT_NO_STAR;
     star[i] = row < 0 ? row : search->rows[row];
   }
-  if (status == STARCAT_IDENTIFIED) {
-    if (search->directions != NULL) {
-      fit_again(search->directions, memory);
-    }
+  if ((status == STARCAT_IDENTIFIED) && (search->directions != NULL)) {
+    fit_again(search->directions, memory);
+  }
+  if (has_stars) {
     tell(result, answer);
   }
   return answer->status;

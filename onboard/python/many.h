@@ -24,7 +24,11 @@ typedef struct {
   double q_body_from_icrs[4];
   double matrix[3][3];
   double residual_rad;
-  double log_chance;
+  double log_chance; /* if not identified, of the best agreement */
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
   double seconds; /* that the library took */
 } starcat_answer;
 

@@ -48,6 +48,28 @@ int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
   return 1;
 }
 
+/* Invert a matrix of four. Returns 0 if it is not positive definite. */
+int sc_invert(const sc_information *m, sc_information *inverse) {
+  const real *c = m->with_scale;
+  real along[3], of_angles[6];
+  if (!sc_solve(m->angles, c, along, of_angles)) {
+    return 0;
+  }
+  const real left = m->scale - sc_dot(c, along);
+  if (!(left > R(0.0))) {
+    return 0;
+  }
+  const real scale = R(1.0) / left;
+  for (uint32_t i = 0, at = 0; i < 3u; i++) {
+    for (uint32_t j = i; j < 3u; j++, at++) {
+      inverse->angles[at] = of_angles[at] + scale * along[i] * along[j];
+    }
+    inverse->with_scale[i] = -scale * along[i];
+  }
+  inverse->scale = scale;
+  return 1;
+}
+
 /* Turn an attitude by the small angles w about the camera's axes (Cayley's rotation). */
 static void turn_by(real m[9], const real w[3]) {
   const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};

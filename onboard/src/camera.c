@@ -138,6 +138,39 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   return STARCAT_IDENTIFIED;
 }
 
+/* Use another focal length from now on, a multiple of the given one; the given one itself where the
+ * lens would then form no image of a centroid. */
+void sc_set_focal(sc_call *call, real focal) {
+  starcat_workspace *w = call->work;
+  if (focal == call->focal) {
+    return;
+  }
+  starcat_camera given = call->camera.given;
+  given.focal_length_px = focal * call->focal_px;
+  int good = sc_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
+  for (uint32_t i = 0; good && (i < w->count); i++) {
+    good = sc_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
+  }
+  call->focal = focal;
+  call->body = focal == R(1.0) ? w->body : w->scaled;
+  if (!good) {
+    sc_set_focal(call, R(1.0));
+  }
+}
+
+/* Fit the focal length too from now on, where its error may be above 0. */
+void sc_allow_scales(sc_call *call, real fov_error) {
+  const sc_camera *camera = &call->camera;
+  call->fov_error = fov_error;
+  call->log_scales = R(0.0);
+  call->bend = R(0.0);
+  if (fov_error > R(0.0)) {
+    const real radius_rad = STARCAT_ATAN2(camera->sin_radius, camera->cos_radius);
+    call->log_scales = R(-2.0) * STARCAT_LOG(R(1.0) - fov_error);
+    call->bend = SC_CURVATURE * fov_error * radius_rad * radius_rad;
+  }
+}
+
 void starcat_camera_of(const starcat_image *image, starcat_camera *camera) {
   camera->width_px = image->width_px;
   camera->height_px = image->height_px;

@@ -19,13 +19,15 @@
 
 static real larger(real a, real b) { return a > b ? a : b; }
 
-/* How places move as the camera turns, summed over the matched centroids: the determinant. */
-static real information_of_places(const sc_call *call) {
+/* How places move as the camera turns, summed over the matched centroids: the determinant, and
+ * that with the focal length as a fourth unknown over the one without. */
+static real information_of_places(const sc_call *call, real *of_scale) {
   const starcat_workspace *w = call->work;
-  real h[6] = {0};
+  real h[6] = {0}, cross[3] = {0}, along = R(0.0), unused[6], share[3];
   for (uint32_t i = 0; i < w->count; i++) {
     if (w->match[i] >= 0) {
-      const real x = w->body[i][0] / w->body[i][2], y = w->body[i][1] / w->body[i][2];
+      const real *body = call->body[i];
+      const real x = body[0] / body[2], y = body[1] / body[2];
       const real a = x * y, b = R(1.0) + x * x, c = R(1.0) + y * y;
       h[0] += a * a + c * c;
       h[1] -= a * (b + c);
@@ -33,25 +35,34 @@ static real information_of_places(const sc_call *call) {
       h[3] += b * b + a * a;
       h[4] += a * x - b * y;
       h[5] += x * x + y * y;
+      along += x * x + y * y;
+      cross[0] += y * (b + y * y);
+      cross[1] -= x * (b + y * y);
     }
   }
+  *of_scale = sc_solve(h, cross, share, unused) ? along - sc_dot(cross, share) : R(0.0);
   return h[0] * (h[3] * h[5] - h[4] * h[4]) + h[1] * (h[2] * h[4] - h[1] * h[5]) +
          h[2] * (h[1] * h[4] - h[2] * h[3]);
 }
 
-/* Logarithm of the volume of the unit ball in 2 n - 3 dimensions, where n is at least 2: by
- * Gamma(k + 1/2) = (2 k)! sqrt(pi) / (4^k k!) with k = n - 1. */
-static real log_unit_ball(uint32_t n) {
+/* Logarithm of the volume of the unit ball in 2 n - 3 dimensions, where n is at least 2, by
+ * Gamma(k + 1/2) = (2 k)! sqrt(pi) / (4^k k!) with k = n - 1; or in 2 n - 4 dimensions. */
+static real log_unit_ball(uint32_t n, uint32_t unknowns) {
   const uint32_t k = n - 1u;
+  if (unknowns > 3u) {
+    return (real)(n - 2u) * LOG_PI - sc_log_factorial(n - 2u);
+  }
   return (real)(k - 1u) * LOG_PI - sc_log_factorial(2u * k) + sc_log_factorial(k) +
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
-/* Logarithm of the expected number of agreements of n centroids. */
-static real log_expected(const sc_call *call, uint32_t n, real square_px, real log_information) {
-  return sc_log_ways(call, n) + LOG_ALL_ATTITUDES + R(3.0) * call->camera.log_focal +
-         R(0.5) * log_information + log_unit_ball(n) +
-         R(0.5) * (real)(2u * n - 3u) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
+/* Logarithm of the expected number of agreements of n centroids, by the number of unknowns that
+ * are fitted: three angles, and the focal length. */
+static real log_expected(const sc_call *call, uint32_t n, real square_px, real log_information,
+                         uint32_t unknowns) {
+  return sc_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
+         R(0.5) * log_information + log_unit_ball(n, unknowns) +
+         R(0.5) * (real)(2u * n - unknowns) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
          (real)n * call->camera.log_area;
 }
 
@@ -67,7 +78,7 @@ static real log_share(const sc_call *call, uint32_t n, uint32_t most) {
   real total = R(0.0), share = R(1.0);
   while ((typical < most) &&
          (log_expected(call, typical, (real)(2u * typical - 3u) * square_px,
-                       R(3.0) * STARCAT_LOG((real)typical) + log_spread) > LOG_NEARLY_CERTAIN)) {
+                       R(3.0) * STARCAT_LOG((real)typical) + log_spread, 3) > LOG_NEARLY_CERTAIN)) {
     typical++;
   }
   for (uint32_t distance = 0; distance <= most - SC_MIN_STARS; distance++) {
@@ -78,82 +89,126 @@ static real log_share(const sc_call *call, uint32_t n, uint32_t most) {
   return (real)(n > typical ? n - typical : typical - n) * LOG_NEXT_SHARE - STARCAT_LOG(total);
 }
 
+/* Logarithm of the sum of two numbers whose logarithms are given. */
+static real log_of_sum(real a, real b) {
+  const real most = larger(a, b), apart = most - (a < b ? a : b);
+  return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / sc_exponential(apart)) : most;
+}
+
 /* Logarithm of the bound; 0 if it says nothing. */
 real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched) {
   const starcat_workspace *w = call->work;
   const uint32_t fewer = w->count < w->n_within ? w->count : w->n_within;
   const int is_stated = call->noise_px > R(0.0);
-  const real information = information_of_places(call);
+  real of_scale;
+  const real information = information_of_places(call, &of_scale);
   if (!(information > R(0.0))) {
     return R(0.0);
   }
   sc_count_ways(call, is_stated ? fewer : n_matched);
-  const real expected = log_expected(call, n_matched, square_px, STARCAT_LOG(information)) -
-                        (is_stated ? log_share(call, n_matched, fewer)
-                                   : -STARCAT_LOG((real)(w->count - 3u)));
+  real expected = log_expected(call, n_matched, square_px, STARCAT_LOG(information), 3);
+  if ((call->log_scales > R(0.0)) && (of_scale > R(0.0))) {
+    expected = log_of_sum(expected, STARCAT_LOG(call->log_scales) +
+                                        log_expected(call, n_matched, square_px,
+                                                     STARCAT_LOG(information * of_scale), 4));
+  }
+  expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(w->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
 }
 
-/* Add the information that a direction gives about an attitude (Shuster and Oh 1981). */
-static void inform(real h[6], const real b[3]) {
-  h[0] += R(1.0) - b[0] * b[0];
-  h[1] -= b[0] * b[1];
-  h[2] -= b[0] * b[2];
-  h[3] += R(1.0) - b[1] * b[1];
-  h[4] -= b[1] * b[2];
-  h[5] += R(1.0) - b[2] * b[2];
+/* Add the information that a direction gives about an attitude (Shuster and Oh 1981) and about the
+ * focal length. */
+void sc_inform(sc_information *h, const real b[3]) {
+  const real square = b[2] * b[2];
+  h->angles[0] += R(1.0) - b[0] * b[0];
+  h->angles[1] -= b[0] * b[1];
+  h->angles[2] -= b[0] * b[2];
+  h->angles[3] += R(1.0) - b[1] * b[1];
+  h->angles[4] -= b[1] * b[2];
+  h->angles[5] += R(1.0) - square;
+  h->with_scale[0] -= b[1] * b[2];
+  h->with_scale[1] += b[0] * b[2];
+  h->scale += square * (R(1.0) - square);
 }
 
-/* Three over the trace of the product of two symmetric matrices. */
-static real share_of(const real c[6], const real h[6]) {
-  return R(3.0) / (c[0] * h[0] + c[3] * h[3] + c[5] * h[5] +
-                   R(2.0) * (c[1] * h[1] + c[2] * h[2] + c[4] * h[4]));
+/* Trace of the product of two matrices. */
+static real trace(const sc_information *a, const sc_information *b) {
+  const real *c = a->angles, *h = b->angles;
+  return c[0] * h[0] + c[3] * h[3] + c[5] * h[5] +
+         R(2.0) * (c[1] * h[1] + c[2] * h[2] + c[4] * h[4] + sc_dot(a->with_scale, b->with_scale)) +
+         a->scale * b->scale;
 }
 
 /* Error of the worst corner, in units of the error of a direction along one axis. */
-static real corner_deviation(const real c[6], const sc_camera *camera) {
+static real corner_deviation(const sc_information *covariance, const sc_camera *camera) {
   real worst = R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
-    const real *b = camera->corner[n];
-    const real along = c[0] * b[0] * b[0] + c[3] * b[1] * b[1] + c[5] * b[2] * b[2] +
-                       R(2.0) * (c[1] * b[0] * b[1] + c[2] * b[0] * b[2] + c[4] * b[1] * b[2]);
-    worst = larger(worst, c[0] + c[3] + c[5] - along);
+    sc_information h = {{0}, {0}, R(0.0)};
+    sc_inform(&h, camera->corner[n]);
+    worst = larger(worst, trace(covariance, &h));
   }
   return STARCAT_SQRT(worst);
 }
 
-/* Share of the frame that an attitude explains, by weight; 0 if it determines no attitude. */
-real sc_share(const sc_call *call, const real m[9], real residual_rad, uint32_t n_matched) {
+/* What the covariance is without the focal length. Returns 0 if it determines no attitude. */
+static int invert_angles(const sc_information *matched, sc_information *covariance) {
+  const sc_information none = {{0}, {0}, R(0.0)};
+  real unused[3];
+  *covariance = none;
+  return sc_solve(matched->angles, matched->with_scale, unused, covariance->angles);
+}
+
+/* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
+ * whether its stars determine the whole frame, even where the focal length is not trusted. */
+void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found) {
   const starcat_workspace *w = call->work;
-  real matched[6] = {0}, centroids[6] = {0}, stars[6] = {0}, covariance[6], unused[3];
+  const real n = (real)found->n_matched;
+  sc_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
+  sc_information own, with_scale;
+  const int has_scale = call->fov_error > R(0.0);
   for (uint32_t i = 0; i < w->count; i++) {
-    inform(centroids, w->body[i]);
+    sc_inform(&centroids, call->body[i]);
     if (w->match[i] >= 0) {
-      inform(matched, w->body[i]);
+      sc_inform(&matched, call->body[i]);
     }
+  }
+  const int is_whole = sc_invert(&matched, &with_scale);
+  real corner = R(0.0);
+  found->is_firm = 0;
+  if (is_whole) {
+    corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(4.0))) *
+             corner_deviation(&with_scale, &call->camera);
+    found->is_firm = corner <= SC_SURE_CORNER * tolerance_rad;
+  }
+  if (found->n_matched >= w->n_within) {
+    return;
+  }
+  found->share = R(0.0);
+  if (has_scale ? !is_whole : !invert_angles(&matched, &own)) {
+    return;
   }
   for (uint32_t j = 0; j < w->n_within; j++) {
     real body[3];
     sc_turn(m, w->near_icrs[w->within[j]], body);
-    inform(stars, body);
+    sc_inform(&stars, body);
   }
-  if (!sc_solve(matched, call->camera.corner[0], unused, covariance)) {
-    return R(0.0);
+  const sc_information *covariance = has_scale ? &with_scale : &own;
+  const real unknowns = has_scale ? R(4.0) : R(3.0);
+  const real of_centroids = unknowns / trace(covariance, &centroids);
+  found->share = unknowns / trace(covariance, &stars);
+  if (of_centroids > found->share) {
+    if (!has_scale) {
+      corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(3.0))) *
+               corner_deviation(covariance, &call->camera);
+    }
+    if (!(corner > call->tolerance_rad)) {
+      found->share = of_centroids;
+    }
   }
-  const real of_stars = share_of(covariance, stars);
-  const real of_centroids = share_of(covariance, centroids);
-  if (of_centroids <= of_stars) {
-    return of_stars;
-  }
-  /* Three of the 2 n components went into the attitude. */
-  const real deviation =
-      residual_rad * STARCAT_SQRT((real)n_matched / (real)(2u * n_matched - 3u));
-  const real corner = deviation * corner_deviation(covariance, &call->camera);
-  return corner > call->tolerance_rad ? of_stars : of_centroids;
 }
 
 /* Whether the frame differs in scale from the stars that it matches: a wrong focal length. */
-int sc_is_scaled(const sc_call *call, uint32_t n_matched) {
+int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px) {
   const starcat_workspace *w = call->work;
   const real n = (real)n_matched;
   real mean_x = R(0.0), mean_y = R(0.0), off_x = R(0.0), off_y = R(0.0);
@@ -180,7 +235,7 @@ int sc_is_scaled(const sc_call *call, uint32_t n_matched) {
       STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                    call->camera.half_height * call->camera.half_height);
   const real moved = excess < R(0.0) ? -excess * corner_px : excess * corner_px;
-  if (!(moved > call->tolerance_px)) {
+  if (!(moved > tolerance_px)) {
     return 0;
   }
   for (uint32_t i = 0; i < w->count; i++) {

@@ -5,6 +5,7 @@
 #include "internal.h"
 
 #define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
+#define WIDEST_FOV_ERROR R(0.5)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
 void starcat_default_options(starcat_options *options) {
@@ -12,6 +13,7 @@ void starcat_default_options(starcat_options *options) {
   options->noise_px = R(0.0);
   options->noise_mag = R(0.0);
   options->log_chance = LOG_CERTAIN;
+  options->fov_error = R(0.0);
   options->max_steps = 4000000u;
 }
 
@@ -19,10 +21,11 @@ static int is_finite(real x) { return x - x == R(0.0); }
 
 static starcat_status check_options(const starcat_options *o) {
   if (!is_finite(o->tolerance_px) || !is_finite(o->noise_px) || !is_finite(o->noise_mag) ||
-      !is_finite(o->log_chance)) {
+      !is_finite(o->log_chance) || !is_finite(o->fov_error)) {
     return STARCAT_E_NOT_FINITE;
   }
   if ((o->noise_px < R(0.0)) || (o->noise_mag < R(0.0)) || (o->max_steps == 0u) ||
+      (o->fov_error < R(0.0)) || (o->fov_error > WIDEST_FOV_ERROR) ||
       ((o->noise_px <= R(0.0)) && (o->tolerance_px <= R(0.0)))) {
     return STARCAT_E_OPTIONS;
   }
@@ -111,6 +114,9 @@ static void set_limits(sc_call *call, const starcat_options *options) {
   call->tolerance_px = options->noise_px > R(0.0) ? SC_SIGMAS_OF_TOLERANCE * options->noise_px
                                                   : options->tolerance_px;
   call->noise_px = options->noise_px;
+  call->focal = R(1.0);
+  call->focal_px = call->camera.given.focal_length_px;
+  sc_allow_scales(call, options->fov_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = SC_REACH * call->tolerance_px;
   call->mag_reach = w->has_magnitudes != 0u ? SC_MAG_DEVIATIONS * options->noise_mag : R(0.0);
@@ -136,6 +142,11 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   result->steps = 0;
   result->n_tried = 0;
   result->log_chance = R(0.0);
+  result->reason = STARCAT_REASON_NONE;
+  result->n_usable = 0;
+  result->best_n_matched = 0;
+  result->best_log_chance = R(0.0);
+  result->best_share = R(0.0);
   if ((frame->count > 0u) && ((frame->x_px == NULL) || (frame->y_px == NULL))) {
     return STARCAT_E_NULL;
   }
@@ -155,7 +166,11 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   work->n_tried = 0;
   work->steps_left = options->max_steps;
   work->best.log_chance = R(0.0);
+  work->best.log_bound = R(0.0);
   work->best.n_matched = 0;
+  work->best.withheld = 0;
+  work->best.share = R(0.0);
+  call->body = work->body;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
     if (result->star[i] == STARCAT_NO_STAR) {
@@ -170,21 +185,44 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
     }
   }
   set_limits(call, options);
-  return work->count < SC_MIN_STARS ? STARCAT_TOO_FEW_STARS : STARCAT_IDENTIFIED;
+  result->n_usable = work->count;
+  if (work->count < SC_MIN_STARS) {
+    result->reason = STARCAT_REASON_TOO_FEW_STARS;
+    return STARCAT_TOO_FEW_STARS;
+  }
+  return STARCAT_IDENTIFIED;
 }
 
-starcat_status sc_end(const sc_call *call, const starcat_options *options, starcat_result *result) {
+/* Say why there is no answer, and how good the best agreement was. */
+static void refuse(const sc_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
+  result->best_n_matched = w->best.n_matched;
+  result->best_log_chance = w->best.log_bound;
+  result->best_share = w->best.share;
+  if (w->steps_left == 0u) {
+    result->reason = STARCAT_REASON_STEPS;
+  } else if (w->n_tried == 0u) {
+    result->reason = STARCAT_REASON_NO_CANDIDATE;
+  } else {
+    result->reason = w->best.withheld != 0u ? w->best.withheld : STARCAT_REASON_CHANCE;
+  }
+}
+
+starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result) {
+  starcat_workspace *w = call->work;
   result->steps = options->max_steps - w->steps_left;
   result->n_tried = w->n_tried;
   if ((w->best.n_matched < SC_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
+    refuse(call, result);
     return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
   }
+  sc_set_focal(call, w->best.focal);
   sc_quaternion(w->best.matrix, result->q_body_from_icrs);
   sc_matrix(result->q_body_from_icrs, result->matrix);
   result->residual_rad = w->best.residual_rad;
   result->log_chance = w->best.log_chance;
   result->n_matched = w->best.n_matched;
+  result->focal_length_px = call->camera.given.focal_length_px;
   for (uint32_t i = 0; i < w->count; i++) {
     result->star[w->row[i]] = w->best.star[i];
   }

@@ -138,7 +138,7 @@ static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t
     return 0;
   }
   p->is_stale = 1;
-  return sc_try(call, m);
+  return sc_try(call, m, R(1.0));
 }
 
 /* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if

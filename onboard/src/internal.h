@@ -25,6 +25,12 @@
 #define SC_MIN_SHARE (R(1.0) / R(3.0))
 #define SC_SURE_SHARE (R(2.0) / R(3.0))
 #define SC_REACH R(1.5)          /* largest distance of a match, in tolerances */
+#define SC_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
+#define SC_SURE_CORNER R(0.5)    /* largest error of a corner that firm stars leave, tolerances */
+#define SC_OTHER_SCALES R(0.05)  /* errors of the focal length that are looked for */
+#define SC_FOCAL_MARGIN R(0.02)  /* of the field's radius, where the focal length is fitted */
+#define SC_OVER_CHANCE R(2.0)    /* of the centroids within a smaller reach, over its area's share */
+#define SC_CURVATURE (R(2.0) / R(3.0))
 #define SC_REFINEMENTS 4u
 #define SC_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
 #define SC_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
@@ -35,6 +41,8 @@
 #define SC_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
 #define SC_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define SC_FEW_CENTROIDS 12u
+#define SC_SPREAD_CENTROIDS 400u /* that make triangles with their neighbours, the first ones */
+#define SC_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
 
 /* A camera as a call uses it. */
 typedef struct {
@@ -46,10 +54,15 @@ typedef struct {
   int distorted;
 } sc_camera;
 
-/* One call: what does not change while it lasts. */
+/* One call. Where the focal length is fitted, the camera and the directions of the centroids are
+ * those of the attitude that is tried; the rest does not change while it lasts. */
 typedef struct {
   const starcat_image *image;
   sc_camera camera;
+  real (*body)[3];
+  real focal, focal_px; /* of the camera over the given one; the given one, pixels */
+  real fov_error;       /* largest relative error of the focal length; 0: it is known */
+  real log_scales, bend;
   real tolerance_px, tolerance_rad, reach_px;
   real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
   real mag_reach; /* largest difference of magnitudes of a match; 0: any */
@@ -57,6 +70,14 @@ typedef struct {
   real log_certain;
   starcat_workspace *work;
 } sc_call;
+
+/* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles, how the logarithm of the
+ * focal length goes with each of them, and its own. */
+typedef struct {
+  real angles[6];
+  real with_scale[3];
+  real scale;
+} sc_information;
 
 /* The direction of a star. */
 static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3]) {
@@ -69,6 +90,7 @@ static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3
 /* attitude.c */
 int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]);
 int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
+int sc_invert(const sc_information *m, sc_information *inverse);
 void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
                uint32_t count, uint32_t most);
 void sc_quaternion(const real m[9], real q[4]);
@@ -76,6 +98,8 @@ void sc_matrix(const real q[4], real m[9]);
 
 /* camera.c */
 starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera);
+void sc_set_focal(sc_call *call, real focal);
+void sc_allow_scales(sc_call *call, real fov_error);
 int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]);
 int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px);
 
@@ -85,25 +109,27 @@ uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real s
 
 /* ways.c */
 real sc_log_factorial(uint32_t n);
+real sc_exponential(real x);
 void sc_count_ways(const sc_call *call, uint32_t most);
 real sc_log_ways(const sc_call *call, uint32_t n);
 
 /* chance.c */
 real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);
-real sc_share(const sc_call *call, const real m[9], real residual_rad, uint32_t n_matched);
-int sc_is_scaled(const sc_call *call, uint32_t n_matched);
+void sc_inform(sc_information *h, const real b[3]);
+void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found);
+int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
 int sc_spend(starcat_workspace *work, uint32_t steps);
 int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row);
-int sc_try(sc_call *call, const real m[9]);
+int sc_try(sc_call *call, const real m[9], real focal);
 void sc_project(const sc_call *call, const real m[9], real margin_px);
 
 /* frame.c */
 starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
                         const starcat_options *options, const starcat_frame *frame,
                         starcat_workspace *work, starcat_result *result);
-starcat_status sc_end(const sc_call *call, const starcat_options *options, starcat_result *result);
+starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result);
 
 /* triangles.c, pyramids.c */
 typedef int (*sc_look_up)(sc_call *call, const uint32_t triple[3], const real sides[3]);

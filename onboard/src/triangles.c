@@ -5,6 +5,8 @@
 #include "internal.h"
 
 #define BLOCK 16u
+#define PART R(1.02)       /* areas that are looked up together, the largest over the least */
+#define LEAST_PART R(1e-3) /* of the largest area that is looked up at all */
 
 /* What the triangles of one frame are tried with. */
 typedef struct {
@@ -12,6 +14,7 @@ typedef struct {
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
   int poor; /* in the second round, those that the first has left out */
+  uint32_t left; /* triangles that may still be looked up */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -19,7 +22,9 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
 }
 
 real sc_side(const sc_call *call, uint32_t i, uint32_t j) {
-  return call->work->separation_rad[pair_of(i, j)];
+  const starcat_workspace *w = call->work;
+  return w->is_crowded != 0u ? sc_angle_of_chord(sc_chord_square(w->body[i], w->body[j]))
+                             : w->separation_rad[pair_of(i, j)];
 }
 
 /* Whether a triangle has no side as short as `least` and no angle as narrow as one of a cosine
@@ -41,7 +46,7 @@ static int is_well_shaped(const real sides[3], real least, real cosine) {
 }
 
 /* Look a triangle up if it is of this round. Returns 1 if the search can end. */
-static int take(sc_call *call, const search *s, uint32_t i, uint32_t j, uint32_t k) {
+static int take(sc_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
   const uint32_t triple[3] = {i, j, k};
   const real sides[3] = {sc_side(call, j, k), sc_side(call, i, k), sc_side(call, i, j)};
   const int good = is_well_shaped(sides, s->least_side_rad, SC_COS_MIN_ANGLE);
@@ -54,6 +59,10 @@ static int take(sc_call *call, const search *s, uint32_t i, uint32_t j, uint32_t
   if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, SC_COS_LEAST_ANGLE)) {
     return 0;
   }
+  if (s->left == 0u) {
+    return 1;
+  }
+  s->left--;
   return s->look_up(call, triple, sides);
 }
 
@@ -66,7 +75,7 @@ static void separate(sc_call *call, uint32_t k) {
 }
 
 /* Triangles by brightness: those whose faintest centroid is the brightest come first. */
-static int by_brightness(sc_call *call, const search *s) {
+static int by_brightness(sc_call *call, search *s) {
   for (uint32_t k = 0; k < s->count; k++) {
     if (s->poor == 0) {
       separate(call, k);
@@ -107,7 +116,7 @@ static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
 }
 
 /* All triangles whose longest side is that of a pair. */
-static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
+static int with_longest_side(sc_call *call, search *s, uint16_t pair) {
   const starcat_workspace *w = call->work;
   uint32_t q = 1;
   while ((q + 1u) * q / 2u <= pair) {
@@ -128,7 +137,7 @@ static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
 
 /* Triangles by their longest side, the shortest first: the most fields hold these whole. The
  * pairs are sorted no further than they are needed. */
-static int by_longest_side(sc_call *call, const search *s) {
+static int by_longest_side(sc_call *call, search *s) {
   starcat_workspace *w = call->work;
   uint32_t count = s->count * (s->count - 1u) / 2u;
   if (s->poor == 0) {
@@ -157,10 +166,86 @@ static int by_longest_side(sc_call *call, const search *s) {
   return 0;
 }
 
-void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+/* List the nearest centroids of one, the nearest first. Returns how many. */
+static uint32_t list_neighbours(sc_call *call, uint32_t i, uint32_t count) {
+  starcat_workspace *w = call->work;
+  real square[STARCAT_NEIGHBOURS];
+  uint32_t n = 0;
+  for (uint32_t k = 0; k < count; k++) {
+    const real apart = sc_chord_square(w->body[i], w->body[k]);
+    if ((k == i) || ((n == STARCAT_NEIGHBOURS) && !(apart < square[n - 1u]))) {
+      continue;
+    }
+    uint32_t at = n < STARCAT_NEIGHBOURS ? n++ : n - 1u;
+    while ((at > 0u) && (apart < square[at - 1u])) {
+      square[at] = square[at - 1u];
+      w->neighbour[i][at] = w->neighbour[i][at - 1u];
+      at--;
+    }
+    square[at] = apart;
+    w->neighbour[i][at] = (uint16_t)k;
+  }
+  return n;
+}
+
+/* Whether two centroids are neighbours of a third, of ranks that come before others: then their
+ * triangle has been taken. */
+static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, uint32_t b,
+                      uint32_t first, uint32_t second, int is_before) {
+  uint32_t low = STARCAT_NEIGHBOURS, high = STARCAT_NEIGHBOURS;
+  for (uint32_t n = 0; n <= second; n++) {
+    const uint32_t one = w->neighbour[owner][n];
+    if ((one == a) || (one == b)) {
+      high = low < STARCAT_NEIGHBOURS ? n : high;
+      low = low < STARCAT_NEIGHBOURS ? low : n;
+    }
+  }
+  if (high == STARCAT_NEIGHBOURS) {
+    return 0;
+  }
+  return (high < second) || (low < first) || ((low == first) && (is_before != 0));
+}
+
+/* Triangles of near centroids from all over a crowded frame: every centroid's two nearest
+ * neighbours, then of every centroid the first and third nearest, the second and third, and so on.
+ * A database holds the triangles of the brightest stars of its fields; in one place of a crowded
+ * frame most are of the same few stars. */
+static int by_neighbours(sc_call *call, search *s) {
   const starcat_workspace *w = call->work;
-  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0};
-  s.least_side_rad = SC_MIN_SIDE_PX / call->camera.given.focal_length_px;
+  uint32_t most = 0;
+  for (uint32_t i = 0; i < s->count; i++) {
+    most = list_neighbours(call, i, s->count);
+    if (!sc_spend(call->work, s->count)) {
+      return 1;
+    }
+  }
+  for (uint32_t second = 1; second < most; second++) {
+    for (uint32_t first = 0; first < second; first++) {
+      for (uint32_t i = 0; i < s->count; i++) {
+        const uint32_t a = w->neighbour[i][first], b = w->neighbour[i][second];
+        const uint32_t low = a < b ? a : b, high = a < b ? b : a;
+        if (!is_earlier(w, a, i, b, first, second, a < i) &&
+            !is_earlier(w, b, i, a, first, second, b < i) &&
+            (take(call, s, i < low ? i : low, i < low ? low : (i < high ? i : high),
+                  i < high ? high : i) != 0)) {
+          return 1;
+        }
+      }
+    }
+  }
+  return 0;
+}
+
+void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+  starcat_workspace *w = call->work;
+  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0, SC_MOST_TRIANGLES};
+  s.least_side_rad = SC_MIN_SIDE_PX / call->focal_px;
+  w->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (w->has_magnitudes == 0u);
+  if (w->is_crowded != 0u) {
+    s.count = s.count < SC_SPREAD_CENTROIDS ? s.count : SC_SPREAD_CENTROIDS;
+    (void)by_neighbours(call, &s);
+    return;
+  }
   if (s.count > STARCAT_MOST_CENTROIDS) {
     s.count = STARCAT_MOST_CENTROIDS;
   }
@@ -212,6 +297,7 @@ void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, ui
 typedef struct {
   uint32_t triple[3];
   real low[3], high[3]; /* squares of the chords that each side may be */
+  real sides[3], error, slack; /* of the sides; of the scale */
   int is_right_handed;
 } observed;
 
@@ -225,9 +311,44 @@ static void observe(const sc_call *call, const uint32_t triple[3], const real si
     o->triple[n] = triple[n];
     o->low[n] = low * low;
     o->high[n] = high * high;
+    o->sides[n] = sides[n];
   }
+  const real least = sides[0] < sides[1] ? sides[0] : sides[1];
+  o->error = error;
+  o->slack = error / (least < sides[2] ? least : sides[2]);
   sc_cross(w->body[triple[0]], w->body[triple[1]], normal);
   o->is_right_handed = sc_dot(normal, w->body[triple[2]]) > R(0.0);
+}
+
+/* Directions as a camera with a multiple of the focal length sees them. */
+static void scale_to(real body[3][3], real focal) {
+  for (uint32_t n = 0; n < 3u; n++) {
+    real *b = body[n];
+    b[2] *= focal;
+    const real scale = R(1.0) / STARCAT_SQRT(sc_dot(b, b));
+    b[0] *= scale;
+    b[1] *= scale;
+    b[2] *= scale;
+  }
+}
+
+static real around(real v[3][3]) {
+  return sc_chord_square(v[0], v[1]) + sc_chord_square(v[1], v[2]) + sc_chord_square(v[2], v[0]);
+}
+
+/* The focal length with which three centroids are as far apart as their stars; the centroids are
+ * changed to that. Twice, because angles are no tangents. */
+static real fit_scale(const sc_call *call, real body[3][3], real icrs[3][3]) {
+  const real shortest = R(1.0) - call->fov_error, apart = around(icrs);
+  real focal = R(1.0);
+  for (uint32_t n = 0; n < 2u; n++) {
+    const real before = focal;
+    focal *= STARCAT_SQRT(around(body) / apart);
+    focal = focal < shortest ? shortest : focal;
+    focal = focal * shortest > R(1.0) ? R(1.0) / shortest : focal;
+    scale_to(body, focal / before);
+  }
+  return focal;
 }
 
 /* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
@@ -235,18 +356,50 @@ static int try_order(sc_call *call, const observed *o, real stars[3][3],
                      const uint8_t order[3]) {
   const starcat_workspace *w = call->work;
   const uint32_t *t = o->triple;
-  real m[9], body[3][3], icrs[3][3];
+  real m[9], body[3][3], icrs[3][3], focal = R(1.0);
   for (uint32_t n = 0; n < 3u; n++) {
     for (uint32_t k = 0; k < 3u; k++) {
       body[n][k] = w->body[t[n]][k];
       icrs[n][k] = stars[order[n]][k];
     }
   }
+  if (call->fov_error > R(0.0)) {
+    focal = fit_scale(call, body, icrs);
+  }
   if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
   sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
-  return sc_try(call, m);
+  return sc_try(call, m, focal);
+}
+
+/* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
+ * that of least squares. */
+static int is_similar(const sc_call *call, const observed *o, const real apart[3],
+                      const uint8_t order[3]) {
+  const real u = apart[order[0]], v = apart[order[1]], t = apart[order[2]];
+  const real scale = (o->sides[0] * u + o->sides[1] * v + o->sides[2] * t) / (u * u + v * v + t * t);
+  const real shortest = R(1.0) - call->fov_error;
+  if (!sc_is_between(scale, shortest - o->slack, R(1.0) / shortest + o->slack)) {
+    return 0;
+  }
+  for (uint32_t n = 0; n < 3u; n++) {
+    const real miss = apart[order[n]] * scale - o->sides[n];
+    const real most = o->error + call->bend * o->sides[n];
+    if (!sc_is_between(miss, -most, most)) {
+      return 0;
+    }
+  }
+  return 1;
+}
+
+/* Whether the chords of stars, in an order of the corners, are those observed. */
+static int is_same(const observed *o, const real chords[3], const uint8_t order[3]) {
+  int fits = 1;
+  for (uint32_t n = 0; n < 3u; n++) {
+    fits = fits && sc_is_between(chords[order[n]], o->low[n], o->high[n]);
+  }
+  return fits;
 }
 
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
@@ -267,13 +420,13 @@ static int compare(sc_call *call, const observed *o, uint32_t feature) {
   chords[2] = sc_chord_square(stars[0], stars[1]);
   sc_cross(stars[0], stars[1], normal);
   const int is_right_handed = sc_dot(normal, stars[2]) > R(0.0);
+  const int has_scale = call->fov_error > R(0.0);
+  for (uint32_t n = 0; has_scale && (n < 3u); n++) {
+    chords[n] = sc_angle_of_chord(chords[n]);
+  }
   for (uint32_t k = 0; k < 6u; k++) {
     const uint8_t *order = orders[k];
-    int fits = 1;
-    for (uint32_t n = 0; n < 3u; n++) {
-      const real chord = chords[order[n]];
-      fits = fits && (chord >= o->low[n]) && (chord <= o->high[n]);
-    }
+    const int fits = has_scale ? is_similar(call, o, chords, order) : is_same(o, chords, order);
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed)) {
@@ -318,23 +471,14 @@ static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
   return found != 0u;
 }
 
-/* Look up the triangles of stars with the area and circumradius of an observed one. */
-int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]) {
+/* Compare the triangles of stars of some areas and circumradii. Returns 1 if the search can end. */
+static int look_up(sc_call *call, const observed *o, const real area[2], const real radius[2]) {
   const starcat_image *image = call->image;
-  real area, area_error, radius, radius_error;
-  uint32_t start, stop;
-  observed o;
-  features_of(sides, SC_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
-              &radius_error);
-  sc_rows_between(image, area - area_error, area + area_error, &start, &stop);
-  if (start >= stop) {
-    return 0;
-  }
-  observe(call, triple, sides, &o);
   const real quantum = image->radius_quantum_rad;
-  const uint16_t low = quantised(radius - radius_error - quantum, quantum);
-  const uint16_t width =
-      (uint16_t)(quantised(radius + radius_error + R(2.0) * quantum, quantum) - low);
+  const uint16_t low = quantised(radius[0] - quantum, quantum);
+  const uint16_t width = (uint16_t)(quantised(radius[1] + R(2.0) * quantum, quantum) - low);
+  uint32_t start, stop;
+  sc_rows_between(image, area[0], area[1], &start, &stop);
   for (uint32_t row = start; row < stop; row += BLOCK) {
     const uint32_t count = stop - row < BLOCK ? stop - row : BLOCK;
     if (!sc_spend(call->work, count)) {
@@ -342,11 +486,57 @@ int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]) {
     }
     if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
       for (uint32_t n = 0; n < count; n++) {
-        if (((uint16_t)(image->radii[row + n] - low) <= width) && compare(call, &o, row + n)) {
+        if (((uint16_t)(image->radii[row + n] - low) <= width) && compare(call, o, row + n)) {
           return 1;
         }
       }
     }
   }
   return 0;
+}
+
+/* Look up the triangles of stars that an observed one is similar to: area over squared circumradius
+ * is the same, so that an area tells the circumradius. Returns 1 if the search can end. */
+static int look_up_similar(sc_call *call, const observed *o, real area, real area_error,
+                           real radius) {
+  const real shortest = R(1.0) - call->fov_error, error = o->error;
+  const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
+  const real shape = area / (radius * radius);
+  const real scale = R(0.375) / (area * area);
+  const real x = scale * a * (b * b + c * c - a * a) - R(2.0) / a;
+  const real y = scale * b * (a * a + c * c - b * b) - R(2.0) / b;
+  const real z = scale * c * (a * a + b * b - c * c) - R(2.0) / c;
+  const real shape_error = shape * (error * STARCAT_SQRT(x * x + y * y + z * z) +
+                                    R(3.0) * o->slack * o->slack);
+  const real thinnest = shape - shape_error;
+  const real end = (area + area_error) / (shortest * shortest);
+  real part[2], radii[2];
+  part[0] = (area - area_error) * shortest * shortest;
+  part[0] = part[0] > LEAST_PART * end ? part[0] : LEAST_PART * end;
+  while (part[0] < end) {
+    part[1] = part[0] * PART;
+    part[1] = part[1] < end ? part[1] : end;
+    radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
+    radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
+    if (look_up(call, o, part, radii)) {
+      return 1;
+    }
+    part[0] = part[1];
+  }
+  return 0;
+}
+
+/* Look up the triangles of stars with the area and circumradius of an observed one. */
+int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]) {
+  real area, area_error, radius, radius_error;
+  observed o;
+  features_of(sides, SC_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
+              &radius_error);
+  observe(call, triple, sides, &o);
+  if (call->fov_error > R(0.0)) {
+    return look_up_similar(call, &o, area, area_error, radius);
+  }
+  const real areas[2] = {area - area_error, area + area_error};
+  const real radii[2] = {radius - radius_error, radius + radius_error};
+  return look_up(call, &o, areas, radii);
 }

@@ -102,66 +102,138 @@ static int is_as_before(starcat_workspace *w) {
   return same;
 }
 
-/* Refine the attitude on all matches. */
-static void refine(starcat_workspace *w, real m[9]) {
-  uint16_t which[STARCAT_MAX_CENTROIDS];
+/* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
+ * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
+static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*icrs)[3],
+                   const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
+  if (call->fov_error > R(0.0)) {
+    sc_information h = {{0}, {0}, R(0.0)};
+    real turn[3] = {0}, shrink = R(0.0), along[3], unused[6], step = R(0.0);
+    for (uint32_t i = 0; i < n; i++) {
+      const real *b = call->body[of[i]];
+      real a[3], left[3], moved[3];
+      sc_turn(m, icrs[which != NULL ? which[i] : i], a);
+      for (uint32_t k = 0; k < 3u; k++) {
+        left[k] = b[k] - a[k];
+      }
+      sc_cross(a, left, moved);
+      for (uint32_t k = 0; k < 3u; k++) {
+        turn[k] += moved[k];
+      }
+      shrink += b[2] * b[2] * sc_dot(b, left) - b[2] * left[2];
+      sc_inform(&h, b);
+    }
+    if (sc_solve(h.angles, h.with_scale, along, unused)) {
+      const real of_scale = h.scale - sc_dot(h.with_scale, along);
+      if (of_scale > R(0.0)) {
+        step = (shrink - sc_dot(along, turn)) / of_scale;
+      }
+    }
+    step = step > R(1.0) ? R(1.0) : (step < R(-1.0) ? R(-1.0) : step);
+    real focal = call->focal * sc_exponential(step);
+    const real shortest = R(1.0) - call->fov_error;
+    focal = focal < shortest ? shortest : focal;
+    sc_set_focal(call, focal * shortest > R(1.0) ? R(1.0) / shortest : focal);
+  }
+  for (uint32_t i = 0; i < n; i++) {
+    body[i][0] = call->body[of[i]][0];
+    body[i][1] = call->body[of[i]][1];
+    body[i][2] = call->body[of[i]][2];
+  }
+  sc_refine(m, &body[0][0], &icrs[0][0], which, n, 4);
+}
+
+/* Refine on all matches. */
+static void refine_matched(sc_call *call, real m[9]) {
+  const starcat_workspace *w = call->work;
+  uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
   uint32_t n = 0;
   for (uint32_t i = 0; i < w->count; i++) {
     if (w->match[i] >= 0) {
       which[n] = w->within[w->match[i]];
-      body[n][0] = w->body[i][0];
-      body[n][1] = w->body[i][1];
-      body[n][2] = w->body[i][2];
+      of[n] = (uint16_t)i;
       n++;
     }
   }
-  sc_refine(m, &body[0][0], &w->near_icrs[0][0], which, n, 4);
+  refine(call, m, of, (const real(*)[3])w->near_icrs, which, n);
 }
 
-/* Refine an attitude on all stars that match, first within wider reaches. Returns the number of
- * matches, 0 where the stars around the field are too many or the budget is used up. */
-static uint32_t fit(const sc_call *call, real m[9], uint32_t n_wider) {
-  static const real wider[2] = {R(4.0), R(2.0)};
+/* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
+typedef struct {
+  uint32_t count;
+  real first[4];
+  real last;
+} reaches;
+
+static const reaches AS_GIVEN = {0, {0}, R(1.0)};
+static const reaches ROUGH = {1, {R(2.0)}, R(1.0)};
+static const reaches WIDER = {2, {R(4.0), R(2.0)}, R(1.0)};
+
+/* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
+ * is used up. */
+static int gather(const sc_call *call, const real m[9]) {
+  starcat_workspace *w = call->work;
+  real c = call->camera.cos_radius, s = call->camera.sin_radius;
+  if (call->fov_error > R(0.0)) {
+    const real radius_rad = (R(1.0) + SC_FOCAL_MARGIN) * STARCAT_ATAN2(s, c);
+    c = STARCAT_COS(radius_rad);
+    s = STARCAT_SIN(radius_rad);
+  }
+  w->n_near = sc_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
+  return w->n_near <= STARCAT_MAX_STARS;
+}
+
+/* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
+ * around the field are too many or the budget is used up. */
+static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
-  w->n_near = sc_gather(call, m + 6, call->camera.cos_radius, call->camera.sin_radius,
-                        STARCAT_MAX_STARS, w->near_row, w->near_icrs);
-  if (w->n_near > STARCAT_MAX_STARS) {
+  if (!gather(call, m)) {
     return 0;
   }
   for (uint32_t i = 0; i < w->count; i++) {
     w->before[i] = -2;
   }
-  for (uint32_t n = 0; n < n_wider + SC_REFINEMENTS; n++) {
-    const int is_final = n >= n_wider;
-    const real reach_px = is_final ? call->reach_px : wider[n] * call->reach_px;
-    sc_project(call, m, is_final ? call->reach_px : reach_px);
-    matched = match(call, reach_px);
+  for (uint32_t n = 0; n < r->count + SC_REFINEMENTS; n++) {
+    const int is_final = n >= r->count;
+    const real factor = is_final ? r->last : r->first[n];
+    sc_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
+    matched = match(call, factor * call->reach_px);
     if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u))) {
       return 0;
     }
     if ((matched < SC_MIN_STARS) || (is_as_before(w) && is_final)) {
       break;
     }
-    refine(w, m);
+    refine_matched(call, m);
   }
   return matched;
 }
 
-/* Judge the fit that is in the workspace. Returns the share of the frame that it explains, 1
- * where chance explains the agreement, as it is of no use there. */
-static real judge(const sc_call *call, const real m[9], uint32_t matched, starcat_agreement *found) {
+static void withhold(starcat_agreement *found, uint32_t reason) {
+  found->withheld = reason;
+  found->log_chance = R(0.0);
+}
+
+/* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
+static void judge(const sc_call *call, const real m[9], uint32_t matched, real factor,
+                  starcat_agreement *found) {
   starcat_workspace *w = call->work;
-  real square_px = R(0.0), square_rad = R(0.0), share = R(1.0);
+  real square_px = R(0.0), square_rad = R(0.0);
   for (uint32_t k = 0; k < 9u; k++) {
     found->matrix[k] = m[k];
   }
+  found->focal = call->focal;
   found->n_matched = matched;
   found->log_chance = R(0.0);
+  found->log_bound = R(0.0);
   found->residual_rad = R(0.0);
+  found->share = R(1.0);
+  found->withheld = 0;
+  found->is_firm = 1;
   if (matched < SC_MIN_STARS) {
-    return share;
+    return;
   }
   for (uint32_t i = 0; i < w->count; i++) {
     found->star[i] = STARCAT_NO_STAR;
@@ -169,22 +241,23 @@ static real judge(const sc_call *call, const real m[9], uint32_t matched, starca
       const uint32_t j = w->within[w->match[i]];
       real body[3];
       sc_turn(m, w->near_icrs[j], body);
-      square_rad += sc_chord_square(w->body[i], body);
+      square_rad += sc_chord_square(call->body[i], body);
       square_px += w->match_square[i];
       found->star[i] = (int32_t)w->near_row[j];
     }
   }
   found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
-  found->log_chance = sc_log_chance(call, square_px, matched);
-  if (found->log_chance < R(0.0)) {
-    if (matched < w->n_within) {
-      share = sc_share(call, m, found->residual_rad, matched);
-    }
-    if ((share < SC_MIN_SHARE) || sc_is_scaled(call, matched)) {
-      found->log_chance = R(0.0);
+  found->log_bound = sc_log_chance(call, square_px, matched);
+  found->log_chance = found->log_bound;
+  if (found->log_bound < R(0.0)) {
+    sc_weigh(call, m, factor * call->tolerance_rad, found);
+    if ((found->share < SC_MIN_SHARE) &&
+        !((found->is_firm != 0u) && (found->log_bound <= SC_LOG_FIRM_CHANCE))) {
+      withhold(found, STARCAT_REASON_SHARE);
+    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px)) {
+      withhold(found, STARCAT_REASON_SCALE);
     }
   }
-  return share;
 }
 
 /* List the centroids without a star that are near the star of another one. */
@@ -214,70 +287,140 @@ static void find_rivals(const sc_call *call) {
 }
 
 /* Give the star of a centroid to its rival, and fit the attitude to that. */
-static void fit_rival(const sc_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
+static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
   const starcat_workspace *w = call->work;
-  real body[STARCAT_MAX_CENTROIDS][3], icrs[STARCAT_MAX_CENTROIDS][3];
+  real icrs[STARCAT_MAX_CENTROIDS][3];
+  uint16_t of[STARCAT_MAX_CENTROIDS];
   uint32_t n = 0;
-  for (uint32_t k = 0; k < 9u; k++) {
-    m[k] = w->found.matrix[k];
-  }
   for (uint32_t i = 0; i < w->count; i++) {
     const uint32_t owner = i == rival ? centroid : i;
     if ((i != centroid) && (w->found.star[owner] >= 0)) {
       sc_star(call->image, (uint32_t)w->found.star[owner], icrs[n]);
-      body[n][0] = w->body[i][0];
-      body[n][1] = w->body[i][1];
-      body[n][2] = w->body[i][2];
+      of[n] = (uint16_t)i;
       n++;
     }
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, n, 4);
+  refine(call, m, of, (const real(*)[3])icrs, NULL, n);
+}
+
+/* Begin again from the attitude and the focal length of an agreement. */
+static void begin_at(sc_call *call, const starcat_agreement *from, real m[9]) {
+  for (uint32_t k = 0; k < 9u; k++) {
+    m[k] = from->matrix[k];
+  }
+  sc_set_focal(call, from->focal);
 }
 
 /* A false spot beside a star far from the others can turn the attitude so that it is the nearest
  * to the star itself. The star's own spot then has no star, and fits better: the first such rival is
- * taken. Returns the share of the frame that the agreement explains. */
-static real try_rivals(const sc_call *call, real share) {
+ * taken. */
+static void try_rivals(sc_call *call) {
   starcat_workspace *w = call->work;
   find_rivals(call);
   for (uint32_t n = 0; n < w->n_rivals; n++) {
     real m[9];
+    begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], w->rival_of[n], m);
-    const real its_share = judge(call, m, fit(call, m, 0), &w->wider);
+    judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
     if (w->wider.log_chance < w->found.log_chance) {
       w->found = w->wider;
-      return its_share;
+      return;
     }
   }
-  return share;
 }
 
-/* Verify an attitude; keep it if it is the best so far. Returns 1 if the search can end: the
- * agreement is certain, or the budget is used up. */
-int sc_try(sc_call *call, const real m[9]) {
+/* Whether an agreement is better than another one, be it only among those that are withheld. */
+static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
+  return (a->log_chance < b->log_chance) ||
+         (!(b->log_chance < a->log_chance) && (a->log_bound < b->log_bound));
+}
+
+/* How many of the matched centroids are within smaller reaches: halves of the one before. */
+static void count_nearer(const sc_call *call, uint32_t nearer[3]) {
+  const starcat_workspace *w = call->work;
+  for (uint32_t k = 0; k < 3u; k++) {
+    const real reach = call->reach_px / (real)(2u << k);
+    nearer[k] = 0;
+    for (uint32_t i = 0; i < w->count; i++) {
+      nearer[k] += (uint32_t)((w->match[i] >= 0) && (w->match_square[i] <= reach * reach));
+    }
+  }
+}
+
+/* Try smaller reaches where more centroids are near their stars than chance would bring there:
+ * where centroids are better than the tolerance allows, the true stars of a crowded frame are
+ * outnumbered by those that chance puts within its reach. */
+static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) {
   starcat_workspace *w = call->work;
-  const starcat_agreement *found = &w->found;
+  reaches r = {0, {R(0.5), R(0.25), R(0.125)}, R(1.0)};
+  for (uint32_t k = 0; k < 3u; k++) {
+    r.count = k;
+    r.last = r.first[k];
+    if ((nearer[k] >= SC_MIN_STARS) &&
+        ((real)nearer[k] >= SC_OVER_CHANCE * r.last * r.last * (real)count)) {
+      real m[9];
+      begin_at(call, &w->found, m);
+      judge(call, m, fit(call, m, &r), r.last, &w->wider);
+      if (is_better(&w->wider, &w->found)) {
+        w->found = w->wider;
+      }
+    }
+  }
+}
+
+/* Withhold the agreement if the frame agrees better with another focal length. */
+static void try_other_scales(sc_call *call) {
+  starcat_workspace *w = call->work;
+  const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
+                                      call->camera.half_height * call->camera.half_height);
+  real m[9];
+  begin_at(call, &w->found, m);
+  sc_allow_scales(call, SC_OTHER_SCALES);
+  judge(call, m, fit(call, m, &ROUGH), R(1.0), &w->wider);
+  sc_allow_scales(call, R(0.0));
+  const real moved = corner_px * (call->focal - R(1.0));
+  sc_set_focal(call, R(1.0));
+  if ((w->wider.log_bound < w->found.log_bound) &&
+      ((moved > call->tolerance_px) || (-moved > call->tolerance_px))) {
+    withhold(&w->found, STARCAT_REASON_SCALE);
+  }
+}
+
+/* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
+ * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
+int sc_try(sc_call *call, const real m[9], real focal) {
+  starcat_workspace *w = call->work;
+  starcat_agreement *found = &w->found;
+  const int is_scaled = call->fov_error > R(0.0);
+  uint32_t nearer[3];
   real attitude[9];
   for (uint32_t k = 0; k < 9u; k++) {
     attitude[k] = m[k];
   }
   w->n_tried++;
-  real share = judge(call, attitude, fit(call, attitude, 0), &w->found);
-  if (w->found.log_chance < R(0.0)) {
-    share = try_rivals(call, share);
+  sc_set_focal(call, focal);
+  judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
+  const uint32_t count = found->n_matched;
+  count_nearer(call, nearer);
+  if (found->log_chance < R(0.0)) {
+    try_rivals(call);
   }
-  if ((w->found.n_matched >= SC_MIN_STARS) && (share < SC_SURE_SHARE)) {
+  if (!(found->log_chance <= call->log_certain)) {
+    try_nearer(call, nearer, count);
+  }
+  if ((found->n_matched >= SC_MIN_STARS) && (found->share < SC_SURE_SHARE)) {
     /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
      * edge of a cluster may have spoilt an attitude that is nearly right. */
-    for (uint32_t k = 0; k < 9u; k++) {
-      attitude[k] = w->found.matrix[k];
-    }
-    (void)judge(call, attitude, fit(call, attitude, 2), &w->wider);
-    if (w->wider.log_chance < w->found.log_chance) {
-      found = &w->wider;
+    begin_at(call, found, attitude);
+    judge(call, attitude, fit(call, attitude, &WIDER), R(1.0), &w->wider);
+    if (w->wider.log_chance < found->log_chance) {
+      *found = w->wider;
     }
   }
-  if (found->log_chance < w->best.log_chance) {
+  if ((found->log_chance < R(0.0)) && (found->is_firm == 0u) && !is_scaled) {
+    try_other_scales(call);
+  }
+  if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
     w->best = *found;
   }
   return (w->best.log_chance <= call->log_certain) || (w->steps_left == 0u);

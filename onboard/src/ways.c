@@ -24,8 +24,8 @@ real sc_log_factorial(uint32_t n) {
          inverse * (R(1.0 / 12.0) - square * (R(1.0 / 360.0) - square * R(1.0 / 1260.0)));
 }
 
-/* Exponential of a number from 0 to 20, without another function of libm. */
-static real exponential(real x) {
+/* Exponential of a number from -1 to 20, without another function of libm. */
+real sc_exponential(real x) {
   const real y = x * R(1.0 / 256.0);
   real power = R(1.0) + y * (R(1.0) + y * (R(0.5) + y * (R(1.0 / 6.0) +
                                                         y * (R(1.0 / 24.0) + y * R(1.0 / 120.0)))));
@@ -47,7 +47,7 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
     top = numbers[i] > top ? numbers[i] : top;
   }
   const real largest =
-      is_tight ? exponential(sc_log_factorial(top) / (real)top) : (real)top;
+      is_tight ? sc_exponential(sc_log_factorial(top) / (real)top) : (real)top;
   w->log_largest[bound] = STARCAT_LOG(largest);
   sums[0] = R(1.0);
   for (uint32_t k = 1; k <= most; k++) {
@@ -56,7 +56,7 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
   for (uint32_t i = 0; i < count; i++) {
     const uint32_t own = numbers[i];
     if (own != last) { /* many are alike */
-      share = (is_tight ? exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
+      share = (is_tight ? sc_exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
       last = own;
     }
     for (uint32_t k = own > 0u ? most : 0u; k > 0u; k--) {

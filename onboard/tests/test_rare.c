@@ -59,15 +59,21 @@ static void check_degenerate(void) {
   sc_refine(m, v, v, NULL, 0, 4);
   CHECK(m[0] == (starcat_real)1.0);
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(sc_try(&call, unit_result.matrix));
+  CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
   const uint32_t n = unit_work.best.n_matched;
   CHECK(sc_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
-  CHECK(sc_share(&call, unit_work.best.matrix, (starcat_real)0.0, n) > (starcat_real)0.5);
+  starcat_agreement weighed = unit_work.best;
+  weighed.residual_rad = (starcat_real)0.0;
+  unit_work.n_within++; /* one more star than was matched, so that a share is worked out */
+  unit_work.within[unit_work.n_within - 1u] = unit_work.within[0];
+  sc_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  CHECK((weighed.share > (starcat_real)0.5) && (weighed.is_firm != 0u));
   for (uint32_t i = 0; i < unit_work.count; i++) {
     unit_work.match[i] = -1;
   }
   CHECK(sc_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
-  CHECK(sc_share(&call, unit_work.best.matrix, (starcat_real)0.0, n) <= (starcat_real)0.0);
+  sc_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  CHECK((weighed.share <= (starcat_real)0.0) && (weighed.is_firm == 0u));
 }
 
 /* Two centroids in one direction, as no frame has them, proposed as triangles of stars; and sides
@@ -314,7 +320,7 @@ static void check_noises(void) {
  * number of all ways. */
 static void check_ways(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(sc_try(&call, unit_result.matrix));
+  CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
   call.mag_reach = (starcat_real)100.0;
   sc_count_ways(&call, 5);
   const double all = (double)unit_work.log_ways[5];
@@ -463,13 +469,15 @@ static void check_clusters(void) {
       m[3u + k] = y - roll * x;
       m[6u + k] = z - turn * x;
     }
-    certain += (uint32_t)sc_try(&call, m);
-    for (uint32_t k = 0; (unit_work.best.n_matched > 0u) && (k < unit_work.count); k++) {
+    certain += (uint32_t)sc_try(&call, m, (starcat_real)1.0);
+    for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < unit_work.count); k++) {
       const int32_t star = unit_work.best.star[k];
       wrong += (uint32_t)((star >= 0) && (truth.star[unit_work.row[k]] >= 0) &&
                           (star != truth.star[unit_work.row[k]]));
     }
-    (void)sc_share(&call, m, (starcat_real)0.1, 6);
+    unit_work.found.n_matched = 6;
+    unit_work.found.residual_rad = (starcat_real)0.1;
+    sc_weigh(&call, m, call.tolerance_rad, &unit_work.found);
   }
   CHECK((certain > 40u) && (certain < 240u));
   CHECK(wrong < 4u);

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,6 +58,29 @@ TolerancePx = Annotated[
     float | None,
     typer.Option(min=0.01, max=200, help="Default: three times the position noise, or 1."),
 ]
+Ecss = Annotated[
+    Path | None,
+    typer.Option(metavar="SENSOR.toml", help="Star sensor: its figures as of ECSS-E-ST-60-20C."),
+]
+
+
+def _print_example(is_wanted: bool) -> None:
+    from starcat.evaluation.ecss.sensor import example_toml
+
+    if is_wanted:
+        typer.echo(example_toml(), nl=False)
+        raise typer.Exit
+
+
+EcssExample = Annotated[
+    bool,
+    typer.Option(
+        "--ecss-example",
+        callback=_print_example,
+        is_eager=True,
+        help="Print a sensor with every key explained.",
+    ),
+]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of records and reports.")]
 
 
@@ -79,6 +103,8 @@ def evaluate(
     tolerance_px: TolerancePx = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frames.")] = 1,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer frames.")] = False,
+    ecss: Ecss = None,
+    ecss_example: EcssExample = False,
     inputs: Input = None,
     output: Output = Path("dist/evaluation"),
     workers: Annotated[int, typer.Option(min=1, max=64, help="Processes.")] = 2,
@@ -86,9 +112,9 @@ def evaluate(
 ) -> None:
     """Measure how often simulated frames are identified, or reproduce the five papers.
 
-    Finished trials are kept in the output folder and not run again. Of several values of a
-    quantity each is tried in turn, a single value holds for all trials; without any, each
-    quantity takes its usual values.
+    Finished trials are kept in the output folder and not run again. Of several values of a quantity
+    each is tried in turn, a single one holds for all; without any, each takes its usual values.
+    With --ecss a star sensor is simulated from electrons to attitude, --frames pointings a trial.
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
@@ -101,8 +127,11 @@ def evaluate(
     values = sweep_values(
         noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, false_share=false_share,
         drop_probability=drop_probability, k1=k1, roll_deg=roll_deg, scale=scale,
-        limit_mag=limit_mag,
-    )  # fmt: skip
+        limit_mag=limit_mag)  # fmt: skip
+    if ecss is not None:
+        others = bool(values or camera or tolerance_px)
+        _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json, others)
+        return
     given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
     with progress_bars() as progress:
         if artifact is None:
@@ -116,6 +145,32 @@ def evaluate(
             )  # fmt: skip
             found = evaluate_artifact(sweep, output, workers=workers, progress=progress)
     print_evaluation(found, as_json=json)
+
+
+def _evaluate_sensor(
+    artifact: Path | None, ecss: Path, output: Path, method: str | None, frames: int | None,
+    seed: int, quick: bool, workers: int, as_json: bool, has_others: bool,
+) -> None:  # fmt: skip
+    from starcat.evaluation.ecss.pages import tables_of
+    from starcat.evaluation.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
+    from starcat.evaluation.ecss.sensor import read_sensor
+
+    if artifact is None or has_others:
+        raise ConfigError(
+            "--ecss goes with an artifact, --frames, --method, --seed, --quick, --workers and "
+            "--output only; what a sensor is tried with is in its file"
+        )
+    sensor = read_sensor(ecss)
+    with progress_bars() as progress:
+        content, page = evaluate_sensor(
+            artifact, sensor, output, method=method, seed=seed, workers=workers,
+            pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
+        )  # fmt: skip
+    checklist = tables_of(content)["checklist"]
+    rows = tuple((subject, value) for subject, _, _, value, *_ in checklist.rows)
+    short = replace(checklist, title="Star sensor", heads=("subject", "value"), rows=rows)
+    show(as_json, content, _print, short)
+    say(f"wrote {page}")
 
 
 def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:

@@ -11,13 +11,13 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from starcat.errors import StarcatError
 from starcat.evaluation.experiment import (
@@ -31,6 +31,8 @@ from starcat.evaluation.experiment import (
 from starcat.evaluation.rates import ExperimentRates, Share, failures_of, rates_of
 from starcat.evaluation.sweep import axis_label
 from starcat.progress import Progress, no_progress
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,8 @@ def run_paper(
     total = sum(frame_count(experiment) for experiment, _ in tasks)
     done = 0
     progress(paper.name, done, total)
-    with _running(tasks, place, workers) as finished:
+    calls = [(experiment, artifact, place) for experiment, artifact in tasks]
+    with side_by_side(_run, calls, workers) as finished:
         for experiment in finished:
             done += frame_count(experiment)
             progress(paper.name, done, total)
@@ -148,21 +151,19 @@ def _measured(row: Row, records: Path) -> MeasuredRow:
 
 
 @contextmanager
-def _running(
-    tasks: list[tuple[Experiment, Path]], folder: Path, workers: int
-) -> Iterator[Iterator[Experiment]]:
-    """Yield the experiments as they end; leaving the block early drops the others."""
+def side_by_side(
+    work: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: int
+) -> Iterator[Iterator[Result]]:
+    """Yield what calls return as they end; leaving the block early drops the others."""
     if workers == 1:
-        yield (_run(experiment, artifact, folder) for experiment, artifact in tasks)
+        yield (work(*call) for call in calls)
         return
     # Processes are spawned: a forked one inherits locks that the threads of libraries hold, and
     # waits for them without end.
     context, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
     try:
-        futures = [
-            pool.submit(_run, experiment, artifact, folder) for experiment, artifact in tasks
-        ]
+        futures = [pool.submit(work, *call) for call in calls]
         yield (future.result() for future in as_completed(futures))
     except BrokenProcessPool as error:
         raise StarcatError(

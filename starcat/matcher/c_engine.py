@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from importlib import import_module
 from typing import Any, overload
 
@@ -23,8 +23,9 @@ from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, Frames
+from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import MatchResult, Refusal, Status, no_match
+from starcat.matcher.result import MatchResult, Reason, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
@@ -36,19 +37,21 @@ except ImportError:  # the wheel was built without a compiler
     _onboard = None
 
 
-MAX_STEPS = 2_000_000_000
-"""Steps for one frame: on the ground the limit is the caller's patience, not a clock."""
+MAX_STEPS = 300_000_000
+"""Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
 
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
-OUT_OF_STEPS = -14
-"""What the library returns where a budget was used up."""
-
 STATUSES: dict[int, Status] = {
-    0: "identified", 1: "no_match", 2: "too_few_stars", OUT_OF_STEPS: "no_match",
+    0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match",
 }  # fmt: skip
-"""What a frame came to, by the number that the library returns."""
+"""What a frame came to, by the number that the library returns: -14 where the steps are used up."""
+
+REASONS: tuple[Reason, ...] = (
+    "chance", "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "steps",
+)  # fmt: skip
+"""Why there is no answer, by the number of the library."""
 
 NOT_OPENED = {
     -4: "it is of a version of the format that the library does not read",
@@ -71,10 +74,6 @@ def library_version() -> str | None:
     if _onboard is None:
         return None
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
-
-
-Explain = Callable[[Prior | None, Frame], Refusal | None]
-"""Searches a frame again and says why it gets no answer, which the library does not."""
 
 
 @lru_cache(maxsize=1)
@@ -148,21 +147,19 @@ class BatchResult(Sequence[MatchResult]):
         if isinstance(frame, slice):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
-        return MatchResult.later(STATUSES[self._codes[frame]], self._answer, frame)
+        return MatchResult.later(STATUSES[self._codes[frame]], self._facts, frame)
 
     def __iter__(self) -> Iterator[MatchResult]:
         for frame, code in enumerate(self._codes):
-            yield MatchResult.later(STATUSES[code], self._answer, frame)
+            yield MatchResult.later(STATUSES[code], self._facts, frame)
 
-    def _answer(self, n: int) -> MatchResult:
+    def _facts(self, n: int) -> dict[str, Any]:
         stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
-        return self.search.answer(self.records[n], stars, self.frames[n])
+        return self.search.facts(self.records[n], stars, self.frames[n])
 
 
 def _dropped(star: NDArray[np.int32]) -> Dropped:
     """Return row and reason of every centroid that was not used, repeats last."""
-    if star.min(initial=-1) >= -1:
-        return ()
     rows = np.flatnonzero(star < -1)
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
     return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
@@ -194,21 +191,21 @@ class CEngine:
         self.directions = _double_pointer(directions)
         self.database = database
 
-    def search(self, camera: Camera, settings: Settings, explain: Explain | None = None) -> Search:
+    def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
         """Return what asks the library about frames of a camera."""
-        return Search(self, camera, settings, explain)
+        return Search(self, camera, settings, fov_error)
 
 
 class Search:
     """The C library with an image, a camera and settings; threads may share it."""
 
     def __init__(
-        self, engine: CEngine, camera: Camera, settings: Settings, explain: Explain | None
+        self, engine: CEngine, camera: Camera, settings: Settings, fov_error: float
     ) -> None:
-        self.camera, self._settings = camera, settings
-        self._database, self._explain = engine.database, explain
+        self.camera, self._settings, self._fov_error = camera, settings, fov_error
+        self._database = engine.database
         # The library is given addresses: what stands there has to be kept.
-        self._kept = engine, _camera(camera), _options(settings)
+        self._kept = engine, _camera(camera), _options(settings, fov_error)
         addresses = [engine.image, *self._kept[1:], engine.rows, engine.directions]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
         self._one, self._null = _onboard.lib.starcat_one, _onboard.ffi.NULL
@@ -238,12 +235,16 @@ class Search:
             memory.address,
         )
         record, stars = memory.answer[:], memory.stars[: 4 * count]
+        q_found = None if prior is None else _onboard.ffi.unpack(memory.q_found, 4)
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        return MatchResult.later(
-            STATUSES[code], self._answer_of_bytes, record, stars, px, mags, prior
+        found = MatchResult.later(
+            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, prior
         )
+        if prior is None:
+            return found
+        return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
 
     def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
         """Identify the stars of frames; None where the library does not take one of them."""
@@ -276,54 +277,66 @@ class Search:
         answers = BatchResult(records, star_index, frames, self)
         return answers if answers.is_whole else None
 
-    def _answer_of_bytes(
+    def _facts_of_bytes(
         self, record: bytes, stars: bytes, px: bytes, mags: bytes | None, prior: Prior | None
-    ) -> MatchResult:
+    ) -> dict[str, Any]:
+        star = np.frombuffer(stars, np.int32)
         frame = Frame(
-            np.frombuffer(px).reshape(-1, 2),
+            np.ndarray((len(star), 2), np.float64, px),
             None if mags is None else np.frombuffer(mags),
             self.camera,
         )
-        found = np.frombuffer(record, _answer_dtype())[0]
-        return self.answer(found, np.frombuffer(stars, np.int32), frame, prior)
+        return self.facts(np.frombuffer(record, _answer_dtype())[0], star, frame, prior)
 
-    def answer(
-        self, found: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
-    ) -> MatchResult:
-        """Return the answer to a frame, from a record and the stars as `BatchResult` has them."""
-        facts: dict[str, Any] = {
+    def facts(
+        self, record: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
+    ) -> dict[str, Any]:
+        """Return the fields of an answer, from a record and stars as `BatchResult` has them."""
+        found: dict[str, Any] = dict(zip(record.dtype.names or (), record.item(), strict=True))
+        has_dropped = found["n_usable"] < len(star)
+        facts = {
+            "dropped": _dropped(star) if has_dropped else (),
             "origin": "lost_in_space" if prior is None else "tracking",
-            "time_s": float(found["seconds"]),
+            "time_s": found["seconds"],
             "frame": frame,
             "database": self._database,
             "noise_px": self._settings.noise_px,
         }
-        code, dropped = int(found["status"]), _dropped(star)
-        if STATUSES[code] != "identified":
-            return no_match(len(star), dropped, self._why(code, frame, prior), **facts)
-        answer = MatchResult(
-            "identified",
-            np.maximum(star, -1),
-            found["matrix"].copy(),
-            float(found["residual_rad"]) * ARCSEC,
-            math.exp(found["log_chance"]),
-            dropped,
-            frame.camera,
-            **facts,
-        )
-        # The library's own, which rounds otherwise than the one that the matrix makes.
-        vars(answer)["_quaternion"] = found["q_body_from_icrs"].copy()
-        return answer
+        if STATUSES[found["status"]] != "identified":
+            return vars(no_match(len(star), refusal=_refusal_of(found, prior), **facts))
+        camera, error_px = frame.camera, None
+        if self._fov_error:
+            camera = camera.with_focal_length(found["focal_length_px"])
+            error_px = focal_length_error_px(
+                camera.directions_from_pixels(frame.centroids_px[star >= 0]),
+                camera.focal_length_px,
+                found["residual_rad"],
+                self._settings.noise_px,
+            )
+        return facts | {
+            "star_index": np.maximum(star, -1) if has_dropped else star.copy(),
+            "matrix": found["matrix"].copy(),
+            "residual_arcsec": found["residual_rad"] * ARCSEC,
+            "false_match_probability": math.exp(found["log_chance"]),
+            "camera": camera,
+            "focal_length_error_px": error_px,
+            # The library's own, which rounds otherwise than the one that the matrix makes.
+            "_quaternion": found["q_body_from_icrs"].copy(),
+        }
 
-    def _why(
-        self, code: int, frame: Frame, prior: Prior | None
-    ) -> Refusal | Callable[[], Refusal | None] | None:
-        """Return why a frame has no answer, or what finds it out."""
-        if code == OUT_OF_STEPS:
-            return Refusal("steps")
-        if STATUSES[code] == "too_few_stars":
-            return Refusal("too_few_stars")
-        return None if self._explain is None else partial(self._explain, prior, frame)
+
+def _refusal_of(found: dict[str, Any], prior: Prior | None) -> Refusal:
+    """Return why the library has no answer."""
+    reason = REASONS[found["reason"]]
+    if reason == "too_few_stars":
+        return Refusal(reason)
+    if prior is not None and (reason == "no_candidate" or not found["log_chance"] < 0.0):
+        return Refusal("prior")
+    if reason == "no_candidate":
+        return Refusal(reason)
+    return Refusal(
+        reason, found["n_matched"], math.exp(found["log_chance"]), found["share"], found["n_usable"]
+    )
 
 
 class _Memory:
@@ -334,6 +347,7 @@ class _Memory:
         self.address = ffi.new("starcat_memory *")
         self.answer = ffi.buffer(ffi.addressof(self.address, "answer"))
         self.stars = ffi.buffer(ffi.addressof(self.address, "star"))
+        self.q_found = self.address.answer.q_body_from_icrs
 
 
 _FREE: list[_Memory] = []
@@ -364,11 +378,11 @@ def _camera(camera: Camera) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _options(settings: Settings) -> Any:
+def _options(settings: Settings, fov_error: float) -> Any:
     chance = math.log(max(settings.max_false_match_probability, 1e-300))
     # The library takes 0 for a noise that is not stated.
     stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
-    options = [settings.tolerance_px, *stated, chance, MAX_STEPS]
+    options = [settings.tolerance_px, *stated, chance, fov_error, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 

@@ -26,10 +26,11 @@ from starcat.matcher.database import Database, open_database, open_image, produc
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_arrays, as_frame, as_frames
-from starcat.matcher.prior import Prior, prior_of
-from starcat.matcher.result import MatchResult, Refusal
+from starcat.matcher.prior import prior_of
+from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
+    MAX_STEPS,
     MIN_SHARE,
     Engine,
     Settings,
@@ -93,7 +94,7 @@ class Matcher(Settings, _WithDatabase):
         noise_mag: float | None = None,
         engine: Engine = "auto",
         min_share: float = MIN_SHARE,
-        max_steps: float = math.inf,
+        max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
@@ -191,13 +192,14 @@ class Matcher(Settings, _WithDatabase):
         camera = camera or self.database.camera
         px, mags = as_arrays(centroids_px, magnitudes)
         near = prior_of(prior, prior_error_deg)
-        search = partial(solve, prior=near)
         if fov_deg is not None:
-            search = partial(identify_blind, fov_deg=fov_deg)
-        elif error := self._checked_fov_error(fov_error):
-            search = partial(search, fov_error=error)
-        elif (in_c := self._in_c(camera)) and (found := in_c.one(px, mags, near)):
-            return near.checked(found, camera, self.tolerance_px) if near else found
+            return self._timed(as_frame(px, camera, mags), partial(identify_blind, fov_deg=fov_deg))
+        error = self._checked_fov_error(fov_error)
+        # The library does not search for both at once.
+        in_c = None if error and near else self._in_c(camera, error)
+        if in_c and (found := in_c.one(px, mags, near)):
+            return found
+        search = partial(solve, fov_error=error, prior=near)
         return self._timed(as_frame(px, camera, mags), search)
 
     def identify_many(
@@ -266,23 +268,21 @@ class Matcher(Settings, _WithDatabase):
         return f"{self.database.name} has too many stars or features for an onboard image"
 
     @cached_property
-    def _searches(self) -> dict[int, Search]:
-        """Those of the cameras asked for last, by their identity: each holds its camera."""
+    def _searches(self) -> dict[tuple[int, float], Search]:
+        """Those asked for last, by the camera's identity, as each holds its own, and its error."""
         return {}
 
-    def _in_c(self, camera: Camera) -> Search | None:
+    def _in_c(self, camera: Camera, fov_error: float = 0.0) -> Search | None:
         """Return what asks the C library about frames of a camera, where it serves."""
-        found = self._searches.get(id(camera))
+        key = id(camera), fov_error
+        found = self._searches.get(key)
         if found is None:
             engine = self._c_engine
             if engine is None:
                 return None
             if len(self._searches) >= MOST_CAMERAS:
                 self._searches.clear()
-            explain = (
-                None if self.database.image else partial(_explain, self._settings, self.database)
-            )
-            found = self._searches[id(camera)] = engine.search(camera, self._settings, explain)
+            found = self._searches[key] = engine.search(camera, self._settings, fov_error)
         return found
 
     def __getstate__(self) -> dict[str, Any]:
@@ -309,17 +309,5 @@ class Matcher(Settings, _WithDatabase):
         in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
         if not fov_error:
             return 0.0
-        why = "an onboard image needs the focal length"
-        self.database.check_has_products(why, key="fov_error", value=fov_error)
         check_scale_free(self)
         return float(fov_error)
-
-
-def _explain(
-    settings: Settings, database: Database, prior: Prior | None, frame: Frame
-) -> Refusal | None:
-    """Return why the C library has no answer: what the search with numpy comes to."""
-    # What is unlikely enough for one of the two searches near a prior may not be found by the
-    # other.
-    found = solve(settings, database, frame, prior=prior)
-    return Refusal("prior") if found.ok and prior is not None else found.refusal

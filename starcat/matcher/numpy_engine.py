@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
@@ -44,8 +43,7 @@ def solve(
 
 def proposals(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Return the batches of candidates of the method of an observation's settings."""
-    settings = observation.settings
-    return islice(METHODS[settings.method].propose(observation, database), settings.max_batches)
+    return METHODS[observation.settings.method].propose(observation, database)
 
 
 def _search(
@@ -80,7 +78,12 @@ def answer_of(
         return no_match(count, observation.dropped, why, origin=origin)
     error_px = None
     if observation.fov_error:
-        error_px = focal_length_error_px(found.pose, found.matched, found.residual_rad, observation)
+        error_px = focal_length_error_px(
+            found.pose.body[found.matched],
+            found.pose.camera.focal_length_px,
+            found.residual_rad,
+            observation.settings.noise_px,
+        )
     return MatchResult(
         "identified",
         observation.in_frame(found.star_index),

@@ -81,9 +81,10 @@ def as_arrays(
         given = given.reshape(0, 2)
     if magnitudes is None:
         return given, None
-    mag = numbers_of("magnitudes", magnitudes, "(N,)")
-    if mag.shape != given.shape[:1]:
-        one_each = f"({len(given)},), one a centroid"
+    shape = given.shape[:1]
+    mag = numbers_of("magnitudes", magnitudes, shape)
+    if mag.shape != shape:
+        one_each = f"{shape}, one a centroid"
         raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
     return given, mag
 
@@ -130,7 +131,7 @@ def _joined(
     return (counts, px, mag) if fits else None
 
 
-def numbers_of(name: str, values: ArrayLike, shape: str) -> Array:
+def numbers_of(name: str, values: ArrayLike, shape: str | tuple[int, ...]) -> Array:
     """Return an argument as an array of real numbers."""
     if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
         return values

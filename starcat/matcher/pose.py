@@ -30,6 +30,9 @@ _THREE_SIGMA = 3.0
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
+SURE_CORNER = 0.5
+"""Largest error of a corner, in tolerances, that stars may leave which determine their frame."""
+
 _UNIT = np.eye(3)
 
 
@@ -116,20 +119,19 @@ def _by_scale(body: Array) -> Array:
 
 
 def focal_length_error_px(
-    pose: Pose, matched: Rows, residual_rad: float, observation: Observation
+    matched: Directions, focal_length_px: float, residual_rad: float, noise_px: float | None
 ) -> float:
     """Return the standard error of a focal length that was fitted with an attitude."""
-    focal_px, n = pose.camera.focal_length_px, len(matched)
     try:
-        covariance = np.linalg.inv(information(pose.body[matched], with_scale=True))
+        covariance = np.linalg.inv(information(matched, with_scale=True))
     except np.linalg.LinAlgError:
         return math.inf
-    if observation.settings.noise_px is not None:
-        sigma_rad = observation.settings.noise_px / focal_px
+    if noise_px is not None:
+        sigma_rad = noise_px / focal_length_px
     else:
-        free = 2 * n - 4
-        sigma_rad = residual_rad * math.sqrt(n / free) * _student(free) / _THREE_SIGMA
-    return focal_px * sigma_rad * math.sqrt(max(0.0, float(covariance[3, 3])))
+        free = 2 * len(matched) - 4
+        sigma_rad = residual_rad * math.sqrt(len(matched) / free) * _student(free) / _THREE_SIGMA
+    return focal_length_px * sigma_rad * math.sqrt(max(0.0, float(covariance[3, 3])))
 
 
 def _student(free: int) -> float:
@@ -150,6 +152,7 @@ def explained_fraction(
     matched: Directions,
     stars: Directions,
     residual_rad: float,
+    pose: Pose,
     observation: Observation,
     enough: float = 1.0,
 ) -> float:
@@ -162,13 +165,33 @@ def explained_fraction(
     of_stars = weighted_share(covariance, stars)
     if of_stars >= enough:
         return of_stars
-    of_centroids = weighted_share(covariance, observation.body)
+    of_centroids = weighted_share(covariance, pose.body)
     if of_centroids <= of_stars:
         return of_stars
-    # Three of the 2n components went into the attitude, a fourth into the scale.
-    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - len(covariance)))
-    corner_rad = deviation_rad * corner_deviation(covariance, observation.camera)
+    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, pose.camera)
     return of_stars if corner_rad > observation.tolerance_rad else of_centroids
+
+
+def determines_frame(
+    matched: Directions, residual_rad: float, camera: Camera, tolerance_rad: float
+) -> bool:
+    """Return whether stars alone put every corner of a frame where it is.
+
+    That is so if its error is a small part of the tolerance even where the focal length is not
+    trusted but fitted.
+    """
+    try:
+        covariance: Array = np.linalg.inv(information(matched, with_scale=True)).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return False
+    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, camera)
+    return corner_rad <= SURE_CORNER * tolerance_rad
+
+
+def _corner_error_rad(covariance: Array, n: int, residual_rad: float, camera: Camera) -> float:
+    # Three of the 2n components went into the attitude, a fourth into the scale.
+    deviation_rad = residual_rad * math.sqrt(n / (2 * n - len(covariance)))
+    return deviation_rad * corner_deviation(covariance, camera)
 
 
 def information(directions: Array, *, with_scale: bool = False) -> Array:
@@ -218,19 +241,20 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
     return math.sqrt(max(0.0, variance))
 
 
-def is_scaled(predicted_px: Pixels, centroids_px: Pixels, observation: Observation) -> bool:
+def is_scaled(
+    predicted_px: Pixels, centroids_px: Pixels, camera: Camera, tolerance_px: float
+) -> bool:
     """Return whether a frame differs in scale from the stars that it matches.
 
     A frame of another scale means that the camera's focal length is wrong. The attitude may be
     right, but towards the edge of the frame stars are taken for their neighbours.
     """
-    camera = observation.camera
     inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
     extent = float(np.vdot(inner, inner))
     offset = centroids_px - predicted_px
     excess = float(np.vdot(inner, offset)) / extent
     corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
-    if abs(excess) * corner_px <= observation.tolerance_px:
+    if abs(excess) * corner_px <= tolerance_px:
         return False
     left = offset - excess * inner
     left -= left.sum(axis=0) / len(left)

@@ -8,7 +8,7 @@ verification of what that proposes is that of any other method.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,13 +47,19 @@ class Prior:
     q_body_from_icrs: Array
     error_rad: float
 
-    def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
-        """Return an answer if its attitude is as near to the prior as that says."""
+    def checked(
+        self,
+        answer: MatchResult,
+        camera: Camera,
+        tolerance_px: float,
+        q_found: Sequence[float] | None = None,
+    ) -> MatchResult:
+        """Return an answer if its attitude, ``q_found`` if given, is as near as the error says."""
         if not answer.ok:
             return answer
-        prior_q, found_q = self.q_body_from_icrs.tolist(), answer.q_body_from_icrs.tolist()
-        slack_rad = turn_of_noise_rad(camera, tolerance_px)
-        if math.hypot(*turn_between(prior_q, found_q)) <= self.error_rad + slack_rad:
+        q_found = answer.q_body_from_icrs.tolist() if q_found is None else q_found
+        turn_rad = math.hypot(*turn_between(self.q_body_from_icrs.tolist(), q_found))
+        if turn_rad <= self.error_rad + turn_of_noise_rad(camera, tolerance_px):
             return answer
         names = ("origin", "time_s", "frame", "database", "noise_px")
         facts = {name: getattr(answer, name) for name in names}
@@ -70,14 +76,16 @@ def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | N
             f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
         )
     q = numbers_of("prior", quaternion, "(4,)")
-    largest = float(np.abs(q).max()) if q.shape == (4,) else math.nan
-    if not 0.0 < largest < math.inf:
+    parts = q.tolist() if q.shape == (4,) else [math.nan]
+    largest = max(map(abs, parts))
+    if not (all(map(math.isfinite, parts)) and largest > 0.0):
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
         raise ConfigError(text, key="prior", value=quaternion)
     in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
-    # Its length carries no meaning, and the square of 1e200 would overflow.
-    q = np.ldexp(q, -math.frexp(largest)[1])
-    return Prior(q / math.sqrt(float(q @ q)), math.radians(error_deg))
+    # Its length carries no meaning, and that of four times 1e308 would overflow.
+    scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
+    length = math.hypot(*scaled)
+    return Prior(np.array([part / length for part in scaled]), math.radians(error_deg))
 
 
 def search_near(

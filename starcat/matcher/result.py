@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -149,6 +149,8 @@ class MatchResult:
         Standard error of that focal length; None where it was not looked for.
     origin : {"lost_in_space", "tracking"}
         Whether the whole sky was searched, or what is near a prior attitude.
+    refusal : Refusal or None
+        Why there is no answer; None for an answer.
     time_s : float
         Time that the answer took; NaN where nobody measured. It is no part of the answer.
     """
@@ -168,15 +170,13 @@ class MatchResult:
     frame: Frame | None = field(default=None, repr=False, compare=False)
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
-    why: Refusal | Callable[[], Refusal | None] | None = field(
-        default=None, repr=False, compare=False
-    )
+    refusal: Refusal | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def later(
-        cls, status: Status, make: Callable[..., MatchResult], *arguments: Any
+        cls, status: Status, make: Callable[..., dict[str, Any]], *arguments: Any
     ) -> MatchResult:
-        """Return the answer of ``make(*arguments)``, called when more than the status is asked."""
+        """Return an answer whose other fields ``make(*arguments)`` gives when one is asked for."""
         answer = cls.__new__(cls)
         content = answer.__dict__
         content["status"], content["_make"] = status, (make, arguments)
@@ -189,7 +189,7 @@ class MatchResult:
         if unmade is not None:
             make, arguments = unmade
             # What another thread has made meanwhile stays.
-            content.update({**vars(make(*arguments)), **content})
+            content.update(_DEFAULTS | make(*arguments) | content)
             content.pop("_make", None)
         return content
 
@@ -244,15 +244,6 @@ class MatchResult:
     def roll_deg(self) -> float:
         """Roll, as `matrix_from_radec_roll` has it; NaN unless identified."""
         return self._angles[2]
-
-    @cached_property
-    def refusal(self) -> Refusal | None:
-        """Why there is no answer; None for an answer, and where nothing can tell.
-
-        The C library does not say why: for its answers the frame is searched again with numpy,
-        once, when this is asked for. An onboard image holds nothing to search with.
-        """
-        return self.why() if callable(self.why) else self.why
 
     @cached_property
     def stars(self) -> MatchedStars:
@@ -347,8 +338,7 @@ class MatchResult:
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: the stars, not the database they are of."""
         made = self._complete()
-        known = made.get("refusal", None if callable(self.why) else self.why)
-        content = {**made, "frame": None, "database": None, "why": known}
+        content = {**made, "frame": None, "database": None}
         if self.database is not None:
             content["star_ids"] = self.star_ids
             if self.frame is not None and self.camera is not None:
@@ -358,9 +348,7 @@ class MatchResult:
 
     def __repr__(self) -> str:
         if not self.ok:
-            # What is not known yet is not searched for, as that may take long.
-            known = vars(self).get("refusal", self.why)
-            because = f", {known.reason}" if isinstance(known, Refusal) else ""
+            because = f", {self.refusal.reason}" if self.refusal else ""
             because = "" if because == f", {self.status}" else because
             return f"<MatchResult {self.status}: {len(self.star_ids)} spots{because}>"
         return (
@@ -394,26 +382,24 @@ class MatchResult:
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
 
+_DEFAULTS = {one.name: one.default for one in fields(MatchResult) if one.default is not MISSING}
+
 # A default in the class would hide what is not made yet; the constructor has its own.
-for _field in fields(MatchResult):
-    if _field.name in vars(MatchResult):
-        delattr(MatchResult, _field.name)
+for _name in _DEFAULTS:
+    delattr(MatchResult, _name)
 
 NO_MATRIX = np.full((3, 3), np.nan)
 NO_MATRIX.flags.writeable = False
 
 
 def no_match(
-    count: int,
-    dropped: Dropped = (),
-    why: Refusal | Callable[[], Refusal | None] | None = None,
-    **facts: Any,
+    count: int, dropped: Dropped = (), refusal: Refusal | None = None, **facts: Any
 ) -> MatchResult:
     """Return the answer to a frame of so many centroids that was not identified.
 
     ``facts`` are further fields of the answer.
     """
-    is_too_few = isinstance(why, Refusal) and why.reason == "too_few_stars"
+    is_too_few = refusal is not None and refusal.reason == "too_few_stars"
     return MatchResult(
         "too_few_stars" if is_too_few else "no_match",
         np.full(count, -1, dtype=np.int32),
@@ -421,6 +407,6 @@ def no_match(
         math.nan,
         1.0,
         dropped,
-        why=why,
+        refusal=refusal,
         **facts,
     )

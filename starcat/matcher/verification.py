@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
     Pose,
+    determines_frame,
     explained_fraction,
     first_poses,
     fit,
@@ -35,6 +36,14 @@ Withheld = Literal["share_of_frame", "scale"] | None
 
 SURE_SHARE = 2.0 / 3.0
 """An attitude that explains a smaller share is refined again, with the reaches of `WIDER`."""
+
+FIRM_CHANCE = 1e-12
+"""Largest chance of an agreement that need not explain any share of the frame, because its stars
+determine all of it."""
+
+OTHER_SCALES = 0.05
+"""Largest relative error of the focal length that is looked for where an agreement's stars do not
+exclude it."""
 
 WIDER = (4.0, 2.0)
 """Reaches of that second refinement, one after the other, in units of the final reach."""
@@ -80,6 +89,7 @@ class Agreement:
     # Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
     share: float = 1.0
     withheld: Withheld = None  # why it is no answer, however unlikely chance is
+    is_firm: bool = True  # whether its stars alone determine the whole frame
 
     @property
     def false_match_probability(self) -> float:
@@ -156,8 +166,7 @@ def _worth_trying(
     if len(candidates) > alone:
         matrices, factors = first_poses(candidates[alone:], observation, database.directions)
         count = agreeing_centroids(matrices, observation, database, factors)
-        order = np.argsort(-count, kind="stable")
-        for row in order[count[order] >= MIN_STARS].tolist():
+        for row in np.flatnonzero(count >= MIN_STARS).tolist():
             yield pose_at(matrices[row], float(factors[row]), observation)
 
 
@@ -203,7 +212,21 @@ def agree(
         # right, and a search within wider reaches replaces them.
         wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
-            return wider
+            found = wider
+    if found.false_match_probability < 1.0 and not found.is_firm and not observation.fov_error:
+        return _at_own_scale(found, observation, database)
+    return found
+
+
+def _at_own_scale(found: Agreement, observation: Observation, database: Database) -> Agreement:
+    """Withhold an agreement if the frame agrees better with another focal length."""
+    free = replace(observation, fov_error=OTHER_SCALES)
+    observation.budget.spend(AGREEMENT)
+    scaled = _agreement_of(_refine(found.pose, free, database, ROUGH), free)
+    factor = scaled.pose.camera.focal_length_px / observation.camera.focal_length_px
+    corner_px = abs(factor - 1.0) * math.hypot(*observation.camera.middle_px)
+    if scaled.chance < found.chance and corner_px > observation.tolerance_px:
+        return replace(found, withheld="scale")
     return found
 
 
@@ -269,6 +292,7 @@ class _Fit:
     star: Rows  # of each centroid a row of ``near``, -1 where none
     matched: Rows  # centroids with a star
     square_px: Array
+    last: float  # the last reach, in units of the final one
 
 
 def _refine(
@@ -295,7 +319,7 @@ def _refine(
             break
         before = after
         pose = fit(pose, matched, u[star[matched]], observation)
-    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
+    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px, last)
 
 
 def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
@@ -324,15 +348,22 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
     if chance < 1.0 and len(matched) < len(within):
         stars = refined.icrs[within] @ pose.matrix.T
         enough = max(SURE_SHARE, observation.settings.min_share)
-        share = explained_fraction(seen, stars, residual_rad, observation, enough)
+        share = explained_fraction(seen, stars, residual_rad, pose, observation, enough)
     withheld: Withheld = None
-    if share < observation.settings.min_share:
-        withheld = "share_of_frame"
-    elif chance < 1.0 and is_scaled(
-        refined.predicted_px[star], observation.centroids_px[matched], observation
-    ):
-        withheld = "scale"
-    return Agreement(pose, index, residual_rad, chance, share, withheld)
+    is_firm = True
+    if chance < 1.0:
+        tolerance_rad = refined.last * observation.tolerance_rad
+        is_firm = determines_frame(seen, residual_rad, pose.camera, tolerance_rad)
+        if share < observation.settings.min_share and not (is_firm and chance <= FIRM_CHANCE):
+            withheld = "share_of_frame"
+        elif is_scaled(
+            refined.predicted_px[star],
+            observation.centroids_px[matched],
+            pose.camera,
+            refined.last * observation.tolerance_px,
+        ):
+            withheld = "scale"
+    return Agreement(pose, index, residual_rad, chance, share, withheld, is_firm)
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from starcat.errors import ConfigError, quoted, reason, suggest
 from starcat.resources import PathLike, resource_folder
@@ -139,34 +139,36 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
         raise what_is_wrong(error, origin) from error
 
 
-def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
+def what_is_wrong(
+    error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
+) -> ConfigError:
     """Return the error about the first wrong key; a misspelt one first, since it is missing too."""
     wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     first = wrong[0]
-    key = ".".join(_shown_key(str(part)) for part in first["loc"]) or "spec"
-    return ConfigError(f"{origin}: {key}: {_explain(dict(first))}", key=key, value=first["input"])
+    key = ".".join(_shown_key(str(part)) for part in first["loc"]) or kind
+    text = _explain(dict(first), model, kind)
+    return ConfigError(f"{origin}: {key}: {text}", key=key, value=first["input"])
 
 
 def _shown_key(name: str) -> str:
     return name if name.isprintable() and len(name) <= 60 else quoted(name)
 
 
-def _explain(error: dict[str, Any]) -> str:
+def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
-        known = _known_keys(error["loc"][:-1])
+        known = _known_keys(error["loc"][:-1], model)
         hint = suggest(str(error["loc"][-1])[:100], known)
         return f"unknown key; {hint}known keys here: {', '.join(known)}"
     if kind == "missing":
-        return "missing; every spec needs it"
+        return f"missing; every {kind_of_file} needs it"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
     found = _SHOWN.repr(error["input"])
     return f"found {found if len(found) < 60 else found[:57] + '...'}; {error['msg']}"
 
 
-def _known_keys(location: tuple[Any, ...]) -> list[str]:
-    model: Any = BuildSpec
+def _known_keys(location: tuple[Any, ...], model: Any) -> list[str]:
     for part in location:
         model = model.model_fields[part].annotation
     return sorted(model.model_fields)

@@ -27,13 +27,15 @@ from starcat.pipeline.build import build
 from starcat.specs.reading import preset
 
 
-def main() -> None:
-    """Build sao-12deg, ask it about frames of no sky, print a line a kind."""
+def main() -> int:
+    """Build sao-12deg, ask it about frames of no sky, print a line a kind; 1 if one is answered."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--first", type=int, default=0, help="seed of the first frame")
     parser.add_argument("--limit", type=float, default=0.1, help="seconds a frame")
+    parser.add_argument("--quick", action="store_true", help="a few frames")
     given = parser.parse_args()
+    given.frames = 12 if given.quick else given.frames
     with tempfile.TemporaryDirectory() as folder:
         inputs = {"sao": [catalogs_folder() / "sao.dat.gz"]}
         artifact = build(preset("sao-12deg"), inputs, Path(folder), workers=1).folder
@@ -55,7 +57,8 @@ def main() -> None:
         ms = np.array(seconds[key]) * 1e3
         print(f"{key[0]:<10}{key[1]:>7.0%}{len(ms):>8}{answers[key]:>9}{ended[key]:>13}", end="")
         print(f"{np.median(ms):>11.1f}{ms.max():>9.1f}")
+    return int(any(answers.values()))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -21,7 +21,10 @@ import statistics
 import sys
 import tempfile
 import time
+import timeit
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,7 @@ from slew import BORESIGHT_DEG, ROLL_DEG, is_near, wrong_by
 from synthetic import catalogs_folder
 
 from starcat.geometry.attitude import quaternion_from_matrix
+from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import Matcher
@@ -238,7 +242,7 @@ def number(value: float) -> str:
     return f"{value:.{decimals}f}"
 
 
-def opening(artifact: Path, scratch: Path) -> dict[str, float]:
+def opening(artifact: Path, scratch: Path) -> dict[str, Any]:
     """Return the time to open an artifact, and the memory that 100 frames take."""
     seconds = []
     for _ in range(20):
@@ -250,6 +254,24 @@ def opening(artifact: Path, scratch: Path) -> dict[str, float]:
     options = {"artifact": str(artifact), "method": "triangle", "magnitudes": True}
     row = drive("starcat", "starcat", few, np.array([frame.matrix for frame in truth]), options)
     return {"open_ms": statistics.median(seconds) * 1e3, "peak_mib_100_frames": row.peak_mib}
+
+
+def by_the_frame(artifact: Path, frames: dict[str, list[Frame]]) -> dict[str, list[float]]:
+    """Return the least of 20 times by kind, microseconds a frame, with one thread of the C library.
+
+    `identify_many` with an object for each frame; calls of `identify`; the same and a look at each.
+    """
+    matcher, times = Matcher.open(artifact, engine="c"), {}
+    for kind, given in frames.items():
+        px, mags = [frame.centroids_px for frame in given], [frame.mag for frame in given]
+        asked = partial(map, lambda one, mag: matcher.identify(one, magnitudes=mag), px, mags)
+        ways: list[Callable[[], object]] = [
+            lambda px=px, mags=mags: list(matcher.identify_many(px, magnitudes=mags, threads=1)),
+            lambda asked=asked: list(asked()),
+            lambda asked=asked: [found.q_body_from_icrs for found in asked()],
+        ]
+        times[kind] = [min(timeit.repeat(way, number=1, repeat=20)) / len(px) * 1e6 for way in ways]
+    return times
 
 
 def main() -> None:
@@ -280,6 +302,13 @@ def main() -> None:
         facts = opening(built.folder, scratch)
         print(f"Opening an artifact: {facts['open_ms']:.1f} ms, median of 20; a process that does")
         print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
+        if is_compiled():
+            facts["us_a_frame"] = by_the_frame(built.folder, made)
+            for kind, (many, calls, looks) in facts["us_a_frame"].items():
+                print(
+                    f"{kind}, us a frame, least of 20: identify_many {many:.1f}, one by one", end=""
+                )
+                print(f" {calls:.1f}, and looked at {looks:.1f}")
     machine = {"platform": platform.platform(), "cores": os.cpu_count(), "load": os.getloadavg()}
     written = {
         "seed": SEED,

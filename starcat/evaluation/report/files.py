@@ -152,7 +152,7 @@ def evaluation_page(
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">Times: {escape(machine)}.</p>',
-        *([_html(summary)] if summary else []),
+        *([html_of(summary)] if summary else []),
         "<h2>What the columns mean</h2>",
         table("", ("column", "meaning"), legend(contents)),
         table("", ("rule", "a frame is a success if"), rules_of(contents)),
@@ -195,20 +195,21 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
     names = {group: name for name, group, _ in curves(content)}
     for one in rate_tables(content, LONG):
         yield f"<h3>{escape(_capital(one.title))}</h3>"
-        yield _html(one)
+        yield html_of(one)
         if one.title in names:
             alt = f"Curve: {one.title}, rate of identification with intervals"
             yield figure(alt, plots[names[one.title]])
     for one in _other_tables(content):
         yield f"<h3>{escape(_capital(one.title))}</h3>"
-        yield _html(one)
+        yield html_of(one)
     if content["deviations"]:
         yield "<h3>What the paper leaves unsaid, and what is done here</h3>"
         items = "".join(f"<li>{escape(text)}</li>" for text in content["deviations"])
         yield f"<ul>{items}</ul>"
 
 
-def _html(one: Table) -> str:
+def html_of(one: Table) -> str:
+    """Return a table as HTML."""
     notes = "<br>".join(map(escape, one.notes))
     below = f'<p class="notes">{notes}</p>' if notes else ""
     return f'<div class="rates">{table("", one.heads, one.rows, one.numbers)}</div>{below}'
@@ -223,7 +224,7 @@ def reproduction_page(results: Path) -> str:
         "<!-- Generated from reproduction.json by `make docs`; no figure is typed by hand. -->",
         "# Reproduction\n\nWhat the papers print, what starcat measures, and the difference. "
         f"`starcat evaluate --paper all`\nmakes all of it. Times: {stored['machine']}.",
-        *([_markdown(summary)] if summary else []),
+        *([markdown_of(summary)] if summary else []),
         "## What the columns mean",
         _grid(("column", "meaning"), legend(contents), ()),
         _grid(("rule", "a frame is a success if"), rules_of(contents), ()),
@@ -240,18 +241,19 @@ def _paper_markdown(content: Content) -> Iterator[str]:
     names = {group: name for name, group, _ in curves(content)}
     for one in rate_tables(content, LONG):
         yield f"### {_capital(one.title)}"
-        yield _markdown(one)
+        yield markdown_of(one)
         if one.title in names:
             yield f"![{_capital(one.title)}](figures/{names[one.title]}.svg)"
     for one in _other_tables(content):
         yield f"### {_capital(one.title)}"
-        yield _markdown(one)
+        yield markdown_of(one)
     if content["deviations"]:
         yield "### What the paper leaves unsaid, and what is done here"
         yield "\n".join(f"- {text}" for text in content["deviations"])
 
 
-def _markdown(one: Table) -> str:
+def markdown_of(one: Table) -> str:
+    """Return a table as Markdown."""
     notes = "\n".join(f"- {note}" for note in one.notes)
     return _grid(one.heads, one.rows, one.numbers) + (f"\n\n{notes}" if notes else "")
 

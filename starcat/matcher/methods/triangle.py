@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.settings import LOOKUP, TriangleOrder
+from starcat.matcher.settings import LOOKUP, MOST_TRIANGLES, TriangleOrder
 
 LEAST_ANGLE_DEG = 4.0
 """Smallest angle of a triangle that is tried at all."""
@@ -68,7 +68,10 @@ def select_triangles(observation: Observation) -> NDArray[np.intp]:
 
 
 def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.intp]:
-    """Return triangles of near centroids from all over a frame, a round of all centroids at a time.
+    """Return triangles of near centroids from all over a frame.
+
+    Every centroid's two nearest neighbours come first, then of every centroid the first and third
+    nearest, the second and third, and so on; a triangle of several centroids once.
 
     A database holds the triangles of the brightest stars of its fields. In a crowded frame most
     stars are fainter, and the compact triangles of one place are often of the same few stars: if
@@ -78,23 +81,15 @@ def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.in
     apart = observation.separation_rad[:count, :count]
     most = min(NEIGHBOURS, count - 1)
     near = np.argsort(apart, axis=1, kind="stable")[:, 1 : most + 1]
-    first, second = np.triu_indices(most, 1)
-    owner = np.repeat(np.arange(count), len(first))
-    stars = np.sort(
-        np.stack([owner, near[:, first].ravel(), near[:, second].ravel()], axis=-1), axis=-1
-    )
-    i, j, k = stars.T
+    second, first = np.tril_indices(most, -1)
+    owner = np.tile(np.arange(count), len(first))
+    others = near[:, first].T.ravel(), near[:, second].T.ravel()
+    i, j, k = stars = np.sort(np.stack([owner, *others]), axis=0)
     _, fresh = np.unique((i * count + j) * count + k, return_index=True)
-    owner, stars = owner[fresh], stars[fresh]
-    a, b, c = _sides(apart, stars)
+    stars = stars.T[np.sort(fresh)]
     side = selection.min_side_px / observation.camera.focal_length_px
-    good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
-    owner, stars = owner[good], stars[good]
-    longest = np.maximum(np.maximum(a, b), c)[good]
-    order = np.lexsort((longest, owner))
-    own = owner[order]
-    turn = np.arange(len(own)) - np.searchsorted(own, own)
-    return np.asarray(stars[order][np.lexsort((longest[order], turn))])
+    good = is_well_shaped(*_sides(apart, stars), side, np.radians(selection.min_angle_deg))
+    return np.asarray(stars[good])
 
 
 def is_well_shaped(
@@ -161,7 +156,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
     Liao and Zhang 2024 (S4), sections 2 and 3.
     """
-    triangles = select_triangles(observation)
+    triangles = select_triangles(observation)[:MOST_TRIANGLES]
     done = step = 0
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]

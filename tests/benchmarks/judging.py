@@ -1,0 +1,165 @@
+"""Whether an answer is right, and all agreements that a search comes to.
+
+An answer is wrong if its attitude puts a star anywhere in the frame farther from its place than the
+tolerance, and than five times the error that the true noise of the matched spots makes there; or
+if more than one and more than 5 % of the named spots are farther from where the true attitude puts
+their star than the matcher's reach and that error. In a frame without a true sky every answer is
+wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from false_frames import Array, Scene, Trial
+from numpy.typing import NDArray
+
+from starcat.geometry.camera import Camera
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.numpy_engine import answer_of, proposals
+from starcat.matcher.observation import as_frame, observe
+from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import REACH, Budget, BudgetSpentError, Limit, certainty
+from starcat.matcher.verification import Agreement, BestOf, verify
+
+Rows = NDArray[np.integer]
+Verdict = Literal["right", "no sky", "attitude", "names"]
+
+DEVIATIONS = 5.0
+"""Errors of an attitude that noise is allowed to make, in standard deviations."""
+
+LEAST_NOISE_PX = 0.01
+"""Noise that an attitude is allowed at least: of rounding, and of a lens drawn by a formula."""
+
+WRONG_NAMES = 0.05
+"""Share of the named spots that may have another name."""
+
+NOTABLE = 0.1
+"""Agreements that are recorded: those that chance explains less than this."""
+
+
+def judge(
+    trial: Trial, scene: Scene, matrix: Array, fitted: Camera | None, rows: Rows, stars: Rows,
+    tolerance_px: float,
+) -> Verdict:  # fmt: skip
+    """Return whether an attitude and the stars of some spots are right, or what is wrong.
+
+    Where no focal length was ``fitted``, the attitude alone is judged.
+    """
+    true_camera = trial.camera or scene.camera
+    camera, shown = (scene.camera, scene.camera) if fitted is None else (fitted, true_camera)
+    error_px = DEVIATIONS * attitude_error_px(
+        trial.centroids_px[rows], scene.camera, max(trial.noise_px, LEAST_NOISE_PX)
+    )
+    verdict: Verdict = "attitude" if trial.attitudes else "no sky"
+    for truth in trial.attitudes:
+        if distance_px(matrix, camera, truth, shown) > max(tolerance_px, error_px):
+            continue
+        place = true_camera.pixels_from_directions(scene.database.directions[stars] @ truth.T)
+        apart_px = np.hypot(*(place - trial.centroids_px[rows]).T)
+        wrong = int(np.sum(~(apart_px <= REACH * tolerance_px + error_px)))
+        if wrong <= max(1.0, WRONG_NAMES * len(rows)):
+            return "right"
+        verdict = "names"
+    return verdict
+
+
+def _lattice(camera: Camera) -> Array:
+    x, y = (np.linspace(0.0, side, 5) for side in (camera.width_px, camera.height_px))
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+
+
+def distance_px(matrix: Array, camera: Camera, truth: Array, true_camera: Camera) -> float:
+    """Return the largest distance in the frame between where two attitudes put a star."""
+    px = _lattice(camera)
+    there = camera.directions_from_pixels(px) @ matrix @ truth.T
+    if (there[:, 2] <= 0.0).any():
+        return math.inf
+    return float(np.hypot(*(true_camera.pixels_from_directions(there) - px).T).max())
+
+
+def attitude_error_px(px: Array, camera: Camera, noise_px: float) -> float:
+    """Return the standard deviation of a star's place by the noise of matched spots, at most."""
+    u, v = (camera.directions_from_pixels(places) for places in (px, _lattice(camera)))
+    information = len(u) * np.eye(3) - u.T @ u
+    if np.linalg.cond(information) > 1e12:
+        return math.inf
+    covariance = np.linalg.inv(information)
+    square = np.trace(covariance) - np.einsum("ni,ij,nj->n", v, covariance, v)
+    return noise_px * math.sqrt(float(square.max()))
+
+
+def judge_answer(
+    answer: MatchResult, trial: Trial, scene: Scene, tolerance_px: float
+) -> Verdict | None:
+    """Return whether an answer is right; None where there is none."""
+    if not answer.ok:
+        return None
+    rows = np.flatnonzero(answer.star_index >= 0)
+    fitted = answer.camera if answer.focal_length_error_px is not None else None
+    return judge(trial, scene, answer.matrix, fitted, rows, answer.star_index[rows], tolerance_px)
+
+
+@dataclass
+class AllOf(BestOf):
+    """The agreements of a search that chance hardly explains, and the best one."""
+
+    notable: list[Agreement] = field(default_factory=list)
+    is_endless: bool = False  # whether the search goes on when an agreement is certain
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the search is over."""
+        return not self.is_endless and super().is_certain
+
+    def offer(self, found: Agreement) -> None:
+        """Keep an agreement."""
+        if found.chance < NOTABLE:
+            self.notable.append(found)
+        super().offer(found)
+
+
+@dataclass(frozen=True)
+class Notable:
+    """An agreement that chance hardly explains."""
+
+    verdict: Verdict
+    log10_chance: float
+    share: float | None  # of the frame that it explains, where that is told
+    n_matched: int
+    n_spots: int
+    withheld: str | None  # why it is no answer
+
+
+def search(
+    trial: Trial, scene: Scene, matcher: Matcher, fov_error: float, steps: float, *,
+    is_endless: bool,
+) -> tuple[MatchResult, list[Notable]]:  # fmt: skip
+    """Search a frame with numpy; return the answer and the best agreement of each verdict."""
+    frame = as_frame(trial.centroids_px, scene.camera, trial.mag)
+    seen = observe(frame, matcher, fov_error=fov_error, budget=Budget(steps))
+    best = AllOf(certainty(matcher), is_endless=is_endless)
+    limit: Limit | None = None
+    try:
+        for candidates in proposals(seen, scene.database):
+            verify(candidates, seen, scene.database, best)
+            if best.is_certain:
+                break
+    except BudgetSpentError as spent:
+        limit = spent.limit
+    found: dict[Verdict, Notable] = {}
+    for one in sorted(best.notable, key=lambda agreement: agreement.chance):
+        stars = one.star_index[one.matched]
+        fitted = one.pose.camera if fov_error else None
+        verdict = judge(
+            trial, scene, one.pose.matrix, fitted, seen.rows[one.matched], stars,
+            matcher.tolerance_px,
+        )  # fmt: skip
+        log10 = math.log10(max(one.chance, 1e-300))
+        found.setdefault(
+            verdict, Notable(verdict, log10, one.share, len(stars), len(seen), one.withheld)
+        )
+    return answer_of(best.found, seen, limit), list(found.values())
