@@ -1,8 +1,8 @@
 """The turning Earth as the truth: how wrong attitudes of a camera are that stands still.
 
-The sky turns over a camera that is fixed to the ground by 15.041 arcsec a second about the pole, and
-nothing else moves. Attitudes with that turn taken out are all the same, and what they differ by is
-their error: no other star tracker, no table and no mark on the ground is needed. Aberration is
+The sky turns over a camera that is fixed to the ground by 15.041 arcsec a second about the pole,
+and nothing else moves. Attitudes with that turn taken out are all the same, and what they differ by
+is their error: no other star tracker, no table and no mark on the ground is needed. Aberration is
 taken out too; refraction is the same in all frames, as they look at one place of the air. An error
 of the clock that all times share drops out.
 

@@ -64,8 +64,8 @@ def print_calibration(
 def _print_turned(found: EarthRotation) -> None:
     """Print what the turn of the Earth says about the attitudes."""
     print_table(
-        f"Against the turn of the Earth: {len(found.frames)} frames, {found.n_sets} places of the sky",
-        ("frame", "place", "UTC", "x arcsec", "y", "z", "expected x", "y", "z", "clock s", "chi2"),
+        f"Against the turn of the Earth: {len(found.frames)} frames, {found.n_sets} places",
+        ("frame", "place", "UTC", "x arcsec", "y", "z", "error x", "y", "z", "clock s", "chi2"),
         [
             (
                 one.name,

@@ -268,7 +268,7 @@ def calibrate(
         Path | None,
         typer.Option(
             metavar="FILE.csv",
-            help="Columns frame and time (UTC), where the pictures do not say when they were taken.",
+            help="Columns frame and time (UTC), where pictures do not say when they were taken.",
         ),
     ] = None,
     json: opt.Json = False,
