@@ -178,7 +178,7 @@ void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_
   if (is_whole) {
     corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(4.0))) *
              corner_deviation(&with_scale, &call->camera);
-    found->is_firm = corner <= SC_SURE_CORNER * tolerance_rad;
+    found->is_firm = corner <= (has_scale ? R(2.0) : R(1.0)) * SC_SURE_CORNER * tolerance_rad;
   }
   if (found->n_matched >= w->n_within) {
     return;

@@ -31,7 +31,8 @@ SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
 SURE_CORNER = 0.5
-"""Largest error of a corner, in tolerances, that stars may leave which determine their frame."""
+"""Largest error of a corner, in tolerances, that stars may leave which determine their frame where
+the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
 
 _UNIT = np.eye(3)
 
@@ -173,19 +174,20 @@ def explained_fraction(
 
 
 def determines_frame(
-    matched: Directions, residual_rad: float, camera: Camera, tolerance_rad: float
+    matched: Directions, residual_rad: float, pose: Pose, observation: Observation, factor: float
 ) -> bool:
     """Return whether stars alone put every corner of a frame where it is.
 
     That is so if its error is a small part of the tolerance even where the focal length is not
-    trusted but fitted.
+    trusted but fitted; ``factor`` is the reach over the final one.
     """
     try:
         covariance: Array = np.linalg.inv(information(matched, with_scale=True)).astype(np.float64)
     except np.linalg.LinAlgError:
         return False
-    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, camera)
-    return corner_rad <= SURE_CORNER * tolerance_rad
+    corner_rad = _corner_error_rad(covariance, len(matched), residual_rad, pose.camera)
+    most = SURE_CORNER * (2.0 if observation.fov_error else 1.0)
+    return corner_rad <= most * factor * observation.tolerance_rad
 
 
 def _corner_error_rad(covariance: Array, n: int, residual_rad: float, camera: Camera) -> float:

@@ -352,8 +352,7 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
     withheld: Withheld = None
     is_firm = True
     if chance < 1.0:
-        tolerance_rad = refined.last * observation.tolerance_rad
-        is_firm = determines_frame(seen, residual_rad, pose.camera, tolerance_rad)
+        is_firm = determines_frame(seen, residual_rad, pose, observation, refined.last)
         if share < observation.settings.min_share and not (is_firm and chance <= FIRM_CHANCE):
             withheld = "share_of_frame"
         elif is_scaled(
