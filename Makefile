@@ -65,6 +65,9 @@ demo: $(RUNS) ## build a database from the embedded sky, check it, identify simu
 serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded sky
 	$(BIN)/starcat serve --root dist/service
 
+nights: $(READY) ## identify the photographs of ../shared/nights, or of $$STARCAT_NIGHTS
+	$(BIN)/python -m pytest -q tests/test_nights.py
+
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
 	$(BIN)/python tests/benchmarks/ingest.py
 	$(BIN)/python tests/benchmarks/products.py

@@ -1,0 +1,58 @@
+"""Photographs of real skies, from pictures to attitudes with the default settings.
+
+The frames of ``spel`` are of an IMX219 on a Raspberry Pi (spel-uchile/Star_Tracker), about 48.8 deg
+wide. Nothing says where they look to; one focal length has to fit them all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.pipeline.build import build
+from starcat.specs.reading import read_spec
+
+BESIDE = Path(__file__).resolve().parents[2] / "shared" / "nights"
+NIGHTS = Path(os.environ.get("STARCAT_NIGHTS") or BESIDE)
+
+pytestmark = pytest.mark.skipif(
+    not (NIGHTS / "spel").is_dir(),
+    reason=f"no photographs: set STARCAT_NIGHTS to their folder, or put it at {BESIDE}",
+)
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory):
+    """What `starcat init` proposes for that camera."""
+    folder = tmp_path_factory.mktemp("nights")
+    spec = folder / "imx219.toml"
+    asked = ["init", str(spec), "--size", "1024x1024", "--fov-x-deg", "48.8"]
+    subprocess.run([sys.executable, "-m", "starcat", *asked], check=True, capture_output=True)
+    return build(read_spec(spec), {}, folder / "dist").folder
+
+
+def answers(starcat, database, paths):
+    run = starcat(["identify", database, *paths, "--json"])
+    assert run.code == 0, run.err
+    return [json.loads(line) for line in run.out.splitlines()]
+
+
+def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, database):
+    paths = [NIGHTS / "spel" / f"img_{number}.jpg" for number in (1, 26, 31)]
+    found = answers(starcat, database, paths)
+    assert [one["status"] for one in found] == 3 * ["identified"]
+
+
+@pytest.mark.slow
+def test_all_photographs_are_identified_and_of_one_focal_length(starcat, database):
+    found = answers(starcat, database, [NIGHTS / "spel"])
+    assert [one["status"] for one in found] == 50 * ["identified"]
+    focal_px = np.array([one["focal_length_px"] for one in found])
+    assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
+    assert max(one["false_match_probability"] for one in found) < 1e-9
