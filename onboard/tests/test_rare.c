@@ -439,6 +439,29 @@ static void check_caps(void) {
   check_cap(edge, 0.99499, 0.1000001, 1500);
 }
 
+/* A focal length that is told wrong by up to 3 % is found with the attitude; not so where it may be
+ * wrong by 1 % only. */
+static void check_focal_length(void) {
+  uint64_t seed = 9;
+  for (uint32_t n = 0; n < 12u; n++) {
+    const starcat_real scale = (starcat_real)(n % 2u == 0u ? 1.03 : 0.975);
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &seed, 0.05, SKY_SPOTS, 0, &truth);
+    unit_scratch = unit_triangle;
+    unit_scratch.camera.focal_length_px *= scale;
+    unit_scratch.options.fov_error = (starcat_real)0.01;
+    CHECK_IS(identify(&unit_scratch), STARCAT_NO_MATCH);
+    CHECK(unit_result.reason != (uint32_t)STARCAT_REASON_NONE);
+    CHECK_IS(unit_result.n_usable, truth.count);
+    unit_scratch.options.fov_error = (starcat_real)0.05;
+    CHECK_IS(identify(&unit_scratch), STARCAT_IDENTIFIED);
+    CHECK_IS(wrong_stars(), 0);
+    const starcat_real ratio = unit_result.focal_length_px / unit_triangle.camera.focal_length_px;
+    CHECK((ratio > (starcat_real)0.998) && (ratio < (starcat_real)1.002));
+  }
+  unit_scratch.options.fov_error = (starcat_real)0.6;
+  CHECK_IS(identify(&unit_scratch), STARCAT_E_OPTIONS);
+}
+
 /* True stars in one corner, spots elsewhere, and an attitude that is turned: what it explains is
  * too little, or is found only within wider reaches. */
 static void check_clusters(void) {
@@ -502,5 +525,6 @@ void test_rare(void) {
   check_ways();
   check_priors();
   check_caps();
+  check_focal_length();
   check_clusters();
 }
