@@ -298,8 +298,7 @@ def calibrate(
     write_camera(found, output)
     if plot:
         draw_residuals(found, plot)
-    turned = None if when is None else earth.earth_rotation(found, when)
-    print_calibration(found, output, turned, as_json=json)
+    print_calibration(found, output, when and earth.earth_rotation(found, when), as_json=json)
 
 
 @app.command()
