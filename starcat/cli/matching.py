@@ -277,7 +277,8 @@ def calibrate(
 
     Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
     """
-    from starcat.calibration import earth_rotation as earth
+    from starcat.calibration.earth_rotation import earth_rotation as turned_by
+    from starcat.calibration.earth_rotation import times_of_frames
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
     from starcat.images.figure_file import check_kind
@@ -287,7 +288,7 @@ def calibrate(
     check_kind(plot)
     if times is not None and not earth_rotation:
         raise ConfigError("--times is for --earth-rotation; give both, or neither")
-    when = earth.times_of_frames(files, times) if earth_rotation else None
+    when = times_of_frames(files, times) if earth_rotation else None
     known = read_camera(camera) if camera else None
     size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
@@ -298,7 +299,7 @@ def calibrate(
     write_camera(found, output)
     if plot:
         draw_residuals(found, plot)
-    print_calibration(found, output, when and earth.earth_rotation(found, when), as_json=json)
+    print_calibration(found, output, turned_by(found, when) if when else None, as_json=json)
 
 
 @app.command()

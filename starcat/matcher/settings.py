@@ -129,6 +129,8 @@ class Settings:
         it can serve.
     min_share : float
         Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
+        Where it is not larger than that, agreements that chance gives less often than 1e-12 and
+        whose stars determine the whole frame need none.
     max_steps : float
         Steps that a frame may take (`Budget`), then the best answer so far is given, or none. The
         same steps give the same answer. 100,000 by default, about a second with numpy; the C

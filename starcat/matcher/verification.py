@@ -29,7 +29,7 @@ from starcat.matcher.pose import (
     pose_at,
     scaled_directions,
 )
-from starcat.matcher.settings import AGREEMENT, REACH
+from starcat.matcher.settings import AGREEMENT, MIN_SHARE, REACH
 from starcat.matcher.star_cells import cells_for, stars_in_cap
 
 Withheld = Literal["share_of_frame", "scale"] | None
@@ -353,7 +353,9 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
     is_firm = True
     if chance < 1.0:
         is_firm = determines_frame(seen, residual_rad, pose, observation, refined.last)
-        if share < observation.settings.min_share and not (is_firm and chance <= FIRM_CHANCE):
+        asked = observation.settings.min_share
+        is_free = is_firm and chance <= FIRM_CHANCE and asked <= MIN_SHARE
+        if share < asked and not is_free:
             withheld = "share_of_frame"
         elif is_scaled(
             refined.predicted_px[star],
