@@ -286,9 +286,7 @@ def calibrate(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
-    if times is not None and not earth_rotation:
-        raise ConfigError("--times is for --earth-rotation; give both, or neither")
-    when = times_of_frames(files, times) if earth_rotation else None
+    when = times_of_frames(files, times) if earth_rotation or times else None
     known = read_camera(camera) if camera else None
     size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
