@@ -70,7 +70,7 @@ def test_the_noise_of_a_star_is_that_of_the_closed_form(bench_of):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", SENSORS)
 def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_of):
     bench = bench_of(**SENSORS[name])
@@ -233,7 +233,7 @@ def test_a_wrong_sensor_is_told(change, text):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_the_report_says_it_all(small_artifact, tmp_path):
     """Twice the same bytes with one worker and with two, and files that other tools read."""
     quick = {**PERFECT, "rates_deg_s": [0.0], "false_stars": [3], "missing_shares": [],
