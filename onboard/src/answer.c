@@ -66,7 +66,7 @@ static void set_attitude(const real m[9], starcat_result *result) {
 }
 
 /* Fit the attitude of the answer to the stars that are listed. */
-static void fit(const starcat_workspace *w, starcat_result *result) {
+static void fit_stars(const starcat_workspace *w, starcat_result *result) {
   real square = R(0.0);
   sc_refine(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight, w->n_seen,
             4);
@@ -83,7 +83,7 @@ static void fit(const starcat_workspace *w, starcat_result *result) {
 void sc_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
                    starcat_workspace *work, starcat_result *result) {
   take_stars(image, directions, sigma_px, work);
-  fit(work, result);
+  fit_stars(work, result);
 }
 
 /* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
@@ -111,7 +111,7 @@ static real residuals(const sc_call *call, const real m[9], real *chi_square, ui
  * centroids stand for, and the reduced chi-square. */
 static void tell_errors(const sc_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
-  real h[6] = {0}, s[3][3] = {{0}}, chi_square = R(0.0), column[3][3], inverse[6];
+  real h[6] = {0}, s[3][3] = {{0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
   const real unstated = residuals(call, result->matrix, &chi_square, &n_stated);
   const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
@@ -135,17 +135,16 @@ static void tell_errors(const sc_call *call, starcat_result *result) {
       s[i][j] += scale * scale * (turn[0][i] * turn[0][j] + turn[1][i] * turn[1][j]);
     }
   }
-  for (uint32_t j = 0; j < 3u; j++) {
-    if (!sc_solve(h, s[j], column[j], inverse)) { /* rows of the symmetric s are its columns */
-      return;
-    }
+  if (!sc_solve(h, s[0], unused, inverse)) {
+    return; /* all stars are at one place */
   }
+  const real p[3][3] = {{inverse[0], inverse[1], inverse[2]},
+                        {inverse[1], inverse[3], inverse[4]},
+                        {inverse[2], inverse[4], inverse[5]}};
   for (uint32_t k = 0; k < 9u; k++) {
-    const uint32_t i = k / 3u, j = k % 3u;
-    const real along[3] = {column[0][i], column[1][i], column[2][i]};
-    real x[3];
-    (void)sc_solve(h, along, x, inverse);
-    result->covariance_rad2[k] = x[j];
+    for (uint32_t i = 0; i < 3u; i++) {
+      result->covariance_rad2[k] += p[k / 3u][i] * sc_dot(s[i], p[k % 3u]);
+    }
   }
 }
 
@@ -162,7 +161,7 @@ starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_res
   set_attitude(w->best.matrix, result);
   result->residual_rad = w->best.residual_rad;
   if (call->sigma_px != NULL) {
-    fit(w, result);
+    fit_stars(w, result);
   }
   tell_errors(call, result);
   result->log_chance = w->best.log_chance;

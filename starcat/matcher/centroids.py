@@ -65,11 +65,11 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
                 "y_px, and may name mag or flux"
             )
         brightness = next((name for name in BRIGHTNESS if name in names), None)
-        beside = [name for name in (brightness, SIGMA) if name in names]
+        beside = [name for name in (brightness, SIGMA) if name is not None and name in names]
         columns = ["x_px", "y_px", *beside]
         measured = [
             [
-                _number(row[name] or "nan" if name in beside else row[name], name,
+                _number((row[name] or "nan") if name in beside else row[name], name,
                         f"{path}: line {rows.line_num}")
                 for name in columns
             ]
@@ -194,17 +194,13 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
         yield from _json_frames(line, Path(f"{name} {number}"))
 
 
-def write_centroids(
-    centroids_px: Array, path: Path, mag: Array | None = None, sigma_px: Array | None = None
-) -> None:
+def write_centroids(centroids_px: Array, path: Path, mag: Array | None = None) -> None:
     """Write the centroids of one frame."""
-    beside = {"mag": mag, SIGMA: sigma_px}
-    held = {name: values for name, values in beside.items() if values is not None}
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["x_px", "y_px", *held])
-            columns = np.column_stack([centroids_px, *held.values()])
+            writer.writerow(["x_px", "y_px"] + ([] if mag is None else ["mag"]))
+            columns = centroids_px if mag is None else np.column_stack([centroids_px, mag])
             writer.writerows([f"{value:.4f}" for value in row] for row in columns)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error

@@ -158,41 +158,35 @@ class Matcher(Settings, _WithDatabase):
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels; the order carries no meaning. Centroids that are not finite, lie outside
-            the frame or repeat another get no star and are reported.
+            Pixels, in any order. Those that are not finite, outside of the frame or repeat
+            another get no star and are reported.
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
-            Magnitudes; they decide what is tried first. With ``noise_mag`` they also decide
-            what is accepted, and their zero point has to be that of the database.
+            They decide what is tried first; with ``noise_mag`` also what is accepted, and their
+            zero point has to be that of the database.
         sigma_px : array_like of float64, shape (N,), optional
-            Standard deviation of each centroid on each axis, NaN where it is not known. They are
-            the weights of the attitude of an answer and what its covariance is made of; which
-            star a centroid is does not depend on them.
+            Standard deviation of each centroid on each axis, NaN where it is not known: weights of
+            the attitude of an answer, of which its covariance is made. Stars do not depend on them.
         fov_error : float
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
-        prior : array_like of float64, shape (4,), optional
-            Attitude that is expected, as ``q_body_from_icrs``. Only the stars near it are then
-            compared, which no method and no product is needed for; the verification is the same.
-        prior_error_deg : float, optional
-            Largest error of the prior, as an angle of rotation; above 0, at most 20.
+        prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
+            Attitude that is expected, as ``q_body_from_icrs``, and its largest error as an angle of
+            rotation, at most 20. Only the stars near it are compared; the verification is the same.
         fov_deg : pair of float, optional
-            Narrowest and widest field across the frame's width where nothing else is known: of
-            the camera only the size is used then. The database needs the product ``levels``, and
-            the brightness of the spots helps much.
+            Narrowest and widest field across the frame's width where of the camera only the size is
+            known. The database needs the product ``levels``, and magnitudes help much.
 
         Returns
         -------
         MatchResult
-            ``no_match`` and ``too_few_stars`` are answers too. With a prior it is ``no_match``
-            where no attitude as near as that explains the frame.
+            ``no_match`` and ``too_few_stars`` are answers too.
 
         Raises
         ------
         ConfigError
-            If the centroids are not pairs of numbers, magnitudes or noises are not one each, the
-            prior is no quaternion, or an error is missing or out of range.
+            If an array is of another shape, the prior no quaternion, an error missing or too large.
         """
         camera = camera or self.database.camera
         px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)

@@ -8,7 +8,7 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
-from starcat.matcher.pose import focal_length_error_px, fit_by_weights
+from starcat.matcher.pose import fit_by_weights, focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
 from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty

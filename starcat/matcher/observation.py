@@ -81,9 +81,7 @@ def as_frame(
 
 
 def as_arrays(
-    centroids_px: ArrayLike,
-    magnitudes: ArrayLike | None = None,
-    sigma_px: ArrayLike | None = None,
+    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None, sigma_px: ArrayLike | None = None
 ) -> tuple[Pixels, Array | None, Array | None]:
     """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
@@ -133,24 +131,25 @@ def as_frames(
     joined = _joined(centroids_px, *beside.values())
     if joined is None:  # one after the other, which finds what is wrong, or not an array
         none = [None] * len(centroids_px)
-        rows = zip(centroids_px, *(none if one is None else one for one in beside.values()))
-        each = [as_arrays(*row) for row in rows]
-        px = [np.empty((0, 2)), *(row[0] for row in each)]
-        # A frame that has None for an array has none that is known.
+        columns = [none if given is None else given for given in beside.values()]
+        each = [as_arrays(*row) for row in zip(centroids_px, *columns, strict=True)]
+        counts = [len(px) for px, *_ in each]
         mag, sigma = (
-            None
-            if given is None
-            else np.concatenate(
-                [np.empty(0)]
-                + [np.full(len(row[0]), np.nan) if row[n] is None else row[n] for row in each]
-            )
+            None if given is None else _known([row[n] for row in each], counts)
             for n, given in enumerate(beside.values(), start=1)
         )
-        joined = [len(row[0]) for row in each], np.concatenate(px), mag, sigma
+        joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
     counts, all_px, all_mags, all_sigmas = joined
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=starts[1:])
     return Frames(starts, all_px, all_mags, camera, all_sigmas)
+
+
+def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array:
+    """Return arrays of frames joined; NaN for a frame that has None."""
+    given = zip(arrays, counts, strict=True)
+    whole = [np.full(count, np.nan) if one is None else one for one, count in given]
+    return np.concatenate([np.empty(0), *whole])
 
 
 def _joined(

@@ -35,7 +35,7 @@ SURE_CORNER = 0.5
 the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
 
 LEAST_WEIGHT = 1e-8
-"""Least weight of a centroid over the largest of its frame, which rounding still leaves room for."""
+"""Least weight of a centroid over the largest of its frame; rounding leaves no room for less."""
 
 _UNIT = np.eye(3)
 
@@ -119,9 +119,7 @@ def weights_of(sigma_px: Array) -> Array:
     return np.asarray(np.maximum((least / known) ** 2, LEAST_WEIGHT))
 
 
-def fit_by_weights(
-    seen: Directions, stars: Directions, sigma_px: Array
-) -> tuple[Matrix, float]:
+def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tuple[Matrix, float]:
     """Return the attitude that fits centroids best by their noise, and its residual, radians."""
     matrix = solve_wahba_svd(seen, stars, weights_of(sigma_px))
     difference = seen - stars @ matrix.T

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Matrix
+from starcat.arrays import Array, Matrix
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
@@ -20,7 +20,9 @@ from starcat.matcher import sky_objects
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame
+from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.stars import (
+    ARCSEC,
     NO_STARS,
     MatchedStars,
     attitude_covariance,
@@ -288,13 +290,34 @@ class MatchResult:
     def remarks(self) -> tuple[str, ...]:
         """What a reader of the answer should know beside it, in sentences."""
         chi_square = self.reduced_chi_square
-        free = 2 * np.count_nonzero(np.isfinite(self.stars.sigma_px)) - 3
+        free = 2 * int(np.isfinite(self.stars.sigma_px).sum()) - 3
         if not chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(free)):
             return ()
         return (
             f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
             f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
             "length and distortion; the covariance is too small",
+        )
+
+    def with_noise(self, sigma_px: Array) -> MatchResult:
+        """Return the same answer with its attitude fitted by the noises of the centroids.
+
+        ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
+        """
+        stars = self.stars
+        if self.frame is None or self.database is None or self.camera is None:
+            raise ValueError("this MatchResult does not hold the frame that was asked about")
+        px = np.column_stack([stars.x_px, stars.y_px])
+        matrix, residual_rad = fit_by_weights(
+            self.camera.directions_from_pixels(px),
+            self.database.directions[stars.star_index],
+            sigma_px[stars.spot],
+        )
+        return replace(
+            self,
+            matrix=matrix,
+            residual_arcsec=residual_rad * ARCSEC,
+            frame=replace(self.frame, sigma_px=sigma_px),
         )
 
     def table(self) -> QTable:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -121,13 +122,9 @@ class Tracker:
         expected, error_deg = prior, prior_error_deg
         if expected is None and error_deg is None:
             expected, error_deg = self._predicted(now, camera)
+        beside: dict[str, Any] = {"magnitudes": magnitudes, "sigma_px": sigma_px}
         identify = partial(
-            self.matcher.identify,
-            centroids_px,
-            camera,
-            magnitudes=magnitudes,
-            sigma_px=sigma_px,
-            fov_error=fov_error,
+            self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
         found = None
         if expected is not None or error_deg is not None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -40,7 +39,6 @@ def identify_in_time(
     observer: Observer,
     *,
     magnitudes: ArrayLike | None = None,
-    sigma_px: ArrayLike | None = None,
     tolerance_px: float = TOLERANCE_PX,
     max_false_match_probability: float = CERTAIN,
 ) -> MatchResult:
@@ -52,8 +50,8 @@ def identify_in_time(
         `Matcher.identify`, its camera and options filled in.
     database, observer : Database, Observer
         The stars that it names; when and from where the frame was taken.
-    centroids_px, magnitudes, sigma_px : array_like of float64, shape (N, 2), (N,) and (N,)
-        Pixels, magnitudes of any zero point, and the noise of each centroid.
+    centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
+        Pixels, and magnitudes of any zero point.
     camera : Camera
         The camera that took the frame; a focal length that the answer has found counts instead.
     tolerance_px, max_false_match_probability : float
@@ -66,9 +64,8 @@ def identify_in_time(
         not identified is asked again without one or two of its three brightest spots; such an
         answer counts if planets are there, with the probability of all these questions.
     """
-    given = as_frame(centroids_px, camera, magnitudes, sigma_px)
+    given = as_frame(centroids_px, camera, magnitudes)
     frame, mag = given.centroids_px, given.magnitudes
-    identify = partial(identify, sigma_px=given.sigma_px)
     found = identify(frame, magnitudes=mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:
