@@ -187,6 +187,7 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
     }
   }
   drop_repeats(work, result);
+  sc_list_columns(call);
   for (uint32_t i = 0; i < work->count; i++) {
     if (!sc_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;

@@ -71,6 +71,7 @@ typedef struct {
   real log_scales, bend;
   real tolerance_px, tolerance_rad, reach_px;
   real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
+  real columns_per_px; /* columns of the detector that list its centroids */
   real mag_reach; /* largest difference of magnitudes of a match; 0: any */
   real log_limit; /* largest accepted chance */
   real log_certain;
@@ -92,6 +93,23 @@ static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3
   icrs[0] = SC_UNIT * (real)direction[0];
   icrs[1] = SC_UNIT * (real)direction[1];
   icrs[2] = SC_UNIT * (real)direction[2];
+}
+
+/* The rows of the stars of a feature. */
+static inline void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
+                              uint32_t rows[3]) {
+  const size_t at = (size_t)feature * width;
+  if (image->index_bytes == 2u) {
+    const uint16_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  } else {
+    const uint32_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  }
 }
 
 /* attitude.c */
@@ -132,6 +150,7 @@ int sc_spend(starcat_workspace *work, uint32_t steps);
 int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row);
 int sc_try(sc_call *call, const real m[9], real focal);
 void sc_project(const sc_call *call, const real m[9], real margin_px);
+void sc_list_columns(sc_call *call);
 
 /* frame.c */
 starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
@@ -149,7 +168,6 @@ real sc_side(const sc_call *call, uint32_t i, uint32_t j);
 void sc_each_triangle(sc_call *call, sc_look_up look_up);
 void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
                      uint32_t *stop);
-void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, uint32_t rows[3]);
 int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]);
 int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]);
 

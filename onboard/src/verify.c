@@ -5,6 +5,9 @@
  */
 #include "internal.h"
 
+#define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
+#define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
+
 /* Take steps from what is left of the budget. Returns 0 if it is used up. */
 int sc_spend(starcat_workspace *work, uint32_t steps) {
   if (steps >= work->steps_left) {
@@ -47,40 +50,70 @@ void sc_project(const sc_call *call, const real m[9], real margin_px) {
   w->n_within = count;
 }
 
+/* The column of the detector that a place is in; the first or the last one outside of it. */
+static uint32_t column_of(const sc_call *call, real x_px) {
+  const real scaled = x_px * call->columns_per_px;
+  if (!(scaled > R(0.0))) {
+    return 0;
+  }
+  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
+}
+
+/* List the centroids by the column of the detector that they are in. */
+void sc_list_columns(sc_call *call) {
+  starcat_workspace *w = call->work;
+  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
+  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
+    w->column[n] = 0;
+  }
+  for (uint32_t i = 0; i < w->count; i++) {
+    w->column[column_of(call, w->x[i])]++;
+  }
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
+    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
+  }
+  for (uint32_t i = w->count; i > 0u; i--) { /* where it begins */
+    const uint32_t n = column_of(call, w->x[i - 1u]);
+    w->column[n]--;
+    w->in_column[w->column[n]] = (uint16_t)(i - 1u);
+  }
+}
+
+/* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
+ * them is the nearest to it, and to which it is the nearest so far. */
+static void match_star(const sc_call *call, uint32_t k, real reach_px, real reach) {
+  starcat_workspace *w = call->work;
+  const real x = w->x_of[k], y = w->y_of[k];
+  const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
+  w->nearest[k] = UINT16_MAX;
+  for (uint32_t n = w->column[column_of(call, x - reach_px)]; n < stop; n++) {
+    const uint32_t i = w->in_column[n];
+    const real dx = w->x[i] - x, dy = w->y[i] - y;
+    const real square = dx * dx + dy * dy;
+    if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
+      if ((w->match[i] < 0) || (square < w->match_square[i])) {
+        w->match_square[i] = square;
+        w->match[i] = (int16_t)k;
+      }
+      if ((w->nearest[k] == UINT16_MAX) || (square < w->nearest_square[k]) ||
+          ((square == w->nearest_square[k]) && (i < w->nearest[k]))) {
+        w->nearest_square[k] = square;
+        w->nearest[k] = (uint16_t)i;
+      }
+    }
+  }
+}
+
 /* Match centroids and stars that are the nearest to each other, within reach. Returns how many
  * do. */
 static uint32_t match(const sc_call *call, real reach_px) {
   starcat_workspace *w = call->work;
-  const real reach = reach_px * reach_px;
-  const uint32_t n_within = w->n_within;
   uint32_t matched = 0;
-  for (uint32_t k = 0; k < n_within; k++) {
-    w->nearest[k] = UINT16_MAX;
-  }
   for (uint32_t i = 0; i < w->count; i++) {
-    const real x = w->x[i], y = w->y[i];
-    real least = reach;
-    int16_t best = -1;
-    for (uint32_t k = 0; k < n_within; k++) {
-      const real dx = x - w->x_of[k];
-      if (dx * dx > reach) { /* nearly all: the rest is not even computed */
-        continue;
-      }
-      const real dy = y - w->y_of[k];
-      const real square = dx * dx + dy * dy;
-      if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
-        if ((best < 0) || (square < least)) {
-          least = square;
-          best = (int16_t)k;
-        }
-        if ((w->nearest[k] == UINT16_MAX) || (square < w->nearest_square[k])) {
-          w->nearest_square[k] = square;
-          w->nearest[k] = (uint16_t)i;
-        }
-      }
-    }
-    w->match[i] = best;
-    w->match_square[i] = least;
+    w->match[i] = -1;
+  }
+  for (uint32_t k = 0; k < w->n_within; k++) {
+    match_star(call, k, reach_px, reach_px * reach_px);
   }
   for (uint32_t i = 0; i < w->count; i++) {
     if ((w->match[i] >= 0) && (w->nearest[w->match[i]] != i)) {
@@ -200,7 +233,7 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
     const real factor = is_final ? r->last : r->first[n];
     sc_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
     matched = match(call, factor * call->reach_px);
-    if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u))) {
+    if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
       return 0;
     }
     if ((matched < SC_MIN_STARS) || (is_as_before(w) && is_final)) {
@@ -209,6 +242,19 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
     refine_matched(call, m);
   }
   return matched;
+}
+
+/* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
+ * with every star, and polynomials of both are added up. Returns
+ * 0 if they are used up. */
+static int spend_on_bound(const sc_call *call) {
+  starcat_workspace *w = call->work;
+  const uint32_t most = w->count < w->n_within ? w->count : w->n_within;
+  uint32_t steps = STEPS_OF_MATCH * (w->count + w->n_within);
+  if (call->mag_reach > R(0.0)) {
+    steps += w->count * w->n_within + (w->count + w->n_within) * most;
+  }
+  return sc_spend(w, steps);
 }
 
 static void withhold(starcat_agreement *found, uint32_t reason) {
@@ -233,6 +279,10 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
   found->withheld = 0;
   found->is_firm = 1;
   if (matched < SC_MIN_STARS) {
+    return;
+  }
+  if (!spend_on_bound(call)) {
+    found->n_matched = 0; /* as if it had not been found */
     return;
   }
   for (uint32_t i = 0; i < w->count; i++) {
@@ -398,6 +448,9 @@ int sc_try(sc_call *call, const real m[9], real focal) {
     attitude[k] = m[k];
   }
   w->n_tried++;
+  if (!sc_spend(w, STEPS_OF_TRY)) {
+    return 1;
+  }
   sc_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
