@@ -96,6 +96,13 @@ struct starcat_workspace {
   starcat_agreement wider;
   starcat_agreement best;
 
+  /* The centroids of the answer that are stars, where these are, and their weights. */
+  uint32_t n_seen;
+  uint16_t seen[STARCAT_MAX_CENTROIDS];
+  starcat_real seen_body[STARCAT_MAX_CENTROIDS][3];
+  starcat_real seen_icrs[STARCAT_MAX_CENTROIDS][3];
+  starcat_real weight[STARCAT_MAX_CENTROIDS];
+
   uint32_t steps_left;
   uint32_t n_tried;
 };

@@ -163,7 +163,7 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
     if (sc_is_between(sc_chord_square(first, found[n]), o->low[1], o->high[1]) &&
         sc_is_between(sc_chord_square(second, found[n]), o->low[2], o->high[2]) &&
         sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-      sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
+      sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
       if (sc_try(call, m, R(1.0)) != 0) {
         return 1;
       }

@@ -415,7 +415,7 @@ static int try_order(sc_call *call, const observed *o, real stars[3][3],
   if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
   return sc_try(call, m, focal);
 }
 

@@ -174,7 +174,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], which, n, 4);
+  sc_refine(m, &body[0][0], &icrs[0][0], which, NULL, n, 4);
 }
 
 /* Refine on all matches. */

@@ -11,7 +11,7 @@ static sky_frame truth;
 static sc_call call;
 
 static starcat_frame frame_of_truth(void) {
-  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes};
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
   return frame;
 }
 
@@ -56,7 +56,7 @@ static void check_degenerate(void) {
   const starcat_real zero[6] = {0}, v[3] = {1, 2, 3};
   starcat_real x[3], inverse[6], m[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
   CHECK(!sc_solve(zero, v, x, inverse));
-  sc_refine(m, v, v, NULL, 0, 4);
+  sc_refine(m, v, v, NULL, NULL, 0, 4);
   CHECK(m[0] == (starcat_real)1.0);
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
