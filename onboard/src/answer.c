@@ -31,8 +31,7 @@ static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
  * and their weights: one over the square of the noise, over the largest. */
 static void take_stars(const starcat_image *image, const real *directions, const real *sigma_px,
                        starcat_workspace *w) {
-  const real(*body)[3] = w->best.focal == R(1.0) ? (const real(*)[3])w->body
-                                                  : (const real(*)[3])w->scaled;
+  real(*body)[3] = w->best.focal == R(1.0) ? w->body : w->scaled;
   real least = R(0.0);
   uint32_t n = 0;
   for (uint32_t i = 0; i < w->count; i++) {
@@ -111,7 +110,7 @@ static real residuals(const sc_call *call, const real m[9], real *chi_square, ui
  * centroids stand for, and the reduced chi-square. */
 static void tell_errors(const sc_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
-  real h[6] = {0}, s[3][3] = {{0}}, chi_square = R(0.0), unused[3], inverse[6];
+  real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
   const real unstated = residuals(call, result->matrix, &chi_square, &n_stated);
   const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;

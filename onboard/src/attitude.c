@@ -60,9 +60,11 @@ int sc_invert(const sc_information *m, sc_information *inverse) {
     return 0;
   }
   const real scale = R(1.0) / left;
-  for (uint32_t i = 0, at = 0; i < 3u; i++) {
-    for (uint32_t j = i; j < 3u; j++, at++) {
+  uint32_t at = 0;
+  for (uint32_t i = 0; i < 3u; i++) {
+    for (uint32_t j = i; j < 3u; j++) {
       inverse->angles[at] = of_angles[at] + scale * along[i] * along[j];
+      at++;
     }
     inverse->with_scale[i] = -scale * along[i];
   }

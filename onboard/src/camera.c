@@ -114,7 +114,7 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
 void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]) {
   const real u = body[0] / body[2], v = body[1] / body[2];
   real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
-  if (camera->distorted) {
+  if (camera->distorted != 0) {
     slopes(&camera->given, u, v, s);
   }
   /* b x db/du = z (b x e_x), and so for v. */
@@ -166,13 +166,10 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   return STARCAT_IDENTIFIED;
 }
 
-/* Use another focal length from now on, a multiple of the given one; the given one itself where the
- * lens would then form no image of a centroid. */
-void sc_set_focal(sc_call *call, real focal) {
+/* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
+ * Returns 0 where the lens would then form no image of a centroid. */
+static int scale_camera(sc_call *call, real focal) {
   starcat_workspace *w = call->work;
-  if (focal == call->focal) {
-    return;
-  }
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
   int good = sc_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
@@ -181,8 +178,14 @@ void sc_set_focal(sc_call *call, real focal) {
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
-  if (!good) {
-    sc_set_focal(call, R(1.0));
+  return good;
+}
+
+/* Use another focal length from now on, a multiple of the given one; the given one itself where the
+ * lens forms no image with the other. */
+void sc_set_focal(sc_call *call, real focal) {
+  if ((focal != call->focal) && !scale_camera(call, focal)) {
+    (void)scale_camera(call, R(1.0));
   }
 }
 

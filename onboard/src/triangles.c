@@ -187,7 +187,8 @@ static uint32_t list_neighbours(sc_call *call, uint32_t i, uint32_t count) {
     if ((k == i) || ((n == STARCAT_NEIGHBOURS) && !(apart < square[n - 1u]))) {
       continue;
     }
-    uint32_t at = n < STARCAT_NEIGHBOURS ? n++ : n - 1u;
+    uint32_t at = n < STARCAT_NEIGHBOURS ? n : n - 1u;
+    n = at + 1u;
     while ((at > 0u) && (apart < square[at - 1u])) {
       square[at] = square[at - 1u];
       w->neighbour[i][at] = w->neighbour[i][at - 1u];
@@ -568,7 +569,7 @@ static int look_up_similar(sc_call *call, const observed *o, real area, real are
     part[1] = part[1] < end ? part[1] : end;
     radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
     radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
-    if (look_up(call, o, part, radii)) {
+    if (look_up(call, o, part, radii) != 0) {
       return 1;
     }
     part[0] = part[1];

@@ -137,7 +137,7 @@ static int is_as_before(starcat_workspace *w) {
 
 /* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
  * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
-static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*icrs)[3],
+static void refine(sc_call *call, real m[9], const uint16_t *of, const real *icrs,
                    const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
@@ -146,7 +146,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
     for (uint32_t i = 0; i < n; i++) {
       const real *b = call->body[of[i]];
       real a[3], left[3], moved[3];
-      sc_turn(m, icrs[which != NULL ? which[i] : i], a);
+      sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
       for (uint32_t k = 0; k < 3u; k++) {
         left[k] = b[k] - a[k];
       }
@@ -157,7 +157,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
       shrink += b[2] * b[2] * sc_dot(b, left) - b[2] * left[2];
       sc_inform(&h, b);
     }
-    if (sc_solve(h.angles, h.with_scale, along, unused)) {
+    if (sc_solve(h.angles, h.with_scale, along, unused) != 0) {
       const real of_scale = h.scale - sc_dot(h.with_scale, along);
       if (of_scale > R(0.0)) {
         step = (shrink - sc_dot(along, turn)) / of_scale;
@@ -174,7 +174,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], which, NULL, n, 4);
+  sc_refine(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
 /* Refine on all matches. */
@@ -189,19 +189,18 @@ static void refine_matched(sc_call *call, real m[9]) {
       n++;
     }
   }
-  refine(call, m, of, (const real(*)[3])w->near_icrs, which, n);
+  refine(call, m, of, &w->near_icrs[0][0], which, n);
 }
 
 /* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
 typedef struct {
   uint32_t count;
-  real first[4];
+  real first[3];
   real last;
 } reaches;
 
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
-static const reaches ROUGH = {1, {R(2.0)}, R(1.0)};
-static const reaches WIDER = {2, {R(4.0), R(2.0)}, R(1.0)};
+static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
  * is used up. */
@@ -304,7 +303,7 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
     if ((found->share < SC_MIN_SHARE) &&
         !((found->is_firm != 0u) && (found->log_bound <= SC_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
-    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px)) {
+    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
       withhold(found, STARCAT_REASON_SCALE);
     }
   }
@@ -350,7 +349,7 @@ static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9
       n++;
     }
   }
-  refine(call, m, of, (const real(*)[3])icrs, NULL, n);
+  refine(call, m, of, &icrs[0][0], NULL, n);
 }
 
 /* Begin again from the attitude and the focal length of an agreement. */
@@ -411,7 +410,7 @@ static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) 
       real m[9];
       begin_at(call, &w->found, m);
       judge(call, m, fit(call, m, &r), r.last, &w->wider);
-      if (is_better(&w->wider, &w->found)) {
+      if (is_better(&w->wider, &w->found) != 0) {
         w->found = w->wider;
       }
     }
@@ -439,6 +438,7 @@ static void try_other_scales(sc_call *call) {
 /* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
  * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
 int sc_try(sc_call *call, const real m[9], real focal) {
+  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
