@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -100,6 +101,13 @@ def ended(main: Callable[[Rows], None]) -> NoReturn:
         for line in told:
             print(f"{what}: {line}", file=sys.stderr)
     sys.exit(1 if rows.failed else LACKING if rows.lacking else 0)
+
+
+def need(*packages: str) -> None:
+    """Ask for packages that starcat itself runs without."""
+    for name in packages:
+        if find_spec(name) is None:
+            raise LackingError(f"the package {name}: pip install {name}")
 
 
 def database(name: str, folder: Path) -> Built:
