@@ -343,7 +343,8 @@ def test_identify_as_json(starcat, frame, small_artifact):
     assert list(answer) == [
         "frame", "status", "origin", "n_matched",
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
-        "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec", "false_match_probability",
+        "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec",
+        "reduced_chi_square", "remarks", "false_match_probability",
         "focal_length_px", "focal_length_error_px", "time_s", "stars",
     ]  # fmt: skip
     assert answer["status"] == "identified"

@@ -180,7 +180,7 @@ def test_what_numpy_cannot_convert_is_refused(triangles, values):
 
 @pytest.mark.parametrize("shape", [(3,), (5,), (4, 1), ()])
 def test_magnitudes_of_another_number_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"magnitudes have shape .*expected \(4,\)"):
+    with pytest.raises(ConfigError, match=r"magnitudes has shape .*expected \(4,\)"):
         observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
 
 

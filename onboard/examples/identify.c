@@ -74,7 +74,7 @@ int main(int argc, char **argv) {
   starcat_camera_of(&image, &camera);
   starcat_default_options(&options);
   const uint32_t count = read_frame(argv[2], columns);
-  const starcat_frame frame = {count, columns[0], columns[1], columns[2]};
+  const starcat_frame frame = {count, columns[0], columns[1], columns[2], NULL};
   status = starcat_identify(&image, &camera, &options, &frame, &work, &result);
   (void)printf("%.96s: %u stars, status %d after %u steps\n", image.name, (unsigned)image.n_stars,
                (int)status, (unsigned)result.steps);

@@ -116,12 +116,15 @@ typedef struct {
   uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
-/* The centroids of a frame. Arrays of `count`; magnitudes may be null, and NaN where unknown. */
+/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN where
+ * unknown. The noises, standard deviations on each axis above 0, are the weights of the attitude of
+ * an answer, and what its covariance and its chi-square are made of in place of noise_px. */
 typedef struct {
   uint32_t count;
   const starcat_real *x_px;
   const starcat_real *y_px;
   const starcat_real *magnitudes;
+  const starcat_real *sigma_px;
 } starcat_frame;
 
 typedef struct {
@@ -138,6 +141,11 @@ typedef struct {
   uint32_t best_n_matched;               /* if not identified: matches of the best agreement, */
   starcat_real best_log_chance;          /* its bound */
   starcat_real best_share;               /* and the share of the frame that it explains */
+  starcat_real covariance_rad2[9];       /* of small turns about the camera's x, y and z, with the
+                                            stated noise, else with that of the residuals; zeros
+                                            if not identified, or its stars determine no attitude */
+  starcat_real reduced_chi_square;       /* squared residuals in the stated noise, a degree of
+                                            freedom: above 2 that is too small; 0: not stated */
   int32_t star[STARCAT_MAX_CENTROIDS];   /* row in the image, or one of the negative numbers */
 } starcat_result;
 

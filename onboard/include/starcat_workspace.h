@@ -12,6 +12,12 @@
 /* Nearest centroids that a centroid makes triangles with in a crowded frame. */
 #define STARCAT_NEIGHBOURS 20
 
+/* Columns of the detector, by which the centroids near a star are found. */
+#define STARCAT_COLUMNS 64u
+
+/* Words of 32 marks, of which a star has one by its row. */
+#define STARCAT_MARKS 256u
+
 /* Which star each centroid of a frame is under an attitude. */
 typedef struct {
   starcat_real matrix[9];
@@ -39,6 +45,10 @@ struct starcat_workspace {
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
   starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length of an attitude */
 
+  /* The centroids by columns of the detector: those of column n begin at column[n]. */
+  uint16_t column[STARCAT_COLUMNS + 1u];
+  uint16_t in_column[STARCAT_MAX_CENTROIDS];
+
   /* Separations of pairs of centroids k > i, at k (k - 1) / 2 + i. */
   starcat_real separation_rad[STARCAT_MOST_PAIRS];
   uint16_t heap[STARCAT_MOST_PAIRS];
@@ -46,6 +56,11 @@ struct starcat_workspace {
   /* The nearest centroids of each one in a crowded frame, which has no separations of pairs. */
   uint16_t neighbour[STARCAT_MAX_CENTROIDS][STARCAT_NEIGHBOURS];
   uint32_t is_crowded;
+
+  /* Stars that may be corners of a triangle of centroids: either of the first two, and each. */
+  uint32_t either[STARCAT_MARKS];
+  uint32_t corner[2][STARCAT_MARKS];
+  uint32_t third[STARCAT_MARKS];
 
   /* The stars around the field of an attitude, and where it puts them. */
   uint32_t n_near;
@@ -80,6 +95,13 @@ struct starcat_workspace {
   starcat_agreement found;
   starcat_agreement wider;
   starcat_agreement best;
+
+  /* The centroids of the answer that are stars, where these are, and their weights. */
+  uint32_t n_seen;
+  uint16_t seen[STARCAT_MAX_CENTROIDS];
+  starcat_real seen_body[STARCAT_MAX_CENTROIDS][3];
+  starcat_real seen_icrs[STARCAT_MAX_CENTROIDS][3];
+  starcat_real weight[STARCAT_MAX_CENTROIDS];
 
   uint32_t steps_left;
   uint32_t n_tried;

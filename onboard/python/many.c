@@ -19,33 +19,6 @@ static double now_s(void) {
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
-/* Fit the attitude once more, with directions that were not rounded. */
-static void fit_again(const double *directions, starcat_memory *memory) {
-  const starcat_workspace *work = &memory->work;
-  const double(*seen)[3] = work->best.focal == 1.0 ? work->body : work->scaled;
-  starcat_result *result = &memory->result;
-  double square = 0.0;
-  uint32_t n = 0;
-  for (uint32_t i = 0; i < work->count; i++) {
-    if (work->best.star[i] >= 0) {
-      for (size_t k = 0; k < 3u; k++) {
-        memory->body[n][k] = seen[i][k];
-        memory->icrs[n][k] = directions[3u * (size_t)work->best.star[i] + k];
-      }
-      n++;
-    }
-  }
-  sc_refine(result->matrix, &memory->body[0][0], &memory->icrs[0][0], NULL, n, 4);
-  sc_quaternion(result->matrix, result->q_body_from_icrs);
-  sc_matrix(result->q_body_from_icrs, result->matrix);
-  for (uint32_t i = 0; i < n; i++) {
-    double turned[3];
-    sc_turn(result->matrix, memory->icrs[i], turned);
-    square += sc_chord_square(memory->body[i], turned);
-  }
-  result->residual_rad = sqrt(square / (double)n);
-}
-
 /* What the library found, as Python wants it. */
 static void tell(const starcat_result *result, starcat_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
@@ -65,9 +38,10 @@ static void tell(const starcat_result *result, starcat_answer *answer) {
 }
 
 static int identify(const starcat_search *search, uint32_t count, const double *pairs_px,
-                    const double *magnitudes, const double *q_prior, double uncertainty_rad,
-                    starcat_answer *answer, int32_t *star, starcat_memory *memory) {
-  const starcat_frame frame = {count, memory->x_px, memory->y_px, magnitudes};
+                    const double *magnitudes, const double *sigma_px, const double *q_prior,
+                    double uncertainty_rad, starcat_answer *answer, int32_t *star,
+                    starcat_memory *memory) {
+  const starcat_frame frame = {count, memory->x_px, memory->y_px, magnitudes, sigma_px};
   starcat_result *result = &memory->result;
   memset(answer, 0, sizeof *answer);
   if (count > STARCAT_MAX_CENTROIDS) {
@@ -93,7 +67,7 @@ static int identify(const starcat_search *search, uint32_t count, const double *
     star[i] = row < 0 ? row : search->rows[row];
   }
   if ((status == STARCAT_IDENTIFIED) && (search->directions != NULL)) {
-    fit_again(search->directions, memory);
+    sc_fit_answer(search->image, search->directions, sigma_px, &memory->work, result);
   }
   if (has_stars) {
     tell(result, answer);
@@ -102,19 +76,21 @@ static int identify(const starcat_search *search, uint32_t count, const double *
 }
 
 int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
-                const void *magnitudes, const void *q_prior, double uncertainty_rad,
-                starcat_memory *memory) {
-  return identify(search, count, pairs_px, magnitudes, q_prior, uncertainty_rad, &memory->answer,
-                  memory->star, memory);
+                const void *magnitudes, const void *sigma_px, const void *q_prior,
+                double uncertainty_rad, starcat_memory *memory) {
+  return identify(search, count, pairs_px, magnitudes, sigma_px, q_prior, uncertainty_rad,
+                  &memory->answer, memory->star, memory);
 }
 
 void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
                   const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                  starcat_answer *answers, int32_t *stars, starcat_memory *memory) {
+                  const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                  starcat_memory *memory) {
   for (uint32_t n = first; n < stop; n++) {
     const int64_t start = starts[n];
     (void)identify(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
-                   magnitudes == NULL ? NULL : magnitudes + start, NULL, 0.0, answers + n,
+                   magnitudes == NULL ? NULL : magnitudes + start,
+                   sigma_px == NULL ? NULL : sigma_px + start, NULL, 0.0, answers + n,
                    stars + start, memory);
   }
 }

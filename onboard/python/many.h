@@ -38,23 +38,21 @@ typedef struct {
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
   double x_px[STARCAT_MAX_CENTROIDS];
   double y_px[STARCAT_MAX_CENTROIDS];
-  double body[STARCAT_MAX_CENTROIDS][3];
-  double icrs[STARCAT_MAX_CENTROIDS][3];
   starcat_workspace work;
   starcat_result result;
 } starcat_memory;
 
 /* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
- * doubles: x and y of each centroid, magnitudes or null, four of a quaternion. Returns the status
- * that the answer in the memory has too. */
+ * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
+ * the status that the answer in the memory has too. */
 int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
-                const void *magnitudes, const void *q_prior, double uncertainty_rad,
-                starcat_memory *memory);
+                const void *magnitudes, const void *sigma_px, const void *q_prior,
+                double uncertainty_rad, starcat_memory *memory);
 
 /* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
  * The centroids of frame n are those from starts[n] to starts[n + 1]. */
 void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
                   const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                  starcat_answer *answers, int32_t *stars, starcat_memory *memory);
+                  const double *sigma_px, starcat_answer *answers, int32_t *stars, starcat_memory *memory);
 
 #endif

@@ -60,9 +60,11 @@ int sc_invert(const sc_information *m, sc_information *inverse) {
     return 0;
   }
   const real scale = R(1.0) / left;
-  for (uint32_t i = 0, at = 0; i < 3u; i++) {
-    for (uint32_t j = i; j < 3u; j++, at++) {
+  uint32_t at = 0;
+  for (uint32_t i = 0; i < 3u; i++) {
+    for (uint32_t j = i; j < 3u; j++) {
       inverse->angles[at] = of_angles[at] + scale * along[i] * along[j];
+      at++;
     }
     inverse->with_scale[i] = -scale * along[i];
   }
@@ -87,30 +89,31 @@ static void turn_by(real m[9], const real w[3]) {
 
 /* Refine an attitude on pairs of directions until it is the best in the sense of least squares:
  * Newton's method on Wahba's loss, whose steps square the error. body[i] belongs to
- * icrs[which[i]], or to icrs[i] where which is null. It works with differences of directions, so
- * that narrow fields lose no digits. */
+ * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
+ * It works with differences of directions, so that narrow fields lose no digits. */
 void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               uint32_t count, uint32_t most) {
+               const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {
     real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
     for (uint32_t i = 0; i < count; i++) {
       const real *b = body + 3u * i;
+      const real v = weight != NULL ? weight[i] : R(1.0);
       real a[3], e[3], c[3];
       sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
       e[0] = b[0] - a[0];
       e[1] = b[1] - a[1];
       e[2] = b[2] - a[2];
       sc_cross(a, e, c);
-      const real d = sc_dot(a, b);
-      g[0] += c[0];
-      g[1] += c[1];
-      g[2] += c[2];
-      h[0] += d - a[0] * b[0];
-      h[1] -= R(0.5) * (a[0] * b[1] + a[1] * b[0]);
-      h[2] -= R(0.5) * (a[0] * b[2] + a[2] * b[0]);
-      h[3] += d - a[1] * b[1];
-      h[4] -= R(0.5) * (a[1] * b[2] + a[2] * b[1]);
-      h[5] += d - a[2] * b[2];
+      const real d = sc_dot(a, b), half = R(0.5) * v;
+      g[0] += v * c[0];
+      g[1] += v * c[1];
+      g[2] += v * c[2];
+      h[0] += v * (d - a[0] * b[0]);
+      h[1] -= half * (a[0] * b[1] + a[1] * b[0]);
+      h[2] -= half * (a[0] * b[2] + a[2] * b[0]);
+      h[3] += v * (d - a[1] * b[1]);
+      h[4] -= half * (a[1] * b[2] + a[2] * b[1]);
+      h[5] += v * (d - a[2] * b[2]);
     }
     if (!sc_solve(h, g, w, inverse)) {
       return;
@@ -199,7 +202,7 @@ starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_rea
   if ((count < 2u) || !sc_triad(body[0], body[second], icrs[0], icrs[second], m)) {
     return STARCAT_TOO_FEW_STARS;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, count, 16);
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
   sc_quaternion(m, q_body_from_icrs);
   return STARCAT_IDENTIFIED;
 }

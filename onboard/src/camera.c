@@ -16,18 +16,36 @@
 
 static real absolute(real x) { return x < R(0.0) ? -x : x; }
 
-/* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. Returns 0 from the fold
- * outwards. */
+/* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
+static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) {
+  const real s = u * u + v * v;
+  const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
+                      R(2.0) * (c->p2 * u + c->p1 * v);
+  *x = u * factor + s * c->p2;
+  *y = v * factor + s * c->p1;
+}
+
+/* The same; returns 0 from the fold outwards. */
 static int distort(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   if ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius)) {
     return 0;
   }
+  image_of(c, u, v, x, y);
+  return 1;
+}
+
+/* How the image of the direction x/z = u, y/z = v moves with these: dx/du, dx/dv, dy/du, dy/dv. */
+static void slopes(const starcat_camera *c, real u, real v, real slope[4]) {
+  const real s = u * u + v * v;
+  const real along = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
   const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
                       R(2.0) * (c->p2 * u + c->p1 * v);
-  *x = u * factor + s * c->p2;
-  *y = v * factor + s * c->p1;
-  return 1;
+  const real du = R(2.0) * (u * along + c->p2), dv = R(2.0) * (v * along + c->p1);
+  slope[0] = factor + u * du + R(2.0) * u * c->p2;
+  slope[1] = u * dv + R(2.0) * v * c->p2;
+  slope[2] = v * du + R(2.0) * u * c->p1;
+  slope[3] = factor + v * dv + R(2.0) * v * c->p1;
 }
 
 /* The direction that the lens puts at the image x, y: Newton's method in the plane, started at
@@ -36,23 +54,16 @@ static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) 
   *u = x;
   *v = y;
   for (uint32_t step = 0; step < NEWTON_STEPS; step++) {
-    const real s = *u * *u + *v * *v;
-    const real slope = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
-    const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
-                        R(2.0) * (c->p2 * *u + c->p1 * *v);
-    const real miss_x = *u * factor + s * c->p2 - x;
-    const real miss_y = *v * factor + s * c->p1 - y;
-    const real du = R(2.0) * (*u * slope + c->p2), dv = R(2.0) * (*v * slope + c->p1);
-    const real a = factor + *u * du + R(2.0) * *u * c->p2;
-    const real b = *u * dv + R(2.0) * *v * c->p2;
-    const real d = *v * du + R(2.0) * *u * c->p1;
-    const real e = factor + *v * dv + R(2.0) * *v * c->p1;
-    const real determinant = a * e - b * d;
+    real there_x, there_y, slope[4];
+    image_of(c, *u, *v, &there_x, &there_y);
+    slopes(c, *u, *v, slope);
+    const real miss_x = there_x - x, miss_y = there_y - y;
+    const real determinant = slope[0] * slope[3] - slope[1] * slope[2];
     if (!(absolute(determinant) > R(1e-12))) {
       return 0;
     }
-    const real step_u = (e * miss_x - b * miss_y) / determinant;
-    const real step_v = (a * miss_y - d * miss_x) / determinant;
+    const real step_u = (slope[3] * miss_x - slope[1] * miss_y) / determinant;
+    const real step_v = (slope[0] * miss_y - slope[2] * miss_x) / determinant;
     *u -= step_u;
     *v -= step_v;
     const real size = *u * *u + *v * *v;
@@ -99,6 +110,23 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
   return 1;
 }
 
+/* How a direction turns with its pixel's x and y: the turn, radians, for one pixel of each. */
+void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]) {
+  const real u = body[0] / body[2], v = body[1] / body[2];
+  real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
+  if (camera->distorted != 0) {
+    slopes(&camera->given, u, v, s);
+  }
+  /* b x db/du = z (b x e_x), and so for v. */
+  const real scale =
+      body[2] / (camera->given.focal_length_px * (s[0] * s[3] - s[1] * s[2]));
+  const real of_u[3] = {R(0.0), body[2], -body[1]}, of_v[3] = {-body[2], R(0.0), body[0]};
+  for (uint32_t k = 0; k < 3u; k++) {
+    turn[0][k] = scale * (s[3] * of_u[k] - s[2] * of_v[k]);
+    turn[1][k] = scale * (s[0] * of_v[k] - s[1] * of_u[k]);
+  }
+}
+
 static int is_possible(const starcat_camera *c) {
   return sc_is_between(c->width_px, R(1.0), LARGEST_PX) &&
          sc_is_between(c->height_px, R(1.0), LARGEST_PX) &&
@@ -138,13 +166,10 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   return STARCAT_IDENTIFIED;
 }
 
-/* Use another focal length from now on, a multiple of the given one; the given one itself where the
- * lens would then form no image of a centroid. */
-void sc_set_focal(sc_call *call, real focal) {
+/* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
+ * Returns 0 where the lens would then form no image of a centroid. */
+static int scale_camera(sc_call *call, real focal) {
   starcat_workspace *w = call->work;
-  if (focal == call->focal) {
-    return;
-  }
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
   int good = sc_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
@@ -153,8 +178,14 @@ void sc_set_focal(sc_call *call, real focal) {
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
-  if (!good) {
-    sc_set_focal(call, R(1.0));
+  return good;
+}
+
+/* Use another focal length from now on, a multiple of the given one; the given one itself where the
+ * lens forms no image with the other. */
+void sc_set_focal(sc_call *call, real focal) {
+  if ((focal != call->focal) && !scale_camera(call, focal)) {
+    (void)scale_camera(call, R(1.0));
   }
 }
 

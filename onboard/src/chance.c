@@ -175,7 +175,7 @@ void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_
   const int is_whole = sc_invert(&matched, &with_scale);
   real corner = R(0.0);
   found->is_firm = 0;
-  if (is_whole) {
+  if (is_whole != 0) {
     corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(4.0))) *
              corner_deviation(&with_scale, &call->camera);
     found->is_firm = corner <= (has_scale ? R(2.0) : R(1.0)) * SC_SURE_CORNER * tolerance_rad;

@@ -1,4 +1,4 @@
-/* The frame: usable centroids in their own order, what a call needs before it, its answer after it.
+/* The frame: usable centroids in their own order, and what a call needs before it.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -147,6 +147,10 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   result->best_n_matched = 0;
   result->best_log_chance = R(0.0);
   result->best_share = R(0.0);
+  result->reduced_chi_square = R(0.0);
+  for (uint32_t k = 0; k < 9u; k++) {
+    result->covariance_rad2[k] = R(0.0);
+  }
   if ((frame->count > 0u) && ((frame->x_px == NULL) || (frame->y_px == NULL))) {
     return STARCAT_E_NULL;
   }
@@ -171,14 +175,19 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   work->best.withheld = 0;
   work->best.share = R(0.0);
   call->body = work->body;
+  call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
+    if ((frame->sigma_px != NULL) && (frame->sigma_px[i] <= R(0.0))) {
+      return STARCAT_E_OPTIONS;
+    }
     if (result->star[i] == STARCAT_NO_STAR) {
       insert(call, i, work->has_magnitudes != 0u ? frame->magnitudes[i] : R(0.0), frame->x_px[i],
              frame->y_px[i]);
     }
   }
   drop_repeats(work, result);
+  sc_list_columns(call);
   for (uint32_t i = 0; i < work->count; i++) {
     if (!sc_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
@@ -189,42 +198,6 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   if (work->count < SC_MIN_STARS) {
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
-  }
-  return STARCAT_IDENTIFIED;
-}
-
-/* Say why there is no answer, and how good the best agreement was. */
-static void refuse(const sc_call *call, starcat_result *result) {
-  const starcat_workspace *w = call->work;
-  result->best_n_matched = w->best.n_matched;
-  result->best_log_chance = w->best.log_bound;
-  result->best_share = w->best.share;
-  if (w->steps_left == 0u) {
-    result->reason = STARCAT_REASON_STEPS;
-  } else if (w->n_tried == 0u) {
-    result->reason = STARCAT_REASON_NO_CANDIDATE;
-  } else {
-    result->reason = w->best.withheld != 0u ? w->best.withheld : STARCAT_REASON_CHANCE;
-  }
-}
-
-starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result) {
-  starcat_workspace *w = call->work;
-  result->steps = options->max_steps - w->steps_left;
-  result->n_tried = w->n_tried;
-  if ((w->best.n_matched < SC_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
-    refuse(call, result);
-    return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
-  }
-  sc_set_focal(call, w->best.focal);
-  sc_quaternion(w->best.matrix, result->q_body_from_icrs);
-  sc_matrix(result->q_body_from_icrs, result->matrix);
-  result->residual_rad = w->best.residual_rad;
-  result->log_chance = w->best.log_chance;
-  result->n_matched = w->best.n_matched;
-  result->focal_length_px = call->camera.given.focal_length_px;
-  for (uint32_t i = 0; i < w->count; i++) {
-    result->star[w->row[i]] = w->best.star[i];
   }
   return STARCAT_IDENTIFIED;
 }

@@ -41,6 +41,12 @@
 #define SC_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
 #define SC_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define SC_FEW_CENTROIDS 12u
+/* Least weight of a centroid over the largest, which rounding still leaves room for. */
+#ifdef STARCAT_SINGLE
+#define SC_LEAST_WEIGHT R(1e-4)
+#else
+#define SC_LEAST_WEIGHT R(1e-8)
+#endif
 #define SC_SPREAD_CENTROIDS 400u /* that make triangles with their neighbours, the first ones */
 #define SC_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
 
@@ -65,9 +71,11 @@ typedef struct {
   real log_scales, bend;
   real tolerance_px, tolerance_rad, reach_px;
   real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
+  real columns_per_px; /* columns of the detector that list its centroids */
   real mag_reach; /* largest difference of magnitudes of a match; 0: any */
   real log_limit; /* largest accepted chance */
   real log_certain;
+  const real *sigma_px; /* noise of the frame's centroids; null: not stated */
   starcat_workspace *work;
 } sc_call;
 
@@ -87,12 +95,29 @@ static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3
   icrs[2] = SC_UNIT * (real)direction[2];
 }
 
+/* The rows of the stars of a feature. */
+static inline void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
+                              uint32_t rows[3]) {
+  const size_t at = (size_t)feature * width;
+  if (image->index_bytes == 2u) {
+    const uint16_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  } else {
+    const uint32_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  }
+}
+
 /* attitude.c */
 int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]);
 int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
 int sc_invert(const sc_information *m, sc_information *inverse);
 void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               uint32_t count, uint32_t most);
+               const real *weight, uint32_t count, uint32_t most);
 void sc_quaternion(const real m[9], real q[4]);
 void sc_matrix(const real q[4], real m[9]);
 
@@ -102,6 +127,7 @@ void sc_set_focal(sc_call *call, real focal);
 void sc_allow_scales(sc_call *call, real fov_error);
 int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]);
 int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px);
+void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]);
 
 /* sky.c */
 uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real sin_r,
@@ -124,11 +150,16 @@ int sc_spend(starcat_workspace *work, uint32_t steps);
 int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row);
 int sc_try(sc_call *call, const real m[9], real focal);
 void sc_project(const sc_call *call, const real m[9], real margin_px);
+void sc_list_columns(sc_call *call);
 
 /* frame.c */
 starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
                         const starcat_options *options, const starcat_frame *frame,
                         starcat_workspace *work, starcat_result *result);
+
+/* answer.c */
+void sc_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
+                   starcat_workspace *work, starcat_result *result);
 starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result);
 
 /* triangles.c, pyramids.c */
@@ -137,7 +168,6 @@ real sc_side(const sc_call *call, uint32_t i, uint32_t j);
 void sc_each_triangle(sc_call *call, sc_look_up look_up);
 void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
                      uint32_t *stop);
-void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, uint32_t rows[3]);
 int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]);
 int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]);
 

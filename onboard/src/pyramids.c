@@ -7,12 +7,16 @@
 #include "internal.h"
 
 #define MOST_THIRD 8u
+#define STEPS_OF_THIRD 16u /* of computing where a third star has to be */
+#define WORTH_MARKING 16u  /* pairs of the other sides for one of the first, up to which they are */
+#define MARGIN R(1.001)    /* of an error that no rounding shall make smaller */
 
 /* An observed triangle, its corners put in an order such that the side between the first two has
  * the fewest pairs of stars. The third is a sum of the first two and of their cross product. */
 typedef struct {
   uint32_t corner[3];
   uint32_t start, stop;
+  int is_marked; /* whether the stars that the first two corners may be are marked */
   real sum[3];
   real low[3], high[3]; /* squares of chords: first to second, first and second to third */
   real cos_reach, sin_reach;
@@ -24,6 +28,9 @@ static int choose_side(const sc_call *call, const uint32_t triple[3], const real
   const starcat_image *image = call->image;
   o->start = 0;
   o->stop = UINT32_MAX;
+  for (uint32_t n = 0; n < 3u; n++) {
+    o->corner[n] = triple[n];
+  }
   for (uint32_t n = 0; n < 3u; n++) {
     uint32_t start, stop;
     if (sides[n] - error > image->longest_rad) {
@@ -44,18 +51,10 @@ static int choose_side(const sc_call *call, const uint32_t triple[3], const real
   return o->stop != UINT32_MAX;
 }
 
-static int choose_base(const sc_call *call, const uint32_t triple[3], const real sides[3],
-                       base *o) {
+static void describe(const sc_call *call, const real side[3], real error, base *o) {
   const starcat_workspace *w = call->work;
-  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
-  if (!choose_side(call, triple, sides, error, o)) {
-    return 0;
-  }
   const real *a = w->body[o->corner[0]], *b = w->body[o->corner[1]], *c = w->body[o->corner[2]];
-  const real side[3] = {sc_side(call, o->corner[0], o->corner[1]),
-                        sc_side(call, o->corner[0], o->corner[2]),
-                        sc_side(call, o->corner[1], o->corner[2])};
   for (uint32_t n = 0; n < 3u; n++) {
     const real low = sc_chord_of_angle(side[n] - error), high = sc_chord_of_angle(side[n] + error);
     o->low[n] = low * low;
@@ -73,7 +72,62 @@ static int choose_base(const sc_call *call, const uint32_t triple[3], const real
   const real reach = error * (R(1.5) + R(1.5) * longest / side[0]);
   o->sin_reach = STARCAT_SIN(reach < R(0.5) ? reach : R(0.5));
   o->cos_reach = STARCAT_SQRT(R(1.0) - o->sin_reach * o->sin_reach);
-  return 1;
+}
+
+static uint32_t has_mark(const uint32_t *marks, uint32_t row) {
+  return marks[row / 32u % STARCAT_MARKS] >> (row % 32u) & 1u;
+}
+
+/* Mark every star that is in a pair with a marked one; without a branch, which nobody could
+ * foretell. */
+static void mark_partners(const starcat_image *image, const uint32_t range[2],
+                          const uint32_t *marks, uint32_t *partners) {
+  uint32_t rows[3];
+  for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
+    partners[n] = 0;
+  }
+  for (uint32_t pair = range[0]; pair < range[1]; pair++) {
+    sc_rows_of(image, pair, 2, rows);
+    partners[rows[0] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[1]) << (rows[0] % 32u);
+    partners[rows[1] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[0]) << (rows[1] % 32u);
+  }
+}
+
+/* Mark the stars that the first two corners may be. They are in pairs as far apart as the two are;
+ * the third is in pairs of the other sides with such stars, and the first two are with such a third.
+ * A side longer than all pairs says nothing. Stars whose rows differ by a multiple of the marks share
+ * one. Returns 0 if the steps are used up. */
+static int mark_corners(const sc_call *call, base *o, const real side[3], real error) {
+  const starcat_image *image = call->image;
+  starcat_workspace *w = call->work;
+  uint32_t range[3][2] = {{o->start, o->stop}, {0, 0}, {0, 0}}, count = 0;
+  for (uint32_t n = 1; n < 3u; n++) {
+    const real low = side[n] - MARGIN * error, high = side[n] + MARGIN * error;
+    if (high <= image->longest_rad) {
+      sc_rows_between(image, low, high, range[n], range[n] + 1);
+      count += range[n][1] > range[n][0] ? range[n][1] - range[n][0] : 0u;
+    }
+  }
+  o->is_marked = (range[1][1] + range[2][1] != 0u) && (count / WORTH_MARKING <= o->stop - o->start);
+  if (o->is_marked == 0) {
+    return 1;
+  }
+  for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
+    w->corner[0][n] = UINT32_MAX;
+    w->corner[1][n] = UINT32_MAX;
+    w->third[n] = UINT32_MAX;
+  }
+  mark_partners(image, range[0], w->third, w->either);
+  for (uint32_t n = 0; n < 4u; n++) {
+    const uint32_t own = n % 2u;
+    if (range[own + 1u][1] != 0u) {
+      mark_partners(image, range[own + 1u], n < 2u ? w->either : w->third, w->corner[own]);
+    }
+    for (uint32_t k = 0; (n < 2u) && (k < STARCAT_MARKS); k++) {
+      w->third[k] &= w->corner[own][k];
+    }
+  }
+  return sc_spend(w, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS);
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */
@@ -81,6 +135,9 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
+  if (!sc_spend(call->work, STEPS_OF_THIRD)) {
+    return 1;
+  }
   sc_cross(first, second, normal);
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] = o->sum[0] * first[k] + o->sum[1] * second[k] + o->sum[2] * normal[k];
@@ -106,7 +163,7 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
     if (sc_is_between(sc_chord_square(first, found[n]), o->low[1], o->high[1]) &&
         sc_is_between(sc_chord_square(second, found[n]), o->low[2], o->high[2]) &&
         sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-      sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
+      sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
       if (sc_try(call, m, R(1.0)) != 0) {
         return 1;
       }
@@ -115,26 +172,53 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
   return 0;
 }
 
+/* Complete a pair by a third star in both orders that its stars may have. Returns 1 if the search
+ * can end. */
+static int try_stars(sc_call *call, const base *o, const uint32_t rows[2]) {
+  const starcat_workspace *w = call->work;
+  uint32_t may[2] = {1, 1};
+  real star[2][3];
+  for (uint32_t n = 0; (o->is_marked != 0) && (n < 2u); n++) {
+    may[n] = has_mark(w->corner[0], rows[n]) & has_mark(w->corner[1], rows[1u - n]);
+  }
+  if ((may[0] | may[1]) == 0u) {
+    return 0;
+  }
+  sc_star(call->image, rows[0], star[0]);
+  sc_star(call->image, rows[1], star[1]);
+  if (!sc_is_between(sc_chord_square(star[0], star[1]), o->low[0], o->high[0])) {
+    return 0;
+  }
+  for (uint32_t n = 0; n < 2u; n++) {
+    if ((may[n] != 0u) && complete(call, o, star[n], star[1u - n])) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
 int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]) {
   const starcat_image *image = call->image;
+  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
   base o;
-  if (!choose_base(call, triple, sides, &o)) {
+  if (!choose_side(call, triple, sides, error, &o)) {
     return 0;
+  }
+  const real side[3] = {sc_side(call, o.corner[0], o.corner[1]),
+                        sc_side(call, o.corner[0], o.corner[2]),
+                        sc_side(call, o.corner[1], o.corner[2])};
+  describe(call, side, error, &o);
+  if (!mark_corners(call, &o, side, error)) {
+    return 1;
   }
   for (uint32_t pair = o.start; pair < o.stop; pair++) {
     uint32_t rows[3];
-    real first[3], second[3];
     if (!sc_spend(call->work, 1)) {
       return 1;
     }
     sc_rows_of(image, pair, 2, rows);
-    if ((rows[0] >= image->n_stars) || (rows[1] >= image->n_stars)) { /* a damaged image */
-      continue;
-    }
-    sc_star(image, rows[0], first);
-    sc_star(image, rows[1], second);
-    if (sc_is_between(sc_chord_square(first, second), o.low[0], o.high[0]) &&
-        (complete(call, &o, first, second) || complete(call, &o, second, first))) {
+    if ((rows[0] < image->n_stars) && (rows[1] < image->n_stars) && /* else a damaged image */
+        try_stars(call, &o, rows)) {
       return 1;
     }
   }

@@ -4,9 +4,20 @@
  */
 #include "internal.h"
 
-#define BLOCK 16u
+#define BLOCK 32u
 #define PART R(1.02)       /* areas that are looked up together, the largest over the least */
 #define LEAST_PART R(1e-3) /* of the largest area that is looked up at all */
+#define STEPS_OF_SIDES 6u  /* of comparing the sides of one triangle */
+#define HALF_TURN R(3.1415926535897932385)
+
+/* Factors of a bound that rounding shall not make narrower. */
+#ifdef STARCAT_SINGLE
+#define BELOW R(0.99999)
+#define ABOVE R(1.00001)
+#else
+#define BELOW R(0.999999999)
+#define ABOVE R(1.000000001)
+#endif
 
 /* What the triangles of one frame are tried with. */
 typedef struct {
@@ -176,7 +187,8 @@ static uint32_t list_neighbours(sc_call *call, uint32_t i, uint32_t count) {
     if ((k == i) || ((n == STARCAT_NEIGHBOURS) && !(apart < square[n - 1u]))) {
       continue;
     }
-    uint32_t at = n < STARCAT_NEIGHBOURS ? n++ : n - 1u;
+    uint32_t at = n < STARCAT_NEIGHBOURS ? n : n - 1u;
+    n = at + 1u;
     while ((at > 0u) && (apart < square[at - 1u])) {
       square[at] = square[at - 1u];
       w->neighbour[i][at] = w->neighbour[i][at - 1u];
@@ -277,29 +289,47 @@ void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *
   }
 }
 
-/* The rows of the stars of a feature. */
-void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, uint32_t rows[3]) {
-  const size_t at = (size_t)feature * width;
-  if (image->index_bytes == 2u) {
-    const uint16_t *indices = image->features;
-    for (uint32_t n = 0; n < width; n++) {
-      rows[n] = indices[at + n];
-    }
-  } else {
-    const uint32_t *indices = image->features;
-    for (uint32_t n = 0; n < width; n++) {
-      rows[n] = indices[at + n];
-    }
-  }
-}
-
 /* An observed triangle as it is compared with those of stars. */
 typedef struct {
   uint32_t triple[3];
   real low[3], high[3]; /* squares of the chords that each side may be */
+  real least[3], most[3]; /* the same by length, the shortest first */
   real sides[3], error, slack; /* of the sides; of the scale */
   int is_right_handed;
 } observed;
+
+static real shorter(real a, real b) { return a < b ? a : b; }
+static real longer(real a, real b) { return a > b ? a : b; }
+
+/* Put three numbers in order. */
+static void sort(real v[3]) {
+  const real less = shorter(v[0], v[1]), more = longer(v[0], v[1]), other = v[2];
+  v[0] = shorter(less, other);
+  v[1] = longer(less, shorter(more, other));
+  v[2] = longer(more, other);
+}
+
+/* What the chords may be where the scale is not known: the square of the longest, and those of the
+ * others over it. If sides fit in any order they do by length, with the largest of the errors; and a
+ * chord is shorter than its angle, the more so the longer it is. */
+static void bound_shape(const sc_call *call, observed *o) {
+  const real shortest = R(1.0) - call->fov_error;
+  real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
+  sort(a);
+  const real error = o->error + call->bend * a[2], narrowest = shortest - o->slack;
+  const real angle = narrowest > R(0.01) ? (a[2] + error) / narrowest : HALF_TURN;
+  const real widest = angle < HALF_TURN ? angle : HALF_TURN;
+  const real least = sc_chord_of_angle((a[2] - error) / (R(1.0) / shortest + o->slack));
+  const real most = sc_chord_of_angle(widest);
+  for (uint32_t n = 0; n < 2u; n++) {
+    const real low = a[n] > error ? (a[n] - error) / (a[2] + error) : R(0.0);
+    const real high = a[2] > error ? widest / most * (a[n] + error) / (a[2] - error) : R(1.0);
+    o->least[n] = BELOW * low * low;
+    o->most[n] = ABOVE * high * high;
+  }
+  o->least[2] = BELOW * least * least;
+  o->most[2] = ABOVE * most * most;
+}
 
 static void observe(const sc_call *call, const uint32_t triple[3], const real sides[3],
                     observed *o) {
@@ -311,13 +341,30 @@ static void observe(const sc_call *call, const uint32_t triple[3], const real si
     o->triple[n] = triple[n];
     o->low[n] = low * low;
     o->high[n] = high * high;
+    o->least[n] = o->low[n];
+    o->most[n] = o->high[n];
     o->sides[n] = sides[n];
   }
-  const real least = sides[0] < sides[1] ? sides[0] : sides[1];
   o->error = error;
-  o->slack = error / (least < sides[2] ? least : sides[2]);
+  o->slack = error / shorter(shorter(sides[0], sides[1]), sides[2]);
+  sort(o->least);
+  sort(o->most);
+  if (call->fov_error > R(0.0)) {
+    bound_shape(call, o);
+  }
   sc_cross(w->body[triple[0]], w->body[triple[1]], normal);
   o->is_right_handed = sc_dot(normal, w->body[triple[2]]) > R(0.0);
+}
+
+/* Whether the chords of stars may be those observed, in some order of the corners: most are not in
+ * any. */
+static int may_fit(const observed *o, const real chords[3], int has_scale) {
+  real c[3] = {chords[0], chords[1], chords[2]};
+  sort(c);
+  const real unit = has_scale ? c[2] : R(1.0);
+  return sc_is_between(c[2], o->least[2], o->most[2]) &&
+         sc_is_between(c[0], o->least[0] * unit, o->most[0] * unit) &&
+         sc_is_between(c[1], o->least[1] * unit, o->most[1] * unit);
 }
 
 /* Directions as a camera with a multiple of the focal length sees them. */
@@ -369,7 +416,7 @@ static int try_order(sc_call *call, const observed *o, real stars[3][3],
   if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
   return sc_try(call, m, focal);
 }
 
@@ -418,9 +465,12 @@ static int compare(sc_call *call, const observed *o, uint32_t feature) {
   chords[0] = sc_chord_square(stars[1], stars[2]);
   chords[1] = sc_chord_square(stars[0], stars[2]);
   chords[2] = sc_chord_square(stars[0], stars[1]);
+  const int has_scale = call->fov_error > R(0.0);
+  if (!may_fit(o, chords, has_scale)) {
+    return 0;
+  }
   sc_cross(stars[0], stars[1], normal);
   const int is_right_handed = sc_dot(normal, stars[2]) > R(0.0);
-  const int has_scale = call->fov_error > R(0.0);
   for (uint32_t n = 0; has_scale && (n < 3u); n++) {
     chords[n] = sc_angle_of_chord(chords[n]);
   }
@@ -486,7 +536,8 @@ static int look_up(sc_call *call, const observed *o, const real area[2], const r
     }
     if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
       for (uint32_t n = 0; n < count; n++) {
-        if (((uint16_t)(image->radii[row + n] - low) <= width) && compare(call, o, row + n)) {
+        if (((uint16_t)(image->radii[row + n] - low) <= width) &&
+            (!sc_spend(call->work, STEPS_OF_SIDES) || compare(call, o, row + n))) {
           return 1;
         }
       }
@@ -518,7 +569,7 @@ static int look_up_similar(sc_call *call, const observed *o, real area, real are
     part[1] = part[1] < end ? part[1] : end;
     radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
     radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
-    if (look_up(call, o, part, radii)) {
+    if (look_up(call, o, part, radii) != 0) {
       return 1;
     }
     part[0] = part[1];

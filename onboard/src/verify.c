@@ -5,6 +5,9 @@
  */
 #include "internal.h"
 
+#define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
+#define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
+
 /* Take steps from what is left of the budget. Returns 0 if it is used up. */
 int sc_spend(starcat_workspace *work, uint32_t steps) {
   if (steps >= work->steps_left) {
@@ -47,40 +50,70 @@ void sc_project(const sc_call *call, const real m[9], real margin_px) {
   w->n_within = count;
 }
 
+/* The column of the detector that a place is in; the first or the last one outside of it. */
+static uint32_t column_of(const sc_call *call, real x_px) {
+  const real scaled = x_px * call->columns_per_px;
+  if (!(scaled > R(0.0))) {
+    return 0;
+  }
+  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
+}
+
+/* List the centroids by the column of the detector that they are in. */
+void sc_list_columns(sc_call *call) {
+  starcat_workspace *w = call->work;
+  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
+  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
+    w->column[n] = 0;
+  }
+  for (uint32_t i = 0; i < w->count; i++) {
+    w->column[column_of(call, w->x[i])]++;
+  }
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
+    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
+  }
+  for (uint32_t i = w->count; i > 0u; i--) { /* where it begins */
+    const uint32_t n = column_of(call, w->x[i - 1u]);
+    w->column[n]--;
+    w->in_column[w->column[n]] = (uint16_t)(i - 1u);
+  }
+}
+
+/* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
+ * them is the nearest to it, and to which it is the nearest so far. */
+static void match_star(const sc_call *call, uint32_t k, real reach_px, real reach) {
+  starcat_workspace *w = call->work;
+  const real x = w->x_of[k], y = w->y_of[k];
+  const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
+  w->nearest[k] = UINT16_MAX;
+  for (uint32_t n = w->column[column_of(call, x - reach_px)]; n < stop; n++) {
+    const uint32_t i = w->in_column[n];
+    const real dx = w->x[i] - x, dy = w->y[i] - y;
+    const real square = dx * dx + dy * dy;
+    if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
+      if ((w->match[i] < 0) || (square < w->match_square[i])) {
+        w->match_square[i] = square;
+        w->match[i] = (int16_t)k;
+      }
+      if ((w->nearest[k] == UINT16_MAX) || (square < w->nearest_square[k]) ||
+          ((square == w->nearest_square[k]) && (i < w->nearest[k]))) {
+        w->nearest_square[k] = square;
+        w->nearest[k] = (uint16_t)i;
+      }
+    }
+  }
+}
+
 /* Match centroids and stars that are the nearest to each other, within reach. Returns how many
  * do. */
 static uint32_t match(const sc_call *call, real reach_px) {
   starcat_workspace *w = call->work;
-  const real reach = reach_px * reach_px;
-  const uint32_t n_within = w->n_within;
   uint32_t matched = 0;
-  for (uint32_t k = 0; k < n_within; k++) {
-    w->nearest[k] = UINT16_MAX;
-  }
   for (uint32_t i = 0; i < w->count; i++) {
-    const real x = w->x[i], y = w->y[i];
-    real least = reach;
-    int16_t best = -1;
-    for (uint32_t k = 0; k < n_within; k++) {
-      const real dx = x - w->x_of[k];
-      if (dx * dx > reach) { /* nearly all: the rest is not even computed */
-        continue;
-      }
-      const real dy = y - w->y_of[k];
-      const real square = dx * dx + dy * dy;
-      if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
-        if ((best < 0) || (square < least)) {
-          least = square;
-          best = (int16_t)k;
-        }
-        if ((w->nearest[k] == UINT16_MAX) || (square < w->nearest_square[k])) {
-          w->nearest_square[k] = square;
-          w->nearest[k] = (uint16_t)i;
-        }
-      }
-    }
-    w->match[i] = best;
-    w->match_square[i] = least;
+    w->match[i] = -1;
+  }
+  for (uint32_t k = 0; k < w->n_within; k++) {
+    match_star(call, k, reach_px, reach_px * reach_px);
   }
   for (uint32_t i = 0; i < w->count; i++) {
     if ((w->match[i] >= 0) && (w->nearest[w->match[i]] != i)) {
@@ -104,7 +137,7 @@ static int is_as_before(starcat_workspace *w) {
 
 /* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
  * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
-static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*icrs)[3],
+static void refine(sc_call *call, real m[9], const uint16_t *of, const real *icrs,
                    const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
@@ -113,7 +146,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
     for (uint32_t i = 0; i < n; i++) {
       const real *b = call->body[of[i]];
       real a[3], left[3], moved[3];
-      sc_turn(m, icrs[which != NULL ? which[i] : i], a);
+      sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
       for (uint32_t k = 0; k < 3u; k++) {
         left[k] = b[k] - a[k];
       }
@@ -124,7 +157,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
       shrink += b[2] * b[2] * sc_dot(b, left) - b[2] * left[2];
       sc_inform(&h, b);
     }
-    if (sc_solve(h.angles, h.with_scale, along, unused)) {
+    if (sc_solve(h.angles, h.with_scale, along, unused) != 0) {
       const real of_scale = h.scale - sc_dot(h.with_scale, along);
       if (of_scale > R(0.0)) {
         step = (shrink - sc_dot(along, turn)) / of_scale;
@@ -141,7 +174,7 @@ static void refine(sc_call *call, real m[9], const uint16_t *of, const real (*ic
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], which, n, 4);
+  sc_refine(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
 /* Refine on all matches. */
@@ -156,19 +189,18 @@ static void refine_matched(sc_call *call, real m[9]) {
       n++;
     }
   }
-  refine(call, m, of, (const real(*)[3])w->near_icrs, which, n);
+  refine(call, m, of, &w->near_icrs[0][0], which, n);
 }
 
 /* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
 typedef struct {
   uint32_t count;
-  real first[4];
+  real first[3];
   real last;
 } reaches;
 
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
-static const reaches ROUGH = {1, {R(2.0)}, R(1.0)};
-static const reaches WIDER = {2, {R(4.0), R(2.0)}, R(1.0)};
+static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
  * is used up. */
@@ -200,7 +232,7 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
     const real factor = is_final ? r->last : r->first[n];
     sc_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
     matched = match(call, factor * call->reach_px);
-    if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u))) {
+    if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
       return 0;
     }
     if ((matched < SC_MIN_STARS) || (is_as_before(w) && is_final)) {
@@ -209,6 +241,19 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
     refine_matched(call, m);
   }
   return matched;
+}
+
+/* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
+ * with every star, and polynomials of both are added up. Returns
+ * 0 if they are used up. */
+static int spend_on_bound(const sc_call *call) {
+  starcat_workspace *w = call->work;
+  const uint32_t most = w->count < w->n_within ? w->count : w->n_within;
+  uint32_t steps = STEPS_OF_MATCH * (w->count + w->n_within);
+  if (call->mag_reach > R(0.0)) {
+    steps += w->count * w->n_within + (w->count + w->n_within) * most;
+  }
+  return sc_spend(w, steps);
 }
 
 static void withhold(starcat_agreement *found, uint32_t reason) {
@@ -235,6 +280,10 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
   if (matched < SC_MIN_STARS) {
     return;
   }
+  if (!spend_on_bound(call)) {
+    found->n_matched = 0; /* as if it had not been found */
+    return;
+  }
   for (uint32_t i = 0; i < w->count; i++) {
     found->star[i] = STARCAT_NO_STAR;
     if (w->match[i] >= 0) {
@@ -254,7 +303,7 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
     if ((found->share < SC_MIN_SHARE) &&
         !((found->is_firm != 0u) && (found->log_bound <= SC_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
-    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px)) {
+    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
       withhold(found, STARCAT_REASON_SCALE);
     }
   }
@@ -300,7 +349,7 @@ static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9
       n++;
     }
   }
-  refine(call, m, of, (const real(*)[3])icrs, NULL, n);
+  refine(call, m, of, &icrs[0][0], NULL, n);
 }
 
 /* Begin again from the attitude and the focal length of an agreement. */
@@ -361,7 +410,7 @@ static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) 
       real m[9];
       begin_at(call, &w->found, m);
       judge(call, m, fit(call, m, &r), r.last, &w->wider);
-      if (is_better(&w->wider, &w->found)) {
+      if (is_better(&w->wider, &w->found) != 0) {
         w->found = w->wider;
       }
     }
@@ -389,6 +438,7 @@ static void try_other_scales(sc_call *call) {
 /* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
  * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
 int sc_try(sc_call *call, const real m[9], real focal) {
+  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
@@ -398,6 +448,9 @@ int sc_try(sc_call *call, const real m[9], real focal) {
     attitude[k] = m[k];
   }
   w->n_tried++;
+  if (!sc_spend(w, STEPS_OF_TRY)) {
+    return 1;
+  }
   sc_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;

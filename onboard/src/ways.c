@@ -6,6 +6,8 @@
 #include "internal.h"
 
 #define LEAST R(-1e30) /* logarithm of no way at all */
+#define SMALL 16u
+#define FAR_MAGNITUDE R(1e30) /* of a star whose own is not known, which is counted apart */
 
 /* Logarithm of a factorial, from 16 on by Stirling's series. */
 real sc_log_factorial(uint32_t n) {
@@ -41,8 +43,8 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
                    uint32_t most) {
   const int is_tight = bound >= 2u;
   real *sums = w->sums[bound];
-  uint32_t top = 1, last = 0;
-  real share = R(0.0);
+  uint32_t top = 1;
+  real shares[SMALL] = {0};
   for (uint32_t i = 0; i < count; i++) {
     top = numbers[i] > top ? numbers[i] : top;
   }
@@ -54,12 +56,16 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
     sums[k] = R(0.0);
   }
   for (uint32_t i = 0; i < count; i++) {
-    const uint32_t own = numbers[i];
-    if (own != last) { /* many are alike */
-      share = (is_tight ? sc_exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
-      last = own;
+    const uint32_t own = numbers[i], place = own < SMALL ? own : 0u;
+    if (own == 0u) {
+      continue;
     }
-    for (uint32_t k = own > 0u ? most : 0u; k > 0u; k--) {
+    real share = shares[place];
+    if ((place == 0u) || !(share > R(0.0))) { /* else it was worked out before: many are alike */
+      share = (is_tight ? sc_exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
+      shares[place] = share;
+    }
+    for (uint32_t k = i < most ? i + 1u : most; k > 0u; k--) { /* beyond it all are 0 */
       sums[k] += share * sums[k - 1u];
     }
   }
@@ -89,20 +95,33 @@ real sc_log_ways(const sc_call *call, uint32_t n) {
   return least;
 }
 
-/* Count the stars that each centroid may be, and the centroids that each star may be. */
+/* Count the stars that each centroid may be, and the centroids that each star may be. What says
+ * which of them are near each other is not needed any more, and gives its memory. */
 static void count_compatible(const sc_call *call) {
   starcat_workspace *w = call->work;
+  const real reach = call->mag_reach;
+  uint16_t unknown = 0;
   for (uint32_t j = 0; j < w->n_within; j++) {
-    w->nearest[j] = 0;
+    const int16_t stored = call->image->magnitudes[w->near_row[w->within[j]]];
+    const int is_known = stored != INT16_MIN;
+    w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
+    w->nearest[j] = is_known ? 0u : (uint16_t)w->count;
+    unknown = (uint16_t)(unknown + (is_known ? 0u : 1u));
   }
   for (uint32_t i = 0; i < w->count; i++) {
-    w->compatible[i] = 0;
+    const real observed = w->magnitude[i];
+    const int is_known = observed - observed == R(0.0);
+    uint16_t some = unknown;
     for (uint32_t j = 0; j < w->n_within; j++) {
-      if (sc_compatible(call, i, w->near_row[w->within[j]]) != 0) {
-        w->compatible[i]++;
-        w->nearest[j]++; /* not needed any more, so that it can count */
-      }
+      const real apart = observed - w->nearest_square[j];
+      const uint16_t fits = (uint16_t)((apart <= reach) & (-apart <= reach));
+      some = (uint16_t)(some + fits);
+      w->nearest[j] = (uint16_t)(w->nearest[j] + fits);
     }
+    for (uint32_t j = 0; !is_known && (j < w->n_within); j++) {
+      w->nearest[j] = (uint16_t)(w->nearest[j] + (w->nearest_square[j] < FAR_MAGNITUDE ? 1u : 0u));
+    }
+    w->compatible[i] = is_known ? some : (uint16_t)w->n_within;
   }
 }
 

@@ -113,7 +113,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   starcat_real *x = column(&bytes, truth.x, truth.count, count, change >> 1 & 3u);
   starcat_real *y = column(&bytes, truth.y, truth.count, count, change >> 3 & 3u);
   starcat_real *magnitudes = column(&bytes, truth.magnitudes, truth.count, count, change >> 5 & 3u);
-  const starcat_frame frame = {count, x, y, (change & 128u) != 0u ? NULL : magnitudes};
+  const starcat_frame frame = {count, x, y, (change & 128u) != 0u ? NULL : magnitudes,
+                               (count & 2u) != 0u ? y : NULL};
   fuzz_check(image, &options, &frame,
              starcat_identify(image, &camera, &options, &frame, &work, &result), &result);
   fuzz_check(image, &options, &frame,

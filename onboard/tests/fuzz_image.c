@@ -68,7 +68,7 @@ static void use(const starcat_image *image, const starcat_camera *camera) {
   options.max_steps = 20000;
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const sky_frame *f = &frames[n];
-    const starcat_frame frame = {f->count, f->x, f->y, n == 0u ? NULL : f->magnitudes};
+    const starcat_frame frame = {f->count, f->x, f->y, n == 0u ? NULL : f->magnitudes, NULL};
     options.noise_mag = (starcat_real)(n == 0u ? 0.0 : 0.3);
     fuzz_check(image, &options, &frame,
                starcat_identify(image, camera, &options, &frame, &work, &result), &result);

@@ -63,7 +63,7 @@ int main(int argc, char **argv) {
   for (char *at = text; strspn(at, " \r\n") < strlen(at);) {
     const uint32_t count = (uint32_t)strtoul(at, &at, 10);
     const starcat_real prior[4] = {number(&at), number(&at), number(&at), number(&at)};
-    const starcat_frame frame = {count, x, y, magnitudes};
+    const starcat_frame frame = {count, x, y, magnitudes, NULL};
     starcat_status status = STARCAT_NO_MATCH;
     for (uint32_t i = 0; (i < count) && (i < STARCAT_MAX_CENTROIDS); i++) {
       x[i] = number(&at);

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Code of the library for 32-bit ARM, the deepest stack of each call, and the workspace. Called by
-# `make size`; fails above 24 KiB of code or 16 KiB of stack.
+# `make size`; fails above 28 KiB of code or 16 KiB of stack.
 set -eu
 out=$BUILD/size
 mkdir -p "$out"
@@ -9,7 +9,7 @@ for source in src/*.c; do
   $ARM-gcc $FLAGS -Os -fcallgraph-info=su -c "$source" -o "$out/$(basename "$source" .c).o"
 done
 code=$($ARM-size "$out"/*.o | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }')
-echo "size: code and constants of the library for ARM, -Os: $code bytes (at most 24576)"
+echo "size: code and constants of the library for ARM, -Os: $code bytes (at most 28672)"
 cat >"$out/sizes.c" <<'END'
 #include "starcat.h"
 char workspace[sizeof(starcat_workspace)];
@@ -20,4 +20,4 @@ $ARM-gcc -std=c99 -fno-common -Iinclude -c "$out/sizes.c" -o "$out/sizes.o"
 $ARM-nm --print-size "$out/sizes.o" |
   while read -r _ bytes _ name; do echo "size: sizeof(starcat_$name): $((0x$bytes)) bytes"; done
 cat "$out"/*.ci | awk -f tests/stack.awk
-[ "$code" -le 24576 ]
+[ "$code" -le 28672 ]

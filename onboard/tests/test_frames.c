@@ -10,7 +10,7 @@
 #define PRIOR_RAD ((starcat_real)0.01)
 
 static starcat_frame frame_of(const sky_frame *truth) {
-  const starcat_frame frame = {truth->count, truth->x, truth->y, truth->magnitudes};
+  const starcat_frame frame = {truth->count, truth->x, truth->y, truth->magnitudes, NULL};
   return frame;
 }
 
@@ -152,7 +152,7 @@ void test_dropped(void) {
   starcat_real x[STARCAT_MAX_CENTROIDS], y[STARCAT_MAX_CENTROIDS];
   starcat_real magnitudes[STARCAT_MAX_CENTROIDS];
   sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
-  const starcat_frame clean = frame_of(&truth), dirty = {truth.count + 6u, x, y, magnitudes};
+  const starcat_frame clean = frame_of(&truth), dirty = {truth.count + 6u, x, y, magnitudes, NULL};
   const uint32_t n = truth.count;
   memcpy(x, truth.x, sizeof truth.x);
   memcpy(y, truth.y, sizeof truth.y);

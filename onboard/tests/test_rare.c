@@ -11,7 +11,7 @@ static sky_frame truth;
 static sc_call call;
 
 static starcat_frame frame_of_truth(void) {
-  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes};
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
   return frame;
 }
 
@@ -56,7 +56,7 @@ static void check_degenerate(void) {
   const starcat_real zero[6] = {0}, v[3] = {1, 2, 3};
   starcat_real x[3], inverse[6], m[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
   CHECK(!sc_solve(zero, v, x, inverse));
-  sc_refine(m, v, v, NULL, 0, 4);
+  sc_refine(m, v, v, NULL, NULL, 0, 4);
   CHECK(m[0] == (starcat_real)1.0);
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
@@ -191,6 +191,32 @@ static void check_lattice(void) {
   CHECK_IS(identify(&unit_pyramid), STARCAT_NO_MATCH);
 }
 
+/* So many spots of unknown brightness that only near ones make triangles: stars on a crowded sky, and
+ * a lattice; with any number of steps. */
+static void check_spread(void) {
+  unit_copy(&unit_crowded);
+  for (uint32_t n = 0; n < 8u; n++) {
+    uint64_t seed = n + 1u;
+    sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.3, STARCAT_MAX_CENTROIDS,
+             4u + n % 2u * 10u, &truth);
+    if (n >= 6u) {
+      for (uint32_t k = 0; k < truth.count; k++) {
+        truth.x[k] = (starcat_real)(32 + 60 * (k % 8u));
+        truth.y[k] = (starcat_real)(32 + (n == 6u ? 60u : 55u) * (k / 8u));
+      }
+    }
+    const starcat_frame frame = {truth.count, truth.x, truth.y, NULL};
+    for (uint32_t steps = 100; steps < 10000000u; steps *= 3u) {
+      unit_scratch.options.max_steps = steps;
+      const starcat_status status =
+          starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
+                           &unit_work, &unit_result);
+      CHECK((status != STARCAT_IDENTIFIED) || ((n < 6u) && (wrong_stars() <= 1u)));
+    }
+    CHECK_IS(unit_result.reason == (uint32_t)STARCAT_REASON_NONE, n < 6u);
+  }
+}
+
 /* What the caller accepts: much, a little more than is certain, and nothing. */
 static void check_chances(void) {
   static const double chances[4] = {-6.9, -18.4, -30.0, -1000.0};
@@ -256,6 +282,7 @@ static void check_crowded(void) {
       truth.y[0] = truth.y[1];
       truth.magnitudes[0] = truth.magnitudes[1];
     }
+    truth.magnitudes[2] = (starcat_real)NAN;
     const starcat_status identified = identify(&unit_scratch);
     CHECK(n % 3u == 1u || identified == STARCAT_IDENTIFIED);
     CHECK(unit_result.steps <= unit_scratch.options.max_steps);
@@ -526,5 +553,6 @@ void test_rare(void) {
   check_priors();
   check_caps();
   check_focal_length();
+  check_spread();
   check_clusters();
 }

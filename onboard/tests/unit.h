@@ -47,5 +47,6 @@ void test_attitude(void);
 void test_camera(void);
 void test_kernels(void);
 void test_rare(void);
+void test_answer(void);
 
 #endif

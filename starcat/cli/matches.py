@@ -154,6 +154,8 @@ def _print_one(answer: FrameAnswer, database: Database) -> None:
             rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
         elif name == "q_body_from_icrs":
             rows.append((name, value))
+        elif name == "remarks":
+            rows += [("remark", remark) for remark in value]
         else:
             rows += _rows_of_fact(name, value)
     for reason, count in sorted(Counter(reason for _, reason in result.dropped).items()):

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.images.spot_noise import weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_frames,
@@ -211,6 +212,8 @@ def facts(result: MatchResult) -> Content:
                 [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
             ],
             "residual_arcsec": result.residual_arcsec,
+            "reduced_chi_square": _or_none(result.reduced_chi_square),
+            "remarks": list(result.remarks),
             "false_match_probability": result.false_match_probability,
             "focal_length_px": None if camera is None else camera.focal_length_px,
             "focal_length_error_px": result.focal_length_error_px,
@@ -250,12 +253,14 @@ class FileAnswers:
         return self.measured.shape is not None
 
     def __iter__(self) -> Iterator[FrameAnswer]:
-        identify, observer = self._identify(), self.local.observer
+        identify, observer, spots = self._identify(), self.local.observer, self.measured.spots
         for given in self.measured.frames:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
-            result = identify(frame.centroids_px, magnitudes=frame.mag)
-            answer = FrameAnswer(frame, result, observer, self.measured.spots)
+            result = identify(frame.centroids_px, magnitudes=frame.mag, sigma_px=frame.sigma_px)
+            if spots is not None:
+                result = weighed(result, spots.sigma_px)
+            answer = FrameAnswer(frame, result, observer, spots)
             if self.is_image and not result.ok and not _is_limited(result):
                 answer = self._deeper(identify) or answer
             yield answer
@@ -267,7 +272,10 @@ class FileAnswers:
         except ConfigError:  # too much stands out: the first measurement has said what it could
             return None
         result = identify(frame.centroids_px, magnitudes=frame.mag)
-        return FrameAnswer(frame, result, self.local.observer, spots) if result.ok else None
+        if not result.ok or spots is None:
+            return None
+        result = weighed(result, spots.sigma_px)
+        return FrameAnswer(frame, result, self.local.observer, spots)
 
     def _measured_deeper(self) -> tuple[Sequence[MeasuredFrame], Spots | None]:
         changes = {
@@ -302,9 +310,11 @@ class FileAnswers:
             )
         from starcat.sky.spots import identify_in_time
 
-        def identify_with_planets(centroids_px: Any, magnitudes: Any) -> MatchResult:
+        def identify_with_planets(
+            centroids_px: Any, magnitudes: Any, sigma_px: Any = None
+        ) -> MatchResult:
             return identify_in_time(
-                identify,
+                partial(identify, sigma_px=sigma_px),
                 matcher.database,
                 centroids_px,
                 camera,

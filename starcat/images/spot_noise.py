@@ -11,6 +11,10 @@ import numpy as np
 
 from starcat.arrays import Array, Pixels
 from starcat.images.background import Levels
+from starcat.matcher.result import MatchResult
+
+CREDIBLE_CHI_SQUARE = (0.5, 2.0)
+"""Reduced chi-squares of an answer between which the noise of its spots is taken as its weights."""
 
 
 def centroid_sigma_px(
@@ -51,3 +55,16 @@ def electrons_per_step(levels: Levels) -> float:
     darkest = float(levels.raw[~levels.mask].min())
     variance = float(np.median(levels.noise)) ** 2
     return max(sky - darkest, 1e-6 * variance) / variance if variance else 1.0
+
+
+def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
+    """Return the answer to an image, weighted by the noise of its spots where that is their error.
+
+    In a lens that is not calibrated it is not all of it, and in a picture whose sky was clipped it
+    is not known: there all spots weigh the same.
+    """
+    if not result.ok:
+        return result
+    weighted = result.with_noise(sigma_px)
+    low, high = CREDIBLE_CHI_SQUARE
+    return weighted if low <= weighted.reduced_chi_square <= high else result

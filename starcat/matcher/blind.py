@@ -215,7 +215,7 @@ def identify_blind(
     certain = certainty(settings) / len(parts)
     searches = [_begun(part, settings, frame, budget, certain) for part in parts]
     if len(searches[0].whole) < MIN_STARS:
-        return answer_of(None, searches[0].whole)
+        return answer_of(None, searches[0].whole, database)
     limit = _run(searches)
     best = searches[0]
     for other in searches[1:]:
@@ -227,7 +227,7 @@ def identify_blind(
         index = np.full(len(best.whole), -1, dtype=np.int32)
         index[: len(found.star_index)] = rows[found.star_index]
         found = replace(found, star_index=index, chance=min(1.0, len(parts) * found.chance))
-    return answer_of(found, best.whole, limit)
+    return answer_of(found, best.whole, database, limit)
 
 
 def _begun(part: Part, settings: Settings, frame: Frame, budget: Budget, certain: float) -> _Search:

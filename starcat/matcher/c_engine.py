@@ -212,7 +212,11 @@ class Search:
         self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
     def one(
-        self, centroids_px: Pixels, magnitudes: Array | None, prior: Prior | None = None
+        self,
+        centroids_px: Pixels,
+        magnitudes: Array | None,
+        prior: Prior | None = None,
+        sigma_px: Array | None = None,
     ) -> MatchResult | None:
         """Identify the stars of a frame; None where the library does not take it.
 
@@ -224,12 +228,14 @@ class Search:
             return None
         px = centroids_px.tobytes()
         mags = None if magnitudes is None else magnitudes.tobytes()
+        sigma = None if sigma_px is None else sigma_px.tobytes()
         memory = _FREE.pop() if _FREE else _Memory()
         code = self._one(
             self._address,
             count,
             px,
             self._null if mags is None else mags,
+            self._null if sigma is None else sigma,
             self._null if prior is None else prior.q_body_from_icrs.tobytes(),
             0.0 if prior is None else prior.error_rad,
             memory.address,
@@ -240,7 +246,7 @@ class Search:
         if code not in STATUSES:
             return None
         found = MatchResult.later(
-            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, prior
+            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, sigma, prior
         )
         if prior is None:
             return found
@@ -257,6 +263,7 @@ class Search:
             ffi.from_buffer("int64_t[]", starts),
             _double_pointer(frames.centroids_px),
             _double_pointer(frames.magnitudes),
+            _double_pointer(frames.sigma_px),
             ffi.from_buffer("starcat_answer[]", records),
             ffi.from_buffer("int32_t[]", star_index),
         )
@@ -278,13 +285,20 @@ class Search:
         return answers if answers.is_whole else None
 
     def _facts_of_bytes(
-        self, record: bytes, stars: bytes, px: bytes, mags: bytes | None, prior: Prior | None
+        self,
+        record: bytes,
+        stars: bytes,
+        px: bytes,
+        mags: bytes | None,
+        sigma: bytes | None,
+        prior: Prior | None,
     ) -> dict[str, Any]:
         star = np.frombuffer(stars, np.int32)
         frame = Frame(
             np.ndarray((len(star), 2), np.float64, px),
             None if mags is None else np.frombuffer(mags),
             self.camera,
+            None if sigma is None else np.frombuffer(sigma),
         )
         return self.facts(np.frombuffer(record, _answer_dtype())[0], star, frame, prior)
 

@@ -1,9 +1,9 @@
-"""Centroid files: CSV for one frame (``x_px,y_px[,mag]``), JSON for one or many.
+"""Centroid files: CSV for one frame (``x_px,y_px[,mag][,sigma_px]``), JSON for one or many.
 
 JSON is a frame, a list of frames, or an object with the key ``frames``; a frame is an object
-with ``centroids_px`` (pairs of numbers) and, optionally, ``mag`` (a number or null for each) and
-``name``. Instead of ``mag`` there may be ``magnitude``, or ``flux`` or ``sum``, which are light:
-the brighter, the larger.
+with ``centroids_px`` (pairs of numbers) and, optionally, ``mag`` and ``sigma_px`` (a number or null
+for each) and ``name``. Instead of ``mag`` there may be ``magnitude``, or ``flux`` or ``sum``, which
+are light: the brighter, the larger.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from starcat.errors import ConfigError, OutputError, reason
 BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
 """Names of a column of brightness; the first that a file has is used."""
 _LIGHT = ("flux", "sum")
+SIGMA = "sigma_px"
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class MeasuredFrame:
     # Magnitudes, NaN where a centroid has none; None where the file has none. Those of light are
     # -2.5 log10 of it, their zero point unknown; shape (N,).
     mag: Array | None = None
+    sigma_px: Array | None = None  # noise of each on each axis; NaN where a centroid has none
     # Columns or keys of the file that are not known, and so were not used.
     ignored: tuple[str, ...] = ()
 
@@ -63,10 +65,11 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
                 "y_px, and may name mag or flux"
             )
         brightness = next((name for name in BRIGHTNESS if name in names), None)
-        columns = ["x_px", "y_px"] + ([] if brightness is None else [brightness])
+        beside = [name for name in (brightness, SIGMA) if name is not None and name in names]
+        columns = ["x_px", "y_px", *beside]
         measured = [
             [
-                _number(row[name] or "nan" if name == brightness else row[name], name,
+                _number((row[name] or "nan") if name in beside else row[name], name,
                         f"{path}: line {rows.line_num}")
                 for name in columns
             ]
@@ -78,7 +81,9 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
         ) from error
     table = np.array(measured, dtype=np.float64).reshape(-1, len(columns))
     mag = None if brightness is None else _magnitudes(table[:, 2], brightness)
-    return MeasuredFrame(path.stem, table[:, :2], mag, _unknown(names, ("x_px", "y_px")))
+    sigma_px = table[:, -1] if SIGMA in beside else None
+    ignored = _unknown(names, ("x_px", "y_px", SIGMA))
+    return MeasuredFrame(path.stem, table[:, :2], mag, sigma_px, ignored)
 
 
 def _magnitudes(values: Array, name: str) -> Array:
@@ -128,17 +133,22 @@ def _json_frame(frame: Any, name: str, where: str) -> MeasuredFrame:
     brightness = next((key for key in BRIGHTNESS if frame.get(key) is not None), None)
     mag = None
     if brightness is not None:
-        given = frame[brightness]
-        if not isinstance(given, list) or len(given) != len(measured):
-            raise ConfigError(f"{where}: {brightness!r} has to be a list, one for each centroid")
-        values = [
-            _number("nan" if value is None else value, brightness, f"{where}: centroid {number}")
-            for number, value in enumerate(given, start=1)
-        ]
-        mag = _magnitudes(np.array(values, dtype=np.float64), brightness)
+        mag = _magnitudes(_one_each(frame, brightness, len(measured), where), brightness)
+    sigma_px = _one_each(frame, SIGMA, len(measured), where) if frame.get(SIGMA) else None
     centroids_px = np.array(measured, dtype=np.float64).reshape(-1, 2)
-    ignored = _unknown(frame, ("centroids_px", "name"))
-    return MeasuredFrame(str(frame.get("name", name)), centroids_px, mag, ignored)
+    ignored = _unknown(frame, ("centroids_px", "name", SIGMA))
+    return MeasuredFrame(str(frame.get("name", name)), centroids_px, mag, sigma_px, ignored)
+
+
+def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
+    given = frame[key]
+    if not isinstance(given, list) or len(given) != count:
+        raise ConfigError(f"{where}: {key!r} has to be a list, one for each centroid")
+    values = [
+        _number("nan" if value is None else value, key, f"{where}: centroid {number}")
+        for number, value in enumerate(given, start=1)
+    ]
+    return np.array(values, dtype=np.float64)
 
 
 def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
@@ -153,7 +163,7 @@ def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
         return None
     return (
         f"not used, because the name is unknown: {', '.join(names)}; known are x_px, y_px, "
-        f"centroids_px, name, and for the brightness {', '.join(BRIGHTNESS)}"
+        f"centroids_px, sigma_px, name, and for the brightness {', '.join(BRIGHTNESS)}"
     )
 
 

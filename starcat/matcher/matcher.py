@@ -147,6 +147,7 @@ class Matcher(Settings, _WithDatabase):
         camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
+        sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
         prior: ArrayLike | None = None,
         prior_error_deg: float | None = None,
@@ -157,50 +158,49 @@ class Matcher(Settings, _WithDatabase):
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels; the order carries no meaning. Centroids that are not finite, lie outside
-            the frame or repeat another get no star and are reported.
+            Pixels, in any order. Those that are not finite, outside of the frame or repeat
+            another get no star and are reported.
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
-            Magnitudes; they decide what is tried first. With ``noise_mag`` they also decide
-            what is accepted, and their zero point has to be that of the database.
+            They decide what is tried first; with ``noise_mag`` also what is accepted, and their
+            zero point has to be that of the database.
+        sigma_px : array_like of float64, shape (N,), optional
+            Standard deviation of each centroid on each axis, NaN where it is not known: weights of
+            the attitude of an answer, of which its covariance is made. Stars do not depend on them.
         fov_error : float
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
-        prior : array_like of float64, shape (4,), optional
-            Attitude that is expected, as ``q_body_from_icrs``. Only the stars near it are then
-            compared, which no method and no product is needed for; the verification is the same.
-        prior_error_deg : float, optional
-            Largest error of the prior, as an angle of rotation; above 0, at most 20.
+        prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
+            Attitude that is expected, as ``q_body_from_icrs``, and its largest error as an angle of
+            rotation, at most 20. Only the stars near it are compared; the verification is the same.
         fov_deg : pair of float, optional
-            Narrowest and widest field across the frame's width where nothing else is known: of
-            the camera only the size is used then. The database needs the product ``levels``, and
-            the brightness of the spots helps much.
+            Narrowest and widest field across the frame's width where of the camera only the size is
+            known. The database needs the product ``levels``, and magnitudes help much.
 
         Returns
         -------
         MatchResult
-            ``no_match`` and ``too_few_stars`` are answers too. With a prior it is ``no_match``
-            where no attitude as near as that explains the frame.
+            ``no_match`` and ``too_few_stars`` are answers too.
 
         Raises
         ------
         ConfigError
-            If the centroids are not pairs of numbers, the magnitudes are not one each, the
-            prior is no quaternion, or an error is missing or out of range.
+            If an array is of another shape, the prior no quaternion, an error missing or too large.
         """
         camera = camera or self.database.camera
-        px, mags = as_arrays(centroids_px, magnitudes)
+        px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
-            return self._timed(as_frame(px, camera, mags), partial(identify_blind, fov_deg=fov_deg))
+            blind = partial(identify_blind, fov_deg=fov_deg)
+            return self._timed(as_frame(px, camera, mags, sigma), blind)
         error = self._checked_fov_error(fov_error)
         # The library does not search for both at once.
         in_c = None if error and near else self._in_c(camera, error)
-        if in_c and (found := in_c.one(px, mags, near)):
+        if in_c and (found := in_c.one(px, mags, near, sigma)):
             return found
         search = partial(solve, fov_error=error, prior=near)
-        return self._timed(as_frame(px, camera, mags), search)
+        return self._timed(as_frame(px, camera, mags, sigma), search)
 
     def identify_many(
         self,
@@ -208,6 +208,7 @@ class Matcher(Settings, _WithDatabase):
         camera: Camera | None = None,
         *,
         magnitudes: Sequence[ArrayLike] | None = None,
+        sigma_px: Sequence[ArrayLike] | None = None,
         threads: int | None = None,
     ) -> Sequence[MatchResult]:
         """Identify the stars of many frames of one camera.
@@ -218,7 +219,7 @@ class Matcher(Settings, _WithDatabase):
             Centroids of each frame, as `identify` takes them.
         camera : Camera, optional
             The database's own by default.
-        magnitudes : sequence of array_like of float64, shape (n,), optional
+        magnitudes, sigma_px : sequence of array_like of float64, shape (n,), optional
             Those of each frame.
         threads : int, optional
             Threads that the C library runs in at once; all cores by default. The answers do not
@@ -233,10 +234,10 @@ class Matcher(Settings, _WithDatabase):
         Raises
         ------
         ConfigError
-            As `identify`, or if there are not as many arrays of magnitudes as frames.
+            As `identify`, or if there are not as many arrays of each as frames.
         """
         camera = camera or self.database.camera
-        given = as_frames(frames, camera, magnitudes)
+        given = as_frames(frames, camera, magnitudes, sigma_px)
         in_c = self._in_c(camera)
         found = None if in_c is None else in_c.many(given, threads or os.cpu_count() or 1)
         return [self._timed(frame, solve) for frame in given] if found is None else found

@@ -8,7 +8,7 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
-from starcat.matcher.pose import focal_length_error_px
+from starcat.matcher.pose import fit_by_weights, focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
 from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
@@ -37,7 +37,7 @@ def solve(
     best, limit = BestOf(certainty(settings)), None
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
-    answer = answer_of(best.found, observation, limit, prior)
+    answer = answer_of(best.found, observation, database, limit, prior)
     return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
 
 
@@ -66,6 +66,7 @@ def _search(
 def answer_of(
     found: Agreement | None,
     observation: Observation,
+    database: Database,
     limit: Limit | None = None,
     prior: Prior | None = None,
 ) -> MatchResult:
@@ -84,11 +85,17 @@ def answer_of(
             found.residual_rad,
             observation.settings.noise_px,
         )
+    matrix, residual_rad = found.pose.matrix, found.residual_rad
+    if observation.sigma_px is not None:
+        stars = database.directions[found.star_index[found.matched]]
+        matrix, residual_rad = fit_by_weights(
+            found.pose.body[found.matched], stars, observation.sigma_px[found.matched]
+        )
     return MatchResult(
         "identified",
         observation.in_frame(found.star_index),
-        found.pose.matrix,
-        found.residual_rad * ARCSEC,
+        matrix,
+        residual_rad * ARCSEC,
         found.false_match_probability,
         observation.dropped,
         found.pose.camera,

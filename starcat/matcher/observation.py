@@ -33,6 +33,8 @@ class Frame:
     centroids_px: Pixels
     magnitudes: Array | None
     camera: Camera
+    # Standard deviation of each centroid on each axis; NaN or infinite where it is not known.
+    sigma_px: Array | None = None
 
     def __len__(self) -> int:
         return len(self.centroids_px)
@@ -47,6 +49,7 @@ class Frames(Sequence[Frame]):
     centroids_px: Pixels
     magnitudes: Array | None
     camera: Camera
+    sigma_px: Array | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -61,74 +64,115 @@ class Frames(Sequence[Frame]):
         frame = range(len(self))[frame]
         rows = slice(self.starts[frame], self.starts[frame + 1])
         magnitudes = None if self.magnitudes is None else self.magnitudes[rows]
-        return Frame(self.centroids_px[rows], magnitudes, self.camera)
+        sigma_px = None if self.sigma_px is None else self.sigma_px[rows]
+        return Frame(self.centroids_px[rows], magnitudes, self.camera, sigma_px)
 
 
-def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | None = None) -> Frame:
+def as_frame(
+    centroids_px: ArrayLike,
+    camera: Camera,
+    magnitudes: ArrayLike | None = None,
+    sigma_px: ArrayLike | None = None,
+) -> Frame:
     """Return a copy of what a caller gives as a frame; errors as those of `as_arrays`."""
-    px, mag = as_arrays(centroids_px, magnitudes)
-    return Frame(px.copy(), None if mag is None else mag.copy(), camera)
+    px, *each = as_arrays(centroids_px, magnitudes, sigma_px)
+    mag, sigma = (None if one is None else one.copy() for one in each)
+    return Frame(px.copy(), mag, camera, sigma)
 
 
 def as_arrays(
-    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
-) -> tuple[Pixels, Array | None]:
+    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None, sigma_px: ArrayLike | None = None
+) -> tuple[Pixels, Array | None, Array | None]:
     """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     if given.shape[1:] != (2,):
         if given.size:
             raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
         given = given.reshape(0, 2)
-    if magnitudes is None:
-        return given, None
-    shape = given.shape[:1]
-    mag = numbers_of("magnitudes", magnitudes, shape)
-    if mag.shape != shape:
-        one_each = f"{shape}, one a centroid"
-        raise _error_of_shape("magnitudes have", mag, one_each, "magnitudes")
-    return given, mag
+    mag = sigma = None
+    if magnitudes is not None:
+        mag = _one_each("magnitudes", magnitudes, len(given))
+    if sigma_px is not None:
+        sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(given)))
+    return given, mag, sigma
+
+
+def _one_each(name: str, values: ArrayLike, count: int) -> Array:
+    found = numbers_of(name, values, (count,))
+    if found.shape != (count,):
+        raise _error_of_shape(f"{name} has", found, f"({count},), one a centroid", name)
+    return found
+
+
+def _checked_sigma(sigma_px: Array) -> Array:
+    wrong = np.flatnonzero(sigma_px <= 0.0)
+    if len(wrong):
+        raise ConfigError(
+            f"sigma_px of centroid {wrong[0]} is {sigma_px[wrong[0]]:g}; expected above 0, or NaN "
+            "where it is not known",
+            key="sigma_px",
+            value=sigma_px,
+        )
+    return sigma_px
 
 
 def as_frames(
-    centroids_px: Sequence[ArrayLike], camera: Camera, magnitudes: Sequence[ArrayLike] | None = None
+    centroids_px: Sequence[ArrayLike],
+    camera: Camera,
+    magnitudes: Sequence[ArrayLike] | None = None,
+    sigma_px: Sequence[ArrayLike] | None = None,
 ) -> Frames:
     """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
-    if magnitudes is not None and len(magnitudes) != len(centroids_px):
-        text = f"magnitudes of {len(magnitudes)} frames; expected {len(centroids_px)}"
-        raise ConfigError(text, key="magnitudes", value=magnitudes)
-    mags = [None] * len(centroids_px) if magnitudes is None else magnitudes
-    joined = _joined(centroids_px, magnitudes)
+    beside = {"magnitudes": magnitudes, "sigma_px": sigma_px}
+    for name, given in beside.items():
+        if given is not None and len(given) != len(centroids_px):
+            text = f"{name} of {len(given)} frames; expected {len(centroids_px)}"
+            raise ConfigError(text, key=name, value=given)
+    joined = _joined(centroids_px, *beside.values())
     if joined is None:  # one after the other, which finds what is wrong, or not an array
-        each = [as_arrays(*given) for given in zip(centroids_px, mags, strict=True)]
-        px = [np.empty((0, 2)), *(given for given, _ in each)]
-        known = None
-        if magnitudes is not None:
-            # A frame whose magnitudes are None has none that is known.
-            nan = (np.full(len(given), np.nan) if mag is None else mag for given, mag in each)
-            known = np.concatenate([np.empty(0), *nan])
-        joined = [len(given) for given, _ in each], np.concatenate(px), known
-    counts, all_px, all_mags = joined
+        none = [None] * len(centroids_px)
+        columns = [none if given is None else given for given in beside.values()]
+        each = [as_arrays(*row) for row in zip(centroids_px, *columns, strict=True)]
+        counts = [len(px) for px, *_ in each]
+        mag, sigma = (
+            None if given is None else _known([row[n] for row in each], counts)
+            for n, given in enumerate(beside.values(), start=1)
+        )
+        joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
+    counts, all_px, all_mags, all_sigmas = joined
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=starts[1:])
-    return Frames(starts, all_px, all_mags, camera)
+    return Frames(starts, all_px, all_mags, camera, all_sigmas)
+
+
+def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array:
+    """Return arrays of frames joined; NaN for a frame that has None."""
+    given = zip(arrays, counts, strict=True)
+    whole = [np.full(count, np.nan) if one is None else one for one, count in given]
+    return np.concatenate([np.empty(0), *whole])
 
 
 def _joined(
-    centroids_px: Sequence[ArrayLike], magnitudes: Sequence[ArrayLike] | None
-) -> tuple[list[int], Pixels, Array | None] | None:
+    centroids_px: Sequence[ArrayLike], *beside: Sequence[ArrayLike] | None
+) -> tuple[list[int], Pixels, Array | None, Array | None] | None:
     """Return the sizes of frames and their arrays joined in one go; None where they do not fit."""
+    arrays: list[Array | None] = []
     try:
         counts = [len(given) for given in centroids_px]  # type: ignore[arg-type]
-        px, mag = np.asarray(np.concatenate(centroids_px, dtype=np.float64)), None
-        if magnitudes is not None:
-            if [len(given) for given in magnitudes] != counts:  # type: ignore[arg-type]
+        px = np.asarray(np.concatenate(centroids_px, dtype=np.float64))
+        for one in beside:
+            if one is not None and [len(given) for given in one] != counts:  # type: ignore[arg-type]
                 return None
-            mag = np.asarray(np.concatenate(magnitudes, dtype=np.float64))
+            joined = None if one is None else np.asarray(np.concatenate(one, dtype=np.float64))
+            if joined is not None and joined.shape != (sum(counts),):
+                return None
+            arrays.append(joined)
     except (TypeError, ValueError):
         return None
-    total = sum(counts)
-    fits = px.shape == (total, 2) and (mag is None or mag.shape == (total,))
-    return (counts, px, mag) if fits else None
+    mag, sigma = arrays
+    if px.shape != (sum(counts), 2):
+        return None
+    return counts, px, mag, None if sigma is None else _checked_sigma(sigma)
 
 
 def numbers_of(name: str, values: ArrayLike, shape: str | tuple[int, ...]) -> Array:
@@ -168,6 +212,7 @@ class Observation:
     dropped: Dropped = ()
     fov_error: float = 0.0  # largest relative error of the focal length, 0 where it is known
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
+    sigma_px: Array | None = None  # noise of each centroid; None where it is not known
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -224,6 +269,7 @@ class Observation:
             centroids_px=self.centroids_px[:count],
             body=self.body[:count],
             mag=None if self.mag is None else self.mag[:count],
+            sigma_px=None if self.sigma_px is None else self.sigma_px[:count],
         )
 
 
@@ -250,6 +296,7 @@ def observe(
         (*dropped, *repeats),
         fov_error,
         budget or Budget(),
+        None if frame.sigma_px is None else frame.sigma_px[rows],
     )
 
 

@@ -34,6 +34,9 @@ SURE_CORNER = 0.5
 """Largest error of a corner, in tolerances, that stars may leave which determine their frame where
 the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
 
+LEAST_WEIGHT = 1e-8
+"""Least weight of a centroid over the largest of its frame; rounding leaves no room for less."""
+
 _UNIT = np.eye(3)
 
 
@@ -105,6 +108,22 @@ def fit(pose: Pose, matched: Rows, stars: Array, observation: Observation) -> Po
     shortest, longest = observation.focal_range
     scaled = pose_at(pose.matrix, min(max(factor, shortest), longest), observation)
     return Pose(solve_wahba_svd(scaled.body[matched], stars), scaled.camera, scaled.body)
+
+
+def weights_of(sigma_px: Array) -> Array:
+    """Return the weights of centroids by their noise, over the largest; least where not known."""
+    known = np.where(np.isfinite(sigma_px), sigma_px, np.inf)
+    least = known.min(initial=np.inf)
+    if least == np.inf:
+        return np.ones(len(known))
+    return np.asarray(np.maximum((least / known) ** 2, LEAST_WEIGHT))
+
+
+def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tuple[Matrix, float]:
+    """Return the attitude that fits centroids best by their noise, and its residual, radians."""
+    matrix = solve_wahba_svd(seen, stars, weights_of(sigma_px))
+    difference = seen - stars @ matrix.T
+    return matrix, math.sqrt(float(np.vdot(difference, difference)) / len(seen))
 
 
 def _by_scale(body: Array) -> Array:
@@ -196,11 +215,15 @@ def _corner_error_rad(covariance: Array, n: int, residual_rad: float, camera: Ca
     return deviation_rad * corner_deviation(covariance, camera)
 
 
-def information(directions: Array, *, with_scale: bool = False) -> Array:
+def information(
+    directions: Array, *, with_scale: bool = False, weights: Array | None = None
+) -> Array:
     """Return the information matrix of an attitude that the centroids of stars determine.
 
     Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
     """
+    if weights is not None:
+        return np.asarray(weights.sum() * _UNIT - (directions.T * weights) @ directions)
     of_angles = len(directions) * _UNIT - directions.T @ directions
     if not with_scale:
         return np.asarray(of_angles)

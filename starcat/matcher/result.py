@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Matrix
+from starcat.arrays import Array, Matrix
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
@@ -20,7 +20,15 @@ from starcat.matcher import sky_objects
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame
-from starcat.matcher.stars import NO_STARS, MatchedStars, attitude_covariance, matched_stars
+from starcat.matcher.pose import fit_by_weights
+from starcat.matcher.stars import (
+    ARCSEC,
+    NO_STARS,
+    MatchedStars,
+    attitude_covariance,
+    matched_stars,
+    reduced_chi_square,
+)
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -252,7 +260,9 @@ class MatchResult:
             return NO_STARS
         if self.frame is None or self.database is None or self.camera is None:
             raise ValueError("this MatchResult does not hold the frame that was asked about")
-        return matched_stars(self.star_index, self.matrix, self.camera, self.frame, self.database)
+        return matched_stars(
+            self.star_index, self.matrix, self.camera, self.frame, self.database, self.noise_px
+        )
 
     @cached_property
     def covariance_arcsec2(self) -> NDArray[np.float64]:
@@ -265,7 +275,50 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera, self.noise_px)
+        return attitude_covariance(stars, self.camera)
+
+    @cached_property
+    def reduced_chi_square(self) -> float:
+        """Squared residuals in the stated noise, a degree of freedom; NaN if none is stated.
+
+        It is 1 on average where ``noise_px`` or ``sigma_px`` is right, the square of how many
+        times too small where it is not. Errors of the camera raise it too.
+        """
+        return reduced_chi_square(self.stars, 3 if self.focal_length_error_px is None else 4)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the answer should know beside it, in sentences."""
+        chi_square = self.reduced_chi_square
+        free = 2 * int(np.isfinite(self.stars.sigma_px).sum()) - 3
+        if not chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(free)):
+            return ()
+        return (
+            f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
+            f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
+            "length and distortion; the covariance is too small",
+        )
+
+    def with_noise(self, sigma_px: Array) -> MatchResult:
+        """Return the same answer with its attitude fitted by the noises of the centroids.
+
+        ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
+        """
+        stars = self.stars
+        if self.frame is None or self.database is None or self.camera is None:
+            raise ValueError("this MatchResult does not hold the frame that was asked about")
+        px = np.column_stack([stars.x_px, stars.y_px])
+        matrix, residual_rad = fit_by_weights(
+            self.camera.directions_from_pixels(px),
+            self.database.directions[stars.star_index],
+            sigma_px[stars.spot],
+        )
+        return replace(
+            self,
+            matrix=matrix,
+            residual_arcsec=residual_rad * ARCSEC,
+            frame=replace(self.frame, sigma_px=sigma_px),
+        )
 
     def table(self) -> QTable:
         """Return the stars as an astropy table.
@@ -344,6 +397,7 @@ class MatchResult:
             if self.frame is not None and self.camera is not None:
                 content["stars"] = self.stars
                 content["covariance_arcsec2"] = self.covariance_arcsec2
+                content["reduced_chi_square"] = self.reduced_chi_square
         return content
 
     def __repr__(self) -> str:
@@ -387,6 +441,20 @@ _DEFAULTS = {one.name: one.default for one in fields(MatchResult) if one.default
 # A default in the class would hide what is not made yet; the constructor has its own.
 for _name in _DEFAULTS:
     delattr(MatchResult, _name)
+
+NOTABLE_CHI_SQUARE = 2.0
+"""Reduced chi-square above which an answer has a remark, if chance is unlikely to exceed it."""
+
+
+def _chi_square_of_chance(free: int) -> float:
+    """Return the reduced chi-square that chance exceeds once in a thousand (Wilson, Hilferty 1931).
+
+    >>> round(_chi_square_of_chance(5), 2), round(_chi_square_of_chance(40), 2)
+    (4.11, 1.84)
+    """
+    part = 2.0 / (9.0 * max(1, free))
+    return (1.0 - part + 3.0902 * math.sqrt(part)) ** 3
+
 
 NO_MATRIX = np.full((3, 3), np.nan)
 NO_MATRIX.flags.writeable = False

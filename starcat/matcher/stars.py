@@ -13,7 +13,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Frame
-from starcat.matcher.pose import information
+from starcat.matcher.pose import information, weights_of
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
@@ -49,6 +49,8 @@ class MatchedStars:
     observed_mag, difference_mag : ndarray of float64, shape (n,)
         Magnitude of the centroid as it was given, and this minus the database's; NaN where none
         was given. The zero point is the caller's.
+    sigma_px : ndarray of float64, shape (n,)
+        Noise of the centroid on each axis as it was stated; NaN where it was not.
     """
 
     spot: NDArray[np.int64]
@@ -65,6 +67,7 @@ class MatchedStars:
     separation_arcsec: Array
     observed_mag: Array
     difference_mag: Array
+    sigma_px: Array
 
     def __len__(self) -> int:
         return len(self.spot)
@@ -75,14 +78,22 @@ class MatchedStars:
 
 
 _NO_ROWS = np.empty(0, dtype=np.int64)
-NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(10 * (np.empty(0),)))
+NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(11 * (np.empty(0),)))
 """The stars of a frame that was not identified."""
 
 
 def matched_stars(
-    star_index: NDArray[np.int32], matrix: Matrix, camera: Camera, frame: Frame, database: Database
+    star_index: NDArray[np.int32],
+    matrix: Matrix,
+    camera: Camera,
+    frame: Frame,
+    database: Database,
+    noise_px: float | None,
 ) -> MatchedStars:
-    """Return the stars that centroids were found to be, -1 where none, a row for each star."""
+    """Return the stars that centroids were found to be, -1 where none, a row for each star.
+
+    ``noise_px`` is that of the centroids of a frame that states none of each.
+    """
     spot = np.flatnonzero(star_index >= 0)
     row = star_index[spot]
     seen_px = frame.centroids_px[spot]
@@ -92,6 +103,9 @@ def matched_stars(
     ra_deg, dec_deg = radec_from_directions(u)
     mag = np.asarray(database.mag[row], dtype=np.float64)
     given = np.full(len(spot), np.nan) if frame.magnitudes is None else frame.magnitudes[spot]
+    sigma_px = np.full(len(spot), noise_px or np.nan)
+    if frame.sigma_px is not None:
+        sigma_px = np.where(np.isfinite(frame.sigma_px[spot]), frame.sigma_px[spot], np.nan)
     ids = database.star_id[row]
     names = zip(database.designation[row].tolist(), ids.tolist(), strict=True)
     return MatchedStars(
@@ -109,28 +123,43 @@ def matched_stars(
         separation_arcsec=separation(seen, u) * ARCSEC,
         observed_mag=given,
         difference_mag=given - mag,
+        sigma_px=sigma_px,
     )
 
 
-def attitude_covariance(
-    stars: MatchedStars, camera: Camera, noise_px: float | None = None
-) -> Array:
+def reduced_chi_square(stars: MatchedStars, unknowns: int) -> float:
+    """Return the squared offsets of centroids, in their noise, over the degrees of freedom.
+
+    Those are two a star whose noise is known, less the ``unknowns`` that were fitted. It is 1 on
+    average where the noise is stated rightly; NaN where none is stated or nothing is left.
+    """
+    known = np.isfinite(stars.sigma_px)
+    free = 2 * int(np.count_nonzero(known)) - unknowns
+    if free <= 0:
+        return math.nan
+    square = (stars.dx_px**2 + stars.dy_px**2)[known] / stars.sigma_px[known] ** 2
+    return float(square.sum()) / free
+
+
+def attitude_covariance(stars: MatchedStars, camera: Camera) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
     Of the small rotations about the axes of the camera (x right, y down, z along the boresight),
     square arcseconds; NaN where the stars determine no attitude. The noise of a centroid, where it
     is not stated, is that of the residuals, of whose 2n numbers three went into the attitude.
 
-    The attitude is that of Wahba's problem with equal weights, whose error is
-    ``A^-1 sum(b x db)``: A is the `information` of the directions b, and the errors db of these
-    are those of the pixels by the derivative of the camera. With a camera of a narrow field
-    this is the inverse of A times the variance of a direction. An error that all stars share,
-    as of the focal length or the distortion, is not in it.
+    The attitude is that of Wahba's problem with the weights w of `weights_of`, whose error is
+    ``A^-1 sum(w b x db)``: A is the `information` of the directions b, and the errors db of these
+    are those of the pixels by the derivative of the camera. With a camera of a narrow field and
+    equal weights this is the inverse of A times the variance of a direction. An error that all
+    stars share, as of the focal length or the distortion, is not in it.
     """
     px = np.column_stack([stars.x_px, stars.y_px])
-    if noise_px is None:
+    weights, sigma_px = weights_of(stars.sigma_px), stars.sigma_px
+    if np.isnan(sigma_px).any():
         square = float(stars.dx_px @ stars.dx_px + stars.dy_px @ stars.dy_px)
-        noise_px = math.sqrt(square / max(1, 2 * len(stars) - 3))
+        of_residuals = math.sqrt(square / max(1, 2 * len(stars) - 3))
+        sigma_px = np.where(np.isnan(sigma_px), of_residuals, sigma_px)
     body = camera.directions_from_pixels(px)
     total = np.zeros((3, 3))
     for axis in (0, 1):
@@ -139,10 +168,11 @@ def attitude_covariance(
         moved = px.copy()
         moved[:, axis] += step
         turned = np.cross(body, (camera.directions_from_pixels(moved) - body) / step[:, None])
+        turned *= (weights * sigma_px)[:, None]
         total += turned.T @ turned
-    matrix = information(body)
+    matrix = information(body, weights=weights)
     if np.linalg.matrix_rank(matrix, hermitian=True) < 3:
         return np.full((3, 3), np.nan)
     inverse = np.linalg.inv(matrix)
-    covariance = (noise_px * ARCSEC) ** 2 * (inverse @ total @ inverse)
+    covariance = ARCSEC**2 * (inverse @ total @ inverse)
     return np.asarray(0.5 * (covariance + covariance.T))

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -88,6 +89,7 @@ class Tracker:
         camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
+        sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
         prior: ArrayLike | None = None,
         prior_error_deg: float | None = None,
@@ -97,7 +99,7 @@ class Tracker:
 
         Parameters
         ----------
-        centroids_px, camera, magnitudes, fov_error, prior, prior_error_deg
+        centroids_px, camera, magnitudes, sigma_px, fov_error, prior, prior_error_deg
             As for `Matcher.identify`; a prior, of a gyroscope for example, takes the place of the
             prediction.
         time_s : float, optional
@@ -120,8 +122,9 @@ class Tracker:
         expected, error_deg = prior, prior_error_deg
         if expected is None and error_deg is None:
             expected, error_deg = self._predicted(now, camera)
+        beside: dict[str, Any] = {"magnitudes": magnitudes, "sigma_px": sigma_px}
         identify = partial(
-            self.matcher.identify, centroids_px, camera, magnitudes=magnitudes, fov_error=fov_error
+            self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
         found = None
         if expected is not None or error_deg is not None:

@@ -162,4 +162,4 @@ def search(
         found.setdefault(
             verdict, Notable(verdict, log10, one.share, len(stars), len(seen), one.withheld)
         )
-    return answer_of(best.found, seen, limit), list(found.values())
+    return answer_of(best.found, seen, matcher.database, limit), list(found.values())

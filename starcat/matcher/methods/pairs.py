@@ -20,6 +20,9 @@ from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP, MOST_TRIANGLES
 from starcat.matcher.star_cells import rows_between
 
+JOINED_A_STEP = 50
+"""Pairs of stars that are joined with others in the time of a step."""
+
 
 def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose triangles of stars, one batch an observed triangle.
@@ -65,8 +68,7 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
     first_c, star_c = directed_pairs(database, apart[a, c], tolerance_rad)
     order = np.argsort(first_c, kind="stable")
     first_c, star_c = first_c[order], star_c[order]
-    low = np.searchsorted(first_c, first_b, side="left")
-    left, right = rows_between(low, np.searchsorted(first_c, first_b, side="right"))
+    left, right = _with_the_same_star(first_b, first_c, observation)
     v, w = database.directions[star_b[left]], database.directions[star_c[right]]
     fits = np.abs(separation(v, w) - apart[b, c]) <= tolerance_rad
     left, v, w = left[fits], v[fits], w[fits]
@@ -75,6 +77,17 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
     handed = handedness * np.linalg.det(observation.body[triangle]) > 0.0
     left, right = left[handed], right[fits][handed]
     return np.stack([first_b[left], star_b[left], star_c[right]], axis=-1).astype(np.intp)
+
+
+def _with_the_same_star(
+    stars: Rows, ascending: Rows, observation: Observation
+) -> tuple[Rows, Rows]:
+    """Return where each star is in others that ascend, which takes steps by how often it is."""
+    low = np.searchsorted(ascending, stars, side="left")
+    high = np.searchsorted(ascending, stars, side="right")
+    joined = len(stars) + len(ascending) + int((high - low).sum())
+    observation.budget.spend(joined // JOINED_A_STEP)
+    return rows_between(low, high)
 
 
 def directed_pairs(
@@ -94,7 +107,9 @@ def _with_apex(
     wanted = observation.separation_rad[triangle, apex]
     tolerance_rad = observation.side_tolerance_rad
     first, fourth = directed_pairs(database, float(wanted[0]), tolerance_rad)
-    row, pair = np.nonzero(stars[:, :1] == first)
+    order = np.argsort(first, kind="stable")
+    row, place = _with_the_same_star(stars[:, 0], first[order], observation)
+    pair = order[place]
     u = database.directions
     fits = np.ones(len(row), dtype=bool)
     for corner in (1, 2):

@@ -63,6 +63,11 @@ _CENTROIDS = _object(
         "description": "Pairs of x to the right and y down, pixels.",
     },
     mag={"type": "array", "items": {"type": ["number", "null"]}},
+    sigma_px={
+        "type": "array",
+        "items": {"type": ["number", "null"]},
+        "description": "Noise of each centroid on each axis: the weights of the attitude.",
+    },
     name={"type": "string"},
     options=_OPTIONS,
 )

@@ -1,0 +1,128 @@
+/* How well an attitude is known: its covariance, the reduced chi-square, and weights.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include <string.h>
+
+#include "internal.h"
+#include "unit.h"
+
+#define NOISE_PX 0.2
+#define FRAMES 400u
+
+static sky_frame truth;
+
+static starcat_status identify(const unit_sky *sky, const starcat_real *sigma_px) {
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, sigma_px};
+  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                          &unit_result);
+}
+
+/* The square of the error of an attitude in its covariance: 3 on average. */
+static double deviation(void) {
+  const starcat_real *c = unit_result.covariance_rad2;
+  const starcat_real h[6] = {c[0], c[1], c[2], c[4], c[5], c[8]};
+  starcat_real e[3], x[3], inverse[6], turn[9];
+  for (uint32_t k = 0; k < 9u; k++) {
+    turn[k] = (starcat_real)0.0;
+    for (uint32_t n = 0; n < 3u; n++) {
+      turn[k] += unit_result.matrix[3u * (k / 3u) + n] *
+                 (starcat_real)truth.matrix[3u * (k % 3u) + n];
+    }
+  }
+  e[0] = turn[7];
+  e[1] = turn[2];
+  e[2] = turn[3];
+  CHECK(sc_solve(h, e, x, inverse));
+  return (double)sc_dot(e, x);
+}
+
+/* Means over many frames whose centroids have noises that differ by up to eight times. */
+static void check_means(unit_sky *sky, int is_weighted, double *square, double *chi_square) {
+  uint64_t state = 51;
+  uint32_t found = 0;
+  *square = *chi_square = 0.0;
+  for (uint32_t n = 0; n < FRAMES; n++) {
+    starcat_real sigma_px[STARCAT_MAX_CENTROIDS];
+    sky_look(&sky->image, &sky->camera, &state, is_weighted ? 0.0 : NOISE_PX, SKY_SPOTS, 0,
+             &truth);
+    for (uint32_t i = 0; i < truth.count; i++) {
+      sigma_px[i] = (starcat_real)(0.05 * (double)(1u << i % 4u));
+      if (is_weighted) {
+        truth.x[i] += sigma_px[i] * (starcat_real)sky_normal(&state);
+        truth.y[i] += sigma_px[i] * (starcat_real)sky_normal(&state);
+      }
+    }
+    if (identify(sky, is_weighted ? sigma_px : NULL) == STARCAT_IDENTIFIED) {
+      *square += deviation();
+      *chi_square += (double)unit_result.reduced_chi_square;
+      found++;
+    }
+  }
+  CHECK(found > FRAMES * 9u / 10u);
+  *square /= (double)found;
+  *chi_square /= (double)found;
+}
+
+/* Noises that are not known, that cannot be, and the covariance of the residuals. */
+static void check_unknown(unit_sky *sky) {
+  uint64_t state = 52;
+  starcat_real sigma_px[STARCAT_MAX_CENTROIDS], q[4], none = (starcat_real)0.0;
+  none = none / none;
+  sky_look(&sky->image, &sky->camera, &state, NOISE_PX, SKY_SPOTS, 0, &truth);
+  CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
+  CHECK(unit_result.reduced_chi_square == (starcat_real)0.0);
+  CHECK(deviation() < 30.0);
+  memcpy(q, unit_result.q_body_from_icrs, sizeof q);
+  for (uint32_t i = 0; i < truth.count; i++) {
+    sigma_px[i] = none;
+  }
+  CHECK_IS(identify(sky, sigma_px), STARCAT_IDENTIFIED);
+  CHECK(unit_result.reduced_chi_square == (starcat_real)0.0);
+  for (uint32_t k = 0; k < 4u; k++) {
+    const double apart = (double)(q[k] - unit_result.q_body_from_icrs[k]);
+    CHECK((apart < 1e-5) && (apart > -1e-5));
+  }
+  sigma_px[0] = (starcat_real)0.1; /* one that is known leaves no degree of freedom */
+  CHECK_IS(identify(sky, sigma_px), STARCAT_IDENTIFIED);
+  CHECK(unit_result.reduced_chi_square == (starcat_real)0.0);
+  sigma_px[1] = (starcat_real)0.0;
+  CHECK_IS(identify(sky, sigma_px), STARCAT_E_OPTIONS);
+}
+
+/* Stars at one place determine no attitude. */
+static void check_one_place(const unit_sky *sky) {
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+  sc_call call;
+  CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
+  const starcat_agreement best = unit_work.best;
+  CHECK_IS(sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                    &unit_result),
+           STARCAT_IDENTIFIED);
+  unit_work.best = best;
+  for (uint32_t i = 0; i < unit_work.count; i++) {
+    unit_work.body[i][0] = unit_work.body[i][1] = (starcat_real)0.0;
+    unit_work.body[i][2] = (starcat_real)1.0;
+  }
+  CHECK_IS(sc_end(&call, &sky->options, &unit_result), STARCAT_IDENTIFIED);
+  CHECK(unit_result.covariance_rad2[0] == (starcat_real)0.0);
+}
+
+void test_answer(void) {
+  double square, chi_square;
+  unit_sky *sky = &unit_scratch;
+  unit_copy(&unit_triangle);
+  check_unknown(sky);
+  check_one_place(sky);
+  for (int is_weighted = 0; is_weighted < 2; is_weighted++) {
+    sky->options.noise_px = (starcat_real)(is_weighted ? 0.0 : NOISE_PX);
+    check_means(sky, is_weighted, &square, &chi_square);
+    CHECK((square > 2.6) && (square < 3.4));
+    CHECK((chi_square > 0.95) && (chi_square < 1.05));
+  }
+  sky->options.noise_px = (starcat_real)0.0;
+  sky->camera.k1 = (starcat_real)-0.3; /* the lens is in the covariance too */
+  check_means(sky, 1, &square, &chi_square);
+  CHECK((square > 2.6) && (square < 3.4));
+  sky->camera.k1 = (starcat_real)0.0;
+}
