@@ -68,15 +68,11 @@ serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded s
 nights: $(READY) ## identify the photographs of ../shared/nights, or of $$STARCAT_NIGHTS
 	$(BIN)/python -m pytest -q tests/test_nights.py
 
+BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql votable
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
-	$(BIN)/python tests/benchmarks/ingest.py
-	$(BIN)/python tests/benchmarks/products.py
-	$(BIN)/python tests/benchmarks/matcher.py
-	$(BIN)/python tests/benchmarks/hostile.py
-	$(BIN)/python tests/benchmarks/false_matches.py --frames 200
-	$(BIN)/python tests/benchmarks/fields.py
-	$(BIN)/python tests/benchmarks/sql.py
-	$(BIN)/python tests/benchmarks/votable.py
+	@failed=; for name in $(BENCHMARKS); do \
+		$(BIN)/python tests/benchmarks/$$name.py || failed="$$failed $$name"; done; \
+	if [ "$$failed" ]; then echo "benchmarks that failed:$$failed"; exit 1; fi
 
 reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md
 	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)

@@ -12,10 +12,8 @@ no right answer and may have none.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -25,27 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from synthetic import catalogs_folder
+from rows import FILES, Options, Rows, database, ended
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
 from starcat.simulation.selftest import answers_rightly
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.reading import preset
-
-FILES: dict[str, dict[str, str]] = {
-    "sao-12deg": {"sao": "sao.dat.gz"},
-    "sao-12deg-512": {"sao": "sao.dat.gz"},
-    "sao-6deg": {"sao": "sao.dat.gz"},
-    "gaia-12deg": {},
-    "tycho2-12deg": {"tycho2": "tyc2.dat.gz"},
-    "2mass-8x6": {"2mass": "psc_estimated.gz"},
-}
-"""The presets, and the file of the catalogs that each is built from."""
 
 NOISE_PX, NOISE_MAG = 0.5, 0.3
 KINDS = {
@@ -86,30 +69,29 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     return counted
 
 
-def main() -> int:
-    """Build the databases, print a line a preset and kind; 1 where an answer is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("presets", nargs="*", default=[])
-    parser.add_argument("--frames", type=int, default=1_000_000)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--quick", action="store_true", help="a thousand frames of each kind")
-    asked = parser.parse_args()
+def main(rows: Rows) -> None:
+    """Build the databases, print a line a preset and kind."""
+    options = Options(__doc__)
+    options.add_argument("presets", nargs="*", default=[])
+    options.size("--frames", 1_000_000, BATCH * len(KINDS), "of all presets and kinds together")
+    options.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    asked = options.asked()
     names = asked.presets or (["sao-12deg"] if asked.quick else list(FILES))
-    asked.frames = BATCH * len(KINDS) if asked.quick else asked.frames
     batches = math.ceil(asked.frames / (BATCH * len(names) * len(KINDS)))
     total: Counter[str] = Counter()
     print(f"{'':<32}{'frames':>9}{'right':>9}{'wrong':>7}{'none':>7}{'<4 stars':>9}{'us each':>9}")
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(asked.workers) as pool:
         begun = time.perf_counter()
         for place, name in enumerate(names):
-            files = {key: [catalogs_folder() / file] for key, file in FILES[name].items()}
-            folder = build(preset(name), files, Path(scratch)).folder
+            folder = database(name, Path(scratch)).folder
             for number, kind in enumerate(KINDS):
                 first = 10_000 * (10 * place + number)
                 jobs = [pool.submit(batch, folder, kind, first + n) for n in range(batches)]
                 counted = sum((job.result() for job in jobs), Counter())
                 total += counted
                 print_line(f"{name}, {kind}", counted, batches * BATCH)
+                rows.expect(not counted["wrong"], f"{name}, {kind}: {counted['wrong']} wrong")
+                rows.expect(counted["right"] > 0, f"{name}, {kind}: no right answer")
         elapsed_s = time.perf_counter() - begun
     frames = batches * BATCH * len(names) * len(KINDS)
     print_line("all", total, frames)
@@ -121,7 +103,6 @@ def main() -> int:
         bound = -math.log(0.05)
         print(f"no wrong answer: at most {bound / answers:.1e} of the answers and")
         print(f"{bound / frames:.1e} of the frames are wrong, with a confidence of 95 %")
-    return int(total["wrong"] > 0)
 
 
 def print_line(what: str, counted: Counter[str], frames: int) -> None:
@@ -136,4 +117,4 @@ def print_line(what: str, counted: Counter[str], frames: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    ended(main)

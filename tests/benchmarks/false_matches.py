@@ -4,7 +4,7 @@
 
 Every frame is of a kind of ``false_frames.py`` and has a setting of its own: a tolerance or a
 noise from 0.05 to 3 px is stated, and the true noise is the stated one, six times it, or a sixth.
-All frames go through the C library (``c``) and every `SEARCHED`-th through numpy, which tells why
+All frames go through the C library (``c``) and one in ``--searched`` through numpy, which tells why
 there is no answer and gives all agreements of its search. ``judging.py`` says what a wrong
 answer is.
 
@@ -25,7 +25,6 @@ import argparse
 import json
 import math
 import os
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -36,11 +35,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from false_frames import KINDS, Scene, Trial
 from judging import Notable, judge_answer, search
+from rows import Options, Rows, ended
 
 from starcat.images.figure_file import own_style, write_figure
 from starcat.matcher.matcher import Matcher
@@ -82,9 +79,6 @@ NOISE_MAG = 0.3
 
 FOV_ERROR = 0.02
 """Error of the focal length that is allowed in an eighth of the frames that numpy searches."""
-
-SEARCHED = 20
-"""Every so many frames numpy searches one."""
 
 MOST_STEPS = 300_000
 """Steps of a search with numpy."""
@@ -278,13 +272,13 @@ def jobs(
                 yield row, Job(pair, kind, first, size, searched, is_endless)
 
 
-Rows = dict[tuple[str, str], Counts]
+Found = dict[tuple[str, str], Counts]
 """Counts by row and engine."""
 
 
-def measure(asked: argparse.Namespace, folder: Path) -> Rows:
+def measure(asked: argparse.Namespace, folder: Path) -> Found:
     """Run all jobs; whether they run side by side does not change the counts."""
-    found: Rows = {}
+    found: Found = {}
     todo = list(jobs(databases(folder), asked.kind, asked.frames, asked.searched, asked.all))
     with ProcessPoolExecutor(asked.workers) as pool:
         for (row, _), counted in zip(todo, pool.map(run, [job for _, job in todo]), strict=True):
@@ -298,7 +292,7 @@ def is_null_model(row: str) -> bool:
     return row.split(",")[0] in ("random", "dense")
 
 
-def too_often(found: Rows) -> Iterator[str]:
+def too_often(found: Found) -> Iterator[str]:
     """Yield where chance agrees more often than its bound: the 95 % interval begins above it."""
     for (row, engine), counts in found.items():
         for probability, hits in counts.agreeing.items():
@@ -307,7 +301,7 @@ def too_often(found: Rows) -> Iterator[str]:
                 yield f"{row}, {engine}: {hits} of {counts.frames} agree at {probability:g}"
 
 
-def print_tables(found: Rows) -> None:
+def print_tables(found: Found) -> None:
     """Print what came of the frames, what was wrong, and how often chance agrees."""
     print(f"{'kind':<31}{'engine':<7}{'frames':>8}{'right':>8}{'wrong':>7}  no answer")
     for (row, engine), counts in found.items():
@@ -335,7 +329,7 @@ def _short(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def draw(found: Rows, path: Path) -> None:
+def draw(found: Found, path: Path) -> None:
     """Draw the share of frames in which chance agrees at p or less, against p."""
     from matplotlib.figure import Figure
 
@@ -364,21 +358,18 @@ def draw(found: Rows, path: Path) -> None:
         write_figure(figure, path)
 
 
-def main() -> int:
-    """Measure, print, draw; return 1 where something is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--frames", type=int, default=1000, help="frames of each kind")
-    parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--searched", type=int, default=SEARCHED, help="one in so many with numpy")
-    parser.add_argument("--all", action="store_true", help="numpy searches on after its answer")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--folder", type=Path, help="where the databases are, or will be")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="SVG or PNG")
-    parser.add_argument("--quick", action="store_true", help="a few frames of each kind")
-    asked = parser.parse_args()
-    if asked.quick:
-        asked.frames, asked.searched = 10, 10
+def main(rows: Rows) -> None:
+    """Measure, print, draw."""
+    options = Options(__doc__)
+    options.size("--frames", 1000, 10, "of each kind")
+    options.size("--searched", 20, 10, "numpy searches one in so many")
+    options.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
+    options.add_argument("--all", action="store_true", help="numpy searches on after its answer")
+    options.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    options.add_argument("--folder", type=Path, help="where the databases are, or will be")
+    options.add_argument("--json", type=Path, metavar="FILE")
+    options.add_argument("--plot", type=Path, metavar="FILE", help="SVG or PNG")
+    asked = options.asked()
     with tempfile.TemporaryDirectory() as scratch:
         found = measure(asked, asked.folder or Path(scratch))
     print_tables(found)
@@ -387,12 +378,14 @@ def main() -> int:
         asked.json.write_text(json.dumps(content, indent=1) + "\n")
     if asked.plot:
         draw(found, asked.plot)
-    wrong = sum(counts.wrong for counts in found.values())
+    for (row, engine), counts in found.items():
+        rows.expect(not counts.wrong, f"{row}, {engine}: {counts.wrong} wrong answers")
     above = list(too_often(found))
+    rows.failed.extend(above)
+    wrong = sum(counts.wrong for counts in found.values())
     print(f"\n{wrong} wrong answers in {sum(c.frames for c in found.values()):,} frames")
-    print("\n".join(above) or "chance agrees no more often than the bound says")
-    return int(bool(wrong or above))
+    print("" if above else "chance agrees no more often than the bound says")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    ended(main)

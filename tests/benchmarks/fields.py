@@ -8,13 +8,13 @@ and have three false ones. The last line of a field is the same frames without m
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from rows import Options, Rows, ended, fresh
 
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
@@ -27,7 +27,7 @@ from starcat.specs.build_spec import CameraSpec
 
 FIELDS_DEG = (1, 2, 5, 8, 12, 20, 35, 50, 90)
 SIZE_PX = 1280, 960
-FRAMES, SEED, NOISE_PX, TOLERANCE_PX = 500, 1, 0.5, 2.0
+SEED, NOISE_PX, TOLERANCE_PX = 1, 0.5, 2.0
 
 
 def measure(fov_deg: float, frames: int) -> dict[str, float]:
@@ -88,22 +88,23 @@ COLUMNS = (
 """Heading and text of each column of the table, which is Markdown."""
 
 
-def main(*, is_quick: bool) -> int:
-    """Print the table; return 1 where an answer is wrong."""
+def main(rows: Rows) -> None:
+    """Print the table."""
+    options = Options(__doc__)
+    options.size("--frames", 500, 20, "of each kind")
+    given = options.asked()
     print("\nFields of view, each with what `starcat init` chooses (1280 x 960 px)")
     print(f"| {' | '.join(head for head, _ in COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
-    wrong, frames = 0, "20" if is_quick else str(FRAMES)
-    for fov_deg in (20,) if is_quick else FIELDS_DEG:
-        command = [sys.executable, __file__, str(fov_deg), frames]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        row = {"field": fov_deg, "c ms": np.nan, "c bare ms": np.nan} | json.loads(done.stdout)
-        print(f"| {' | '.join(text.format_map(row) for _, text in COLUMNS)} |", flush=True)
-        wrong += int(row["wrong"])
-    return int(wrong > 0)
+    for fov_deg in (20,) if given.quick else FIELDS_DEG:
+        with rows.row(f"{fov_deg} deg"):
+            found = json.loads(fresh(__file__, fov_deg, given.frames))
+            row = {"field": fov_deg, "c ms": np.nan, "c bare ms": np.nan} | found
+            print(f"| {' | '.join(text.format_map(row) for _, text in COLUMNS)} |", flush=True)
+            rows.expect(not row["wrong"], f"{fov_deg} deg: {row['wrong']:.0f} wrong answers")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
+    if len(sys.argv) == 3 and sys.argv[1].isdigit():
         print(json.dumps(measure(float(sys.argv[1]), int(sys.argv[2]))))
     else:
-        sys.exit(main(is_quick="--quick" in sys.argv))
+        ended(main)

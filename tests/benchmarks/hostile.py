@@ -7,7 +7,6 @@ with an error of 2 % allowed in the focal length. Every answer is a wrong one. R
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -16,29 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
 
 from hostile_frames import hostile_frame
-from synthetic import catalogs_folder
+from rows import Options, Rows, database, ended
 
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
-from starcat.specs.reading import preset
 
 
-def main() -> int:
-    """Build sao-12deg, ask it about frames of no sky, print a line a kind; 1 if one is answered."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--frames", type=int, default=600)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first frame")
-    parser.add_argument("--limit", type=float, default=0.1, help="seconds a frame")
-    parser.add_argument("--quick", action="store_true", help="a few frames")
-    given = parser.parse_args()
-    given.frames = 12 if given.quick else given.frames
+def main(rows: Rows) -> None:
+    """Build sao-12deg, ask it about frames of no sky, print a line a kind."""
+    options = Options(__doc__)
+    options.size("--frames", 600, 12, "of all kinds together")
+    options.add_argument("--first", type=int, default=0, help="seed of the first frame")
+    options.add_argument("--limit", type=float, default=0.1, help="seconds a frame")
+    given = options.asked()
     with tempfile.TemporaryDirectory() as folder:
-        inputs = {"sao": [catalogs_folder() / "sao.dat.gz"]}
-        artifact = build(preset("sao-12deg"), inputs, Path(folder), workers=1).folder
+        artifact = database("sao-12deg", Path(folder)).folder
         matcher = Matcher.open(artifact, time_limit_s=given.limit)
         seconds, answers, ended = defaultdict(list), defaultdict(int), defaultdict(int)
         for number in range(given.first, given.first + given.frames):
@@ -49,16 +42,14 @@ def main() -> int:
             seconds[key].append(time.perf_counter() - start)
             answers[key] += result.ok
             ended[key] += result.refusal is not None and result.refusal.reason == "time"
-            if result.ok:
-                print(f"frame {number}, {kind}, {fov_error}: {result}")
+            rows.expect(not result.ok, f"frame {number}, {kind}, {fov_error}: {result}")
     print(f"{'kind':<10}{'error':>7}{'frames':>8}{'answers':>9}{'out of time':>13}", end="")
     print(f"{'median ms':>11}{'most ms':>9}   limit {given.limit * 1e3:.0f} ms")
     for key in sorted(seconds):
         ms = np.array(seconds[key]) * 1e3
         print(f"{key[0]:<10}{key[1]:>7.0%}{len(ms):>8}{answers[key]:>9}{ended[key]:>13}", end="")
         print(f"{np.median(ms):>11.1f}{ms.max():>9.1f}")
-    return int(any(answers.values()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    ended(main)

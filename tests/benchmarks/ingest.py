@@ -1,21 +1,19 @@
 """Ingest of full-size files beside the fastest bare parser of the same files.
 
 Each measurement is a fresh process; seconds exclude imports, memory is the process's peak.
-Run with ``make bench``; a first argument ``--runs N`` sets the repeats (default 3).
+Run with ``make bench``. It fails where ingest reads another number of records or is over its limit.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import subprocess
-import sys
 import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from synthetic import make_sao, make_tycho2
+from rows import Options, Rows, ended, fresh
+from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 CHILD = """
 import json, resource, sys, time
@@ -47,51 +45,76 @@ def measure(what: str, source: str, path: Path, scratch: Path) -> tuple[int, flo
         source=source,
         out=str(scratch / "out.parquet"),
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    rows, seconds, peak = json.loads(done.stdout.splitlines()[-1])
+    rows, seconds, peak = json.loads(fresh("-c", code).splitlines()[-1])
     return rows, seconds, peak
 
 
-def compare(title: str, source: str, path: Path, bare: list[str], runs: int, limit: float) -> None:
-    """Measure ingest and the bare parsers in turn and print the medians."""
-    scratch = path.parent
+@dataclass(frozen=True)
+class Files:
+    """Files of an archive, and what is asked of their ingest."""
+
+    title: str
+    source: str
+    path: Path
+    records: int
+    bare: tuple[str, ...]  # the parsers beside it
+    limit: float  # seconds over those of the fastest bare parser
+
+
+def compare(files: Files, runs: int) -> float:
+    """Measure ingest and the bare parsers in turn, print the best; return its ratio to theirs."""
     seen: dict[str, list[tuple[int, float, float]]] = {}
     for _ in range(runs):
-        for what in ("ingest", *bare):
-            seen.setdefault(what, []).append(measure(what, source, path, scratch))
+        for what in ("ingest", *files.bare):
+            taken = measure(what, files.source, files.path, files.path.parent)
+            seen.setdefault(what, []).append(taken)
     best = {what: min(run[1] for run in done) for what, done in seen.items()}
-    fastest = min(best[what] for what in bare)
-    print(f"\n{title}")
+    fastest = min(best[what] for what in files.bare)
+    print(f"\n{files.title}")
     for what, done in seen.items():
         rows, peak = done[0][0], max(run[2] for run in done)
         spread = "-".join(f"{s:.2f}" for s in sorted(run[1] for run in done)[:: max(1, runs - 1)])
         ratio = best[what] / fastest
         print(
             f"  {what:<18}{rows:>10,} rows {best[what]:>7.2f} s ({spread}) {peak:>7.0f} MiB "
-            f"{ratio:>6.2f} x fastest bare" + (f"  (limit {limit} x)" if what == "ingest" else "")
+            f"{ratio:>6.2f} x fastest bare"
+            + (f"  (limit {files.limit} x)" if what == "ingest" else "")
         )
+        if rows != files.records:
+            raise ValueError(f"{what} read {rows:,} of {files.records:,} records")
+    return best["ingest"] / fastest
 
 
-def main() -> None:
+def made(root: Path, sao: int, tycho2: int) -> Iterator[Files]:
+    """Make the files, one after the other."""
+    path = make_sao(root, rows=sao)
+    yield Files(f"SAO, {sao:,} records", "sao", path, sao, ("numpy_slices",), 2.0)
+    bare = "pyarrow_csv", "numpy_slices"
+    for form in ("compressed", "plain"):
+        parts = make_tycho2(root / form, rows=tycho2, compress=form == "compressed")
+        yield Files(f"Tycho-2, 20 {form} parts", "tycho2", parts, tycho2, bare, 2.5)
+    together = root / "one" / "tyc2.dat"
+    together.parent.mkdir()
+    with together.open("wb") as file:
+        for part in sorted((root / "plain").glob("tyc2.dat.*")):
+            file.write(part.read_bytes())
+    yield Files("Tycho-2, one plain file", "tycho2", together, tycho2, bare, 2.5)
+
+
+def main(rows: Rows) -> None:
     """Make the files, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=3)
-    runs = parser.parse_args().runs
+    options = Options(__doc__)
+    options.size("--runs", 3, 1, "repeats of each measurement")
+    options.size("--sao", SAO_ROWS, 5_000, "records of SAO")
+    options.size("--tycho2", TYCHO2_ROWS, 20_000, "records of Tycho-2")
+    given = options.asked()
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        compare("SAO, 258,997 records", "sao", make_sao(root), ["numpy_slices"], runs, 2.0)
-        bare = ["pyarrow_csv", "numpy_slices"]
-        for compressed in (True, False):
-            form = "compressed" if compressed else "plain"
-            made = make_tycho2(root / form, compress=compressed)
-            compare(f"Tycho-2, 20 {form} parts", "tycho2", made, bare, runs, 2.5)
-        together = root / "one" / "tyc2.dat"
-        together.parent.mkdir()
-        with together.open("wb") as file:
-            for part in sorted((root / "plain").glob("tyc2.dat.*")):
-                file.write(part.read_bytes())
-        compare("Tycho-2, one plain file", "tycho2", together, bare, 1, 2.5)
+        for files in made(Path(folder), given.sao, given.tycho2):
+            with rows.row(files.title):
+                ratio = compare(files, given.runs)
+                is_fast = given.quick or ratio <= files.limit
+                rows.expect(is_fast, f"{files.title}: {ratio:.2f} x, over {files.limit} x")
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -1,6 +1,7 @@
 """Instructions and cache misses of the C library on the frames of the benchmark, by callgrind.
 
-They do not depend on what else the machine does, and show where the microseconds go.
+They do not depend on what else the machine does, and show where the microseconds go. Frames and
+database are those of ``matcher.py``. Run with ``make bench``.
 """
 
 from __future__ import annotations
@@ -9,11 +10,15 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import peers
+from matcher import make_frames
+from rows import LackingError, Options, Rows, database, ended
+
+from starcat.matcher.database import open_database
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
 
@@ -25,24 +30,20 @@ COST = re.compile(
 )
 
 
-def print_all(artifact: Path, frames: Path, kinds: Iterable[str], scratch: Path) -> None:
+def print_all(artifact: Path, frames: Path, scratch: Path) -> None:
     """Print where the instructions of the C library go, for every kind of frames."""
-    compiler, valgrind = shutil.which("cc"), shutil.which("valgrind")
-    if not compiler or not valgrind:
-        print("\nno C compiler or no valgrind: the instructions of the C library are not counted")
-        return
     program, image, counted = scratch / "replay", scratch / "db.img", scratch / "counted.out"
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "replay.c"]
     flags = ["-std=c99", "-O3", "-g", f"-I{ONBOARD / 'include'}", f"-I{ONBOARD / 'src'}"]
-    peers.run([compiler, *flags, *map(str, sources), "-o", str(program), "-lm"])
+    peers.run(["cc", *flags, *map(str, sources), "-o", str(program), "-lm"])
     export = ["export", str(artifact), "--to", "onboard", "-o", str(image)]
     peers.run([sys.executable, "-m", "starcat", *export])
-    for kind in kinds:
+    for kind in peers.KINDS:
         number = write_replay(frames, kind, scratch / "replay.txt")
         for mode in ("identify", "track"):
             tool = ["--tool=callgrind", "--cache-sim=yes", f"--callgrind-out-file={counted}"]
             given = [str(image), str(scratch / "replay.txt"), mode]
-            peers.run([valgrind, *tool, str(program), *given])
+            peers.run(["valgrind", *tool, str(program), *given])
             print_costs(counted, f"{kind} frames, {mode}", number)
 
 
@@ -73,8 +74,29 @@ def print_costs(counted: Path, what: str, frames: int) -> None:
         if "onboard/src/" in file and "scrub" not in function and "crc" not in function:
             numbers = [float(cost[n].replace(",", "").replace(".", "") or 0) for n in (1, 2, 3)]
             totals[Path(file).name] = totals.get(Path(file).name, np.zeros(3)) + numbers
+    if not totals:
+        raise ValueError(f"{what}: callgrind names no function of onboard/src")
     print(f"\nC library, {what}, a frame: instructions and misses of the first cache")
     for name, (ir, *misses) in sorted(totals.items(), key=lambda item: -item[1][0]):
         print(f"  {name:<14}{ir / frames:>10,.0f}{sum(misses) / frames:>8.1f}")
     ir, *misses = sum(totals.values(), np.zeros(3))
     print(f"  {'all':<14}{ir / frames:>10,.0f}{sum(misses) / frames:>8.1f}")
+
+
+def main(rows: Rows) -> None:
+    """Build, simulate, count."""
+    options = Options(__doc__)
+    options.size("--frames", 1000, 20, "of each kind")
+    given = options.asked()
+    for program in ("cc", "valgrind"):
+        if shutil.which(program) is None:
+            raise LackingError(f"{program}, which this benchmark runs")
+    with tempfile.TemporaryDirectory() as folder, rows.row("the C library"):
+        scratch, frames = Path(folder), Path(folder, "frames.npz")
+        artifact = database("sao-12deg", scratch).folder
+        make_frames(open_database(artifact), given.frames, frames)
+        print_all(artifact, frames, scratch)
+
+
+if __name__ == "__main__":
+    ended(main)

@@ -6,14 +6,15 @@ with p = 0.1, and 3 spots are false, their magnitudes drawn from the stars' own.
 to open the database.
 
 The peers are no dependencies of starcat: each is installed from PyPI into dist/bench-peers/,
-which is kept. Run with ``make bench``; ``--frames N`` for a shorter one, ``--only NAME`` for the
-rows whose name begins so. The catalog is sought in $STARCAT_CATALOGS. All figures also go into
-dist/matcher-bench.json. Where valgrind is, the instructions of the C library are counted.
+which is kept; the quick form installs none. Run with ``make bench``; ``--frames N`` for a shorter
+one, ``--of NAME`` for one identifier, ``--only NAME`` for the rows of starcat whose name begins so.
+The catalog is sought in $STARCAT_CATALOGS. All figures also go into dist/matcher-bench.json.
+
+It fails where an answer of starcat is wrong, or an identifier gives no right one.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -22,8 +23,8 @@ import sys
 import tempfile
 import time
 import timeit
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
 
-import instructions
 import peers
+from rows import LackingError, Options, Rows, database, ended
 from slew import BORESIGHT_DEG, ROLL_DEG, is_near, wrong_by
-from synthetic import catalogs_folder
 
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.c_engine import is_compiled
@@ -45,9 +44,8 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.pipeline.build import build
+from starcat.pipeline.build import Built
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
-from starcat.specs.reading import preset
 
 SEED = 86_028_121
 NOISE_PX = 0.5
@@ -79,17 +77,16 @@ method needs; its seconds make and write all products."""
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table; ``failure`` says why there are no answers."""
+    """One line of the table."""
 
     who: str
     version: str = ""
-    counts: dict[str, list[int]] | None = None
-    milliseconds: dict[str, list[float]] | None = None
-    inside_us: dict[str, list[float]] | None = None
+    counts: dict[str, list[int]] = field(default_factory=dict)  # right, wrong, no answers
+    milliseconds: dict[str, list[float]] = field(default_factory=dict)
+    inside_us: dict[str, list[float]] = field(default_factory=dict)
     build_s: float = np.nan
     database_mb: float = np.nan
     peak_mib: float = np.nan
-    failure: str = ""
 
 
 def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Frame]]:
@@ -139,14 +136,14 @@ def drive(
     who: str, driver: str, frames: Path, truth: np.ndarray, options: dict[str, Any] | None = None
 ) -> Row:
     """Let one identifier answer in a process of its own."""
-    answers, stage = frames.with_name("answers.npz"), "not installed"
-    try:
-        python = peers.environment(driver) if driver in peers.REQUIREMENTS else sys.executable
-        stage = "failed"
-        given = str(frames), str(answers), json.dumps(options or {})
-        peers.run([python, peers.__file__, driver, *given])
-    except (OSError, RuntimeError) as error:
-        return Row(who, failure=f"{stage}: {error}")
+    answers, python = frames.with_name("answers.npz"), sys.executable
+    if driver in peers.REQUIREMENTS:
+        try:
+            python = peers.environment(driver)
+        except (OSError, RuntimeError) as error:
+            raise LackingError(f"{driver} from PyPI: {error}") from error
+    given = str(frames), str(answers), json.dumps(options or {})
+    peers.run([python, peers.__file__, driver, *given])
     with np.load(answers) as file:
         found = dict(file)
     counts, milliseconds, inside_us = {}, {}, {}
@@ -181,23 +178,36 @@ def asked() -> dict[str, dict[str, Any]]:
     return rows | {name: {"method": name, "magnitudes": True} for name in METHODS}
 
 
-def drive_all(
-    artifact: Path, build_s: float, frames: Path, truth: np.ndarray, only: str
-) -> list[Row]:
-    """Return a row for every way to ask starcat, and every peer."""
-    rows = []
+Drive = Callable[[], Row]
+
+
+def drives(
+    of: list[str], only: str, artifact: Path, build_s: float, frames: Path, truth: np.ndarray
+) -> Iterator[tuple[str, Drive]]:
+    """Give every way to ask starcat, and every peer, by name of the row."""
+
+    def own(name: str, options: dict[str, Any]) -> Row:
+        options = options | {"artifact": str(artifact)}
+        row = drive(f"* {name}", "starcat", frames, truth, options)
+        return replace(row, build_s=build_s, database_mb=stored_mb(artifact, options["method"]))
+
     for name, options in asked().items():
-        if name.startswith(only):
-            row = drive(
-                f"* {name}", "starcat", frames, truth, options | {"artifact": str(artifact)}
-            )
-            size = stored_mb(artifact, options["method"])
-            rows.append(replace(row, build_s=build_s, database_mb=size))
-    rows += [drive(name, name, frames, truth) for name in peers.REQUIREMENTS]
-    return rows + [
-        drive(f"cedar-solve, {off:.0%} off", "cedar-solve", frames, truth, {"off": off})
-        for off in (0.02, 0.1)
-    ]
+        if "starcat" in of and name.startswith(only):
+            yield f"* {name}", partial(own, name, options)
+    for name in peers.REQUIREMENTS:
+        if name in of:
+            yield name, partial(drive, name, name, frames, truth)
+    for off in (0.02, 0.1):
+        if "cedar-solve" in of:
+            name = f"cedar-solve, {off:.0%} off"
+            yield name, partial(drive, name, "cedar-solve", frames, truth, {"off": off})
+
+
+def judge(row: Row, rows: Rows) -> None:
+    """Have the benchmark fail where starcat is wrong, or nothing is right."""
+    for kind, (right, wrong, none) in row.counts.items():
+        is_right = right > 0 and (wrong == 0 or not row.who.startswith("*"))
+        rows.expect(is_right, f"{row.who}, {kind}: {right} right, {wrong} wrong, {none} none")
 
 
 def stored_mb(artifact: Path, method: str) -> float:
@@ -213,9 +223,6 @@ def print_table(rows: list[Row], frames: int) -> None:
     print(f"{'median p95 ms':>14}{'build s':>8}{'MB':>6}{'x cedar':>11}")
     base = next((row.milliseconds for row in rows if row.who == "cedar-solve"), None)
     for row in rows:
-        if row.counts is None or row.milliseconds is None:
-            print(f"{row.who:<26}{row.failure}"[:100])
-            continue
         line = f"{row.who if row.who not in peers.REQUIREMENTS else f'{row.who} {row.version}':<25}"
         for kind in KINDS:
             counts, ms = row.counts[kind], row.milliseconds[kind]
@@ -227,7 +234,7 @@ def print_table(rows: list[Row], frames: int) -> None:
     print(NOTES)
     print("\nC library, microseconds without the call: median, p95, p99, most")
     for row in rows:
-        if row.inside_us is not None and np.isfinite(row.inside_us["clean"][0]):
+        if np.isfinite(row.inside_us["clean"][0]):
             parts = (
                 f"{kind} " + " ".join(f"{us:8.1f}" for us in row.inside_us[kind]) for kind in KINDS
             )
@@ -274,56 +281,65 @@ def by_the_frame(artifact: Path, frames: dict[str, list[Frame]]) -> dict[str, li
     return times
 
 
-def main() -> None:
+def print_frames(made: dict[str, list[Frame]], built: Built) -> None:
+    """Print what the frames are of, and how many spots they have."""
+    stars, seconds = built.manifest["products"]["stars"]["rows"], built.times_s["total"]
+    print(f"\n{len(made['clean']):,} frames of {stars:,} stars; whole build {seconds:.1f} s")
+    for kind, simulated in made.items():
+        spots = statistics.median(len(frame.star_index) for frame in simulated)
+        few = sum(frame.n_stars < MIN_STARS for frame in simulated)
+        print(f"  {kind}: median of {spots:g} centroids, fewer than {MIN_STARS} stars in {few}")
+
+
+def own_facts(artifact: Path, scratch: Path, made: dict[str, list[Frame]]) -> dict[str, Any]:
+    """Measure and print what only starcat is asked."""
+    facts = opening(artifact, scratch)
+    print(f"Opening an artifact: {facts['open_ms']:.1f} ms, median of 20; a process that does")
+    print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
+    if is_compiled():
+        facts["us_a_frame"] = by_the_frame(artifact, made)
+        for kind, (many, calls, looks) in facts["us_a_frame"].items():
+            told = f"identify_many {many:.1f}, one by one {calls:.1f}, and looked at {looks:.1f}"
+            print(f"{kind}, us a frame, least of 20: {told}")
+    return facts
+
+
+def main(rows: Rows) -> None:
     """Build, simulate, let everybody answer, print; write dist/matcher-bench.json."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--only", default="", help="rows of starcat whose name begins so")
-    given = parser.parse_args()
-    count = given.frames
+    options = Options(__doc__)
+    options.size("--frames", 1000, 20, "of each kind")
+    options.add_argument("--of", nargs="+", choices=peers.DRIVERS, default=list(peers.DRIVERS))
+    options.add_argument("--only", default="", help="rows of starcat whose name begins so")
+    given = options.asked()
     with tempfile.TemporaryDirectory() as folder:
         scratch, frames = Path(folder), Path(folder, "frames.npz")
-        inputs = {"sao": [catalogs_folder() / "sao.dat.gz"]}
-        built = build(preset("sao-12deg"), inputs, scratch, workers=1)
-        times, database = built.times_s, open_database(built.folder)
-        made = make_frames(database, count, frames)
-        print(
-            f"\n{count:,} frames of {len(database.mag):,} stars; whole build {times['total']:.1f} s"
-        )
-        for kind, simulated in made.items():
-            spots = statistics.median(len(frame.star_index) for frame in simulated)
-            few = sum(frame.n_stars < MIN_STARS for frame in simulated)
-            print(f"  {kind}: median of {spots:g} centroids, fewer than {MIN_STARS} stars in {few}")
+        built = database("sao-12deg", scratch)
+        made = make_frames(open_database(built.folder), given.frames, frames)
+        print_frames(made, built)
         truth = np.array([frame.matrix for frame in made["clean"]])
-        build_s = times["products"] + times["write"]
-        rows = drive_all(built.folder, build_s, frames, truth, given.only)
-        print_table(rows, count)
-        instructions.print_all(built.folder, frames, KINDS, scratch)
-        facts = opening(built.folder, scratch)
-        print(f"Opening an artifact: {facts['open_ms']:.1f} ms, median of 20; a process that does")
-        print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
-        if is_compiled():
-            facts["us_a_frame"] = by_the_frame(built.folder, made)
-            for kind, (many, calls, looks) in facts["us_a_frame"].items():
-                print(
-                    f"{kind}, us a frame, least of 20: identify_many {many:.1f}, one by one", end=""
-                )
-                print(f" {calls:.1f}, and looked at {looks:.1f}")
+        build_s = built.times_s["products"] + built.times_s["write"]
+        found: list[Row] = []
+        todo = drives(given.of, given.only, built.folder, build_s, frames, truth)
+        for name, ask in todo:
+            with rows.row(name):
+                if given.quick and not peers.is_installed(name.split(",")[0]):
+                    raise LackingError(f"not in {peers.HOME}, where make bench installs it")
+                found.append(ask())
+                judge(found[-1], rows)
+        print_table(found, given.frames)
+        facts = own_facts(built.folder, scratch, made) if "starcat" in given.of else {}
     machine = {"platform": platform.platform(), "cores": os.cpu_count(), "load": os.getloadavg()}
     written = {
         "seed": SEED,
-        "frames": count,
+        "frames": given.frames,
         "machine": machine,
-        "build_s": times,
+        "build_s": built.times_s,
         "starcat": facts,
-        "rows": [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows],
+        "rows": [{k: None if v != v else v for k, v in asdict(row).items()} for row in found],
     }
     Path("dist").mkdir(exist_ok=True)
     Path("dist", "matcher-bench.json").write_text(json.dumps(written, indent=1) + "\n")
-    failed = [row.who for row in rows if row.failure]
-    if failed:
-        sys.exit(f"no figures of: {', '.join(failed)}")
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

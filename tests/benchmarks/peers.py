@@ -24,6 +24,9 @@ from typing import Any
 
 import numpy as np
 
+HOME = Path(__file__).parents[2] / "dist" / "bench-peers"
+"""Folder of the virtual environments of the peers."""
+
 KINDS = ("clean", "hard")
 SLOW_FRAMES = 200
 SLOW_S = 0.02
@@ -320,15 +323,22 @@ def run(command: list[str]) -> None:
         raise RuntimeError(said[-1].strip())
 
 
+def is_installed(name: str) -> bool:
+    """Whether a peer's virtual environment is there, as it should be; starcat has none."""
+    ready = HOME / name / "installed.txt"
+    wanted = REQUIREMENTS.get(name)
+    return not wanted or (ready.is_file() and ready.read_text() == " ".join(wanted))
+
+
 def environment(name: str) -> str:
     """Return the Python of a peer's virtual environment, made at the first call and kept."""
-    home, wanted = Path("dist", "bench-peers", name).absolute(), " ".join(REQUIREMENTS[name])
-    python, ready = str(home / "bin" / "python"), home / "installed.txt"
-    if not ready.is_file() or ready.read_text() != wanted:
+    home = HOME / name
+    python = str(home / "bin" / "python")
+    if not is_installed(name):
         run([sys.executable, "-m", "venv", "--clear", str(home)])
         quiet = ["--quiet", "--disable-pip-version-check"]
         run([python, "-m", "pip", "install", *quiet, *REQUIREMENTS[name]])
-        ready.write_text(wanted)
+        (home / "installed.txt").write_text(" ".join(REQUIREMENTS[name]))
     return python
 
 

@@ -1,13 +1,13 @@
 """Time, memory and bytes of each product, and how they grow with the number of stars.
 
 Run with ``make bench``. Each growth step is a fresh process, so that its peak memory is its own.
+It fails where a product is not made, is empty or has other rows in one of its files.
 """
 
 from __future__ import annotations
 
 import json
 import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,6 +17,8 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from rows import Options, Rows, ended, fresh
 
 from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
@@ -52,7 +54,12 @@ def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
             with open_for_writing(database) as file:
                 write_product(file, product.table, product_schema(name), product.index, len(stars))
             with h5py.File(database) as file:
-                stored = sum(item.id.get_storage_size() for item in file[name].values())
+                columns = file[name]
+                stored = sum(item.id.get_storage_size() for item in columns.values())
+                in_files = {len(columns[product.table.column_names[0]])}
+            in_files.add(pq.ParquetFile(parquet).metadata.num_rows)
+            if in_files != {len(product.table)} or not len(product.table):
+                raise ValueError(f"{name}: {len(product.table)} rows, in its files {in_files}")
             lists = [pc.list_flatten(c) for c in product.table if pa.types.is_list(c.type)]
             found[name] = {
                 "seconds": seconds,
@@ -96,29 +103,28 @@ def print_products(found: dict[str, dict[str, float]]) -> None:
             )
 
 
-def main() -> None:
+def main(rows: Rows) -> None:
     """Print the products of gaia-12deg, then their growth."""
+    is_quick = Options(__doc__).asked().quick
     print("\nProducts of gaia-12deg, one process")
-    print_products(measure(preset("gaia-12deg")))
+    with rows.row("gaia-12deg"):
+        print_products(measure(preset("gaia-12deg")))
     growth = {}
-    for limit in LIMITS_MAG:
-        done = subprocess.run(
-            [sys.executable, __file__, str(limit)], capture_output=True, text=True, check=True
-        )
-        growth[limit] = json.loads(done.stdout)
-        fov = spec_at(limit).camera.fov_x_deg
-        stars = growth[limit]["memory"]["stars"]
-        print(f"\nG <= {limit:g}: {stars:,.0f} stars, field {fov:.1f} deg", end="")
-        print(f", peak {growth[limit]['memory']['peak_mib']:.0f} MiB")
-        print_products(growth[limit])
-    print("\nNanoseconds a row, smallest and largest over the four")
-    for name in RECIPES:
+    for limit in LIMITS_MAG[:1] if is_quick else LIMITS_MAG:
+        with rows.row(f"G <= {limit:g}"):
+            found = growth[limit] = json.loads(fresh(__file__, limit))
+            fov, memory = spec_at(limit).camera.fov_x_deg, found["memory"]
+            print(f"\nG <= {limit:g}: {memory['stars']:,.0f} stars, field {fov:.1f} deg", end="")
+            print(f", peak {memory['peak_mib']:.0f} MiB")
+            print_products(found)
+    print("\nNanoseconds a row, smallest and largest of all limits")
+    for name in RECIPES if growth else ():
         each = [g[name]["seconds"] / max(1.0, g[name]["rows"]) * 1e9 for g in growth.values()]
         print(f"  {name:<18}{min(each):>8.0f}{max(each):>8.0f}{max(each) / min(each):>7.2f} x")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
+    if sys.argv[1:2] and sys.argv[1][0].isdigit():
         print(json.dumps(measure(spec_at(float(sys.argv[1])))))
     else:
-        main()
+        ended(main)

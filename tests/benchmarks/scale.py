@@ -4,7 +4,8 @@ The parts are those of `twomass_parts`: made here, or given as a folder. Each ca
 its own; its memory is the sum over its processes, sampled every 50 ms, its CPU time that of all of
 them. The bare parse is zlib and pyarrow's CSV reader with the used columns typed, a process for
 each worker. Wall times mean something on a quiet machine only; CPU times of the same run can be
-compared on any.
+compared on any. It fails where a case does not end well, or where the build from the store has
+other guide stars than that from the parts.
 
     python tests/benchmarks/scale.py --rows 5000000
     python tests/benchmarks/scale.py --parts FOLDER --cases bare build
@@ -13,6 +14,7 @@ compared on any.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import subprocess
@@ -27,6 +29,8 @@ from pathlib import Path
 
 import pyarrow as pa
 from pyarrow import csv
+from rows import Options, Rows, ended, need
+from twomass_parts import write_parts
 
 SAMPLE_S = 0.05
 ARCHIVE_ROWS = 470_992_970
@@ -82,7 +86,7 @@ def measure(command: list[str]) -> Measured:
         out.seek(0)
         said = out.read()
     if running.returncode:
-        raise SystemExit(f"{' '.join(command)} ended with {running.returncode}:\n{said}")
+        raise RuntimeError(f"{' '.join(command)} ended with {running.returncode}:\n{said}")
     cpu_s = after.children_user + after.children_system
     cpu_s -= before.children_user + before.children_system
     return Measured(seconds, cpu_s, peak, said)
@@ -156,42 +160,58 @@ def commands(given: Given) -> dict[str, list[str]]:
 CASES = ("bare", "store", "build", "from-store")
 
 
-def main() -> None:
-    """Make the parts, run the cases in turn and print what they took."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", type=int, default=5_000_000, help="of the parts, given or made")
-    parser.add_argument("--parts", type=Path, help="a folder of parts that are there already")
-    parser.add_argument("--store", type=Path, help="where the store is, or is made and left")
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--bare", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.bare:
-        print(bare(given.parts, given.workers))
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        scratch, parts = Path(folder), given.parts
-        store = given.store or scratch / "store"
-        if parts is None:
-            from twomass_parts import write_parts
+def guide_stars_of(folder: Path) -> str:
+    """Return the digest of the guide stars that a build has written."""
+    [manifest] = (folder / "built").glob("*/manifest.json")
+    return str(json.loads(manifest.read_text())["products"]["stars"]["content_sha256"])
 
+
+def main(rows: Rows) -> None:
+    """Make the parts, run the cases in turn and print what they took."""
+    options = Options(__doc__)
+    options.size("--rows", 5_000_000, 200_000, "of the parts, given or made")
+    options.add_argument("--parts", type=Path, help="a folder of parts that are there already")
+    options.add_argument("--store", type=Path, help="where the store is, or is made and left")
+    options.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    options.add_argument("--workers", type=int, default=2)
+    options.add_argument("--runs", type=int, default=1)
+    options.add_argument("--bare", action="store_true", help=argparse.SUPPRESS)
+    asked = options.asked()
+    if asked.bare:
+        print(bare(asked.parts, asked.workers))
+        return
+    need("distributed", "cdshealpix")
+    with tempfile.TemporaryDirectory() as folder:
+        scratch, parts = Path(folder), asked.parts
+        if parts is None:
             parts = scratch / "parts"
-            write_parts(parts, given.rows, given.workers)
-        rows = given.rows
-        print(f"{rows:,} rows in {len(list(parts.glob('psc_*.gz')))} parts")
+            write_parts(parts, asked.rows, asked.workers)
+        given = Given(parts, asked.rows, scratch, asked.store or scratch / "store", asked.workers)
+        print(f"{asked.rows:,} rows in {len(list(parts.glob('psc_*.gz')))} parts")
         first: Measured | None = None
-        for name in given.cases * given.runs:
-            took = measure(commands(Given(parts, rows, scratch, store, given.workers))[name])
-            first = first or took
-            times = took.seconds / first.seconds, took.cpu_s / first.cpu_s
-            print(
-                f"  {name:<10}{took.seconds:>8.1f} s {took.cpu_s:>8.1f} s CPU"
-                f"{1e6 * took.cpu_s / rows:>7.2f} us CPU a row {took.peak_mib:>7.0f} MiB"
-                f"{times[0]:>7.2f} x time {times[1]:>6.2f} x CPU of {given.cases[0]}",
-                flush=True,
-            )
+        made: set[str] = set()
+        for name in asked.cases * asked.runs:
+            with rows.row(name):
+                took = measure(commands(given)[name])
+                first = first or took
+                print_times(name, took, first, given)
+                if name == "bare" and asked.parts is None and int(took.out) != asked.rows:
+                    raise ValueError(f"{int(took.out):,} records read")
+                if name in ("build", "from-store"):
+                    made.add(guide_stars_of(scratch))
+        rows.expect(len(made) < 2, "the build from the store has other guide stars")
+
+
+def print_times(name: str, took: Measured, first: Measured, given: Given) -> None:
+    """Print the row of a case."""
+    times = took.seconds / first.seconds, took.cpu_s / first.cpu_s
+    print(
+        f"  {name:<10}{took.seconds:>8.1f} s {took.cpu_s:>8.1f} s CPU"
+        f"{1e6 * took.cpu_s / given.rows:>7.2f} us CPU a row {took.peak_mib:>7.0f} MiB"
+        f"{times[0]:>7.2f} x time {times[1]:>6.2f} x CPU of the first",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)

@@ -14,7 +14,7 @@ import numpy as np
 
 SAO_ROWS = 258_997
 TYCHO2_ROWS = 2_539_913
-TYCHO2_PART_ROWS = 127_000
+TYCHO2_PARTS = 20
 
 
 def catalogs_folder() -> Path:
@@ -68,17 +68,17 @@ def by_region(ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
     return np.lexsort((dec, np.floor(ra / 3.75), np.floor(dec / 7.5)))
 
 
-def make_sao(folder: Path, catalogs: Path | None = None) -> Path:
-    """Write a file of the size and layout of sao.dat."""
+def make_sao(folder: Path, catalogs: Path | None = None, rows: int = SAO_ROWS) -> Path:
+    """Write a file of the layout of sao.dat, and of its size unless told."""
     generator = np.random.default_rng(1)
     lines = read_lines((catalogs or catalogs_folder()) / "sao.dat.gz", 204)
-    records = lines[generator.integers(len(lines), size=SAO_ROWS)].copy()
-    ra, dec = random_sky(SAO_ROWS, generator)
-    put(records, 1, np.arange(1, SAO_ROWS + 1), 6)
-    put(records, 81, generator.uniform(4.0, 10.9, SAO_ROWS), 4, 1)
-    put(records, 118, generator.integers(1, 359_083, SAO_ROWS), 6)
-    put(records, 161, generator.normal(0.0, 0.003, SAO_ROWS), 7, 4)
-    put(records, 178, generator.normal(0.0, 0.04, SAO_ROWS), 6, 3)
+    records = lines[generator.integers(len(lines), size=rows)].copy()
+    ra, dec = random_sky(rows, generator)
+    put(records, 1, np.arange(1, rows + 1), 6)
+    put(records, 81, generator.uniform(4.0, 10.9, rows), 4, 1)
+    put(records, 118, generator.integers(1, 359_083, rows), 6)
+    put(records, 161, generator.normal(0.0, 0.003, rows), 7, 4)
+    put(records, 178, generator.normal(0.0, 0.04, rows), 6, 3)
     put(records, 184, np.radians(ra), 10, 8)
     put(records, 194, np.radians(dec), 11, 8)
     path = folder / "sao.dat"
@@ -86,17 +86,19 @@ def make_sao(folder: Path, catalogs: Path | None = None) -> Path:
     return path
 
 
-def make_tycho2(folder: Path, catalogs: Path | None = None, *, compress: bool) -> Path:
+def make_tycho2(
+    folder: Path, catalogs: Path | None = None, rows: int = TYCHO2_ROWS, *, compress: bool
+) -> Path:
     """Write the 20 parts of tyc2.dat, plain or compressed; return their folder."""
     folder.mkdir(parents=True, exist_ok=True)
     generator = np.random.default_rng(2)
     lines = read_lines((catalogs or catalogs_folder()) / "tyc2.dat.gz", 206)
-    all_ra, all_dec = random_sky(TYCHO2_ROWS, generator)
+    all_ra, all_dec = random_sky(rows, generator)
     order = by_region(all_ra, all_dec)
     all_ra, all_dec = all_ra[order], all_dec[order]
-    for part in range(20):
-        start = part * TYCHO2_PART_ROWS
-        count = min(TYCHO2_PART_ROWS, TYCHO2_ROWS - start)
+    thousands = -(-rows // (1000 * TYCHO2_PARTS))
+    for start in range(0, rows, 1000 * thousands):
+        part, count = start // (1000 * thousands), min(1000 * thousands, rows - start)
         records = lines[generator.integers(len(lines), size=count)].copy()
         number = start + np.arange(count)
         ra, dec = all_ra[number], all_dec[number]

@@ -5,13 +5,14 @@ follow a jump of 40 deg. *tracked*: a Tracker, jumps included. *prior*: a prior 
 wrong by up to an angle. *lost*: no prior. Magnitudes are not given. Milliseconds are processor time
 of the call alone.
 
-Run with ``python tests/benchmarks/tracking.py ARTIFACT [--frames N]``.
+Run with ``python tests/benchmarks/tracking.py [ARTIFACT] [--frames N]``; without an artifact
+gaia-12deg is built. It fails where an answer is wrong or nothing is identified.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -21,6 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
 
+from rows import Options, Rows, database, ended
 from slew import is_near, slew, wrong_by
 
 from starcat.matcher.c_engine import is_compiled
@@ -48,7 +50,7 @@ def near_prior(
     return partial(matcher.identify, prior=prior, prior_error_deg=most_deg)
 
 
-def report(name: str, frames: Iterable[Frame], ask: Ask) -> list[MatchResult]:
+def report(rows: Rows, name: str, frames: Iterable[Frame], ask: Ask) -> list[MatchResult]:
     """Print one line: right, wrong and no answers, how many were tracked, and milliseconds."""
     answers, ms, right = [], [], 0
     for frame in frames:
@@ -63,34 +65,41 @@ def report(name: str, frames: Iterable[Frame], ask: Ask) -> list[MatchResult]:
     counts = f"{right}/{ok - right}/{len(answers) - ok}"
     parts = "".join(f"{value:9.3f}" for value in np.percentile(ms, [50, 95, 99]))
     print(f"{name:<18}{counts:>14}{tracked:>9}{parts}", flush=True)
+    rows.expect(0 < right == ok, f"{name}: right/wrong/no answers {counts}")
     return answers
 
 
-def main() -> None:
-    """Print both engines."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("artifact", type=Path)
-    parser.add_argument("--frames", type=int, default=10_000)
-    arguments = parser.parse_args()
-    count = arguments.frames
+def measure(rows: Rows, engine: Engine, artifact: Path, count: int) -> None:
+    """Print the rows of an engine."""
     jumps = set(range(count // 4, count, max(1, count // 4)))
-    engines: tuple[Engine, ...] = ("numpy", "c") if is_compiled() else ("numpy",)
-    print(f"{'':<18}{'right/wrong/no':>14}{'tracked':>9}{'median':>9}{'p95':>9}{'p99 ms':>9}")
-    for engine in engines:
-        matcher = Matcher.open(arguments.artifact, engine=engine)
-        database = matcher.database
-        matcher.identify(np.zeros((0, 2)))
-        frames = list(slew(database, count, NOISE, 7, jumps))
-        tracker = Tracker(matcher)
+    matcher = Matcher.open(artifact, engine=engine)
+    matcher.identify(np.zeros((0, 2)))
+    frames = list(slew(matcher.database, count, NOISE, 7, jumps))
+    tracker = Tracker(matcher)
+    answers = report(rows, f"{engine} tracked", frames, lambda _: tracker.identify)
+    after = sum(answers[jump].ok for jump in jumps)
+    print(f"{'':<18}{after} of {len(jumps)} jumps recovered in their own frame")
+    for most_deg in PRIORS_DEG:
+        near = partial(near_prior, matcher, most_deg, np.random.default_rng(5))
+        report(rows, f"{engine} prior {most_deg:g} deg", frames[:FEW], near)
+    report(rows, f"{engine} lost", frames[:FEW], lambda _: matcher.identify)
 
-        answers = report(f"{engine} tracked", frames, lambda _, t=tracker: t.identify)
-        after = sum(answers[jump].ok for jump in jumps)
-        print(f"{'':<18}{after} of {len(jumps)} jumps recovered in their own frame")
-        for most_deg in PRIORS_DEG:
-            near = partial(near_prior, matcher, most_deg, np.random.default_rng(5))
-            report(f"{engine} prior {most_deg:g} deg", frames[:FEW], near)
-        report(f"{engine} lost", frames[:FEW], lambda _, m=matcher: m.identify)
+
+def main(rows: Rows) -> None:
+    """Print both engines."""
+    options = Options(__doc__)
+    options.add_argument("artifact", type=Path, nargs="?")
+    options.size("--frames", 10_000, 40, "of the slew")
+    given = options.asked()
+    if not is_compiled():
+        rows.lacking.append("the compiled C library: its rows are left out")
+    print(f"{'':<18}{'right/wrong/no':>14}{'tracked':>9}{'median':>9}{'p95':>9}{'p99 ms':>9}")
+    with tempfile.TemporaryDirectory() as folder:
+        artifact = given.artifact or database("gaia-12deg", Path(folder)).folder
+        for engine in ("numpy", "c") if is_compiled() else ("numpy",):
+            with rows.row(engine):
+                measure(rows, engine, artifact, given.frames)
 
 
 if __name__ == "__main__":
-    main()
+    ended(main)
