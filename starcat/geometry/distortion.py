@@ -45,13 +45,12 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 
 
 def checked_pair(name: str, value: object) -> tuple[float, float]:
-    """Return a value that has to be two finite numbers."""
+    """Return a value that has to be two numbers."""
     numbers = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    if len(numbers) != 2:
+    if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
         text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
         raise ConfigError(text, key=name, value=value)
-    low, high = (checked_number(f"{name}[{place}]", one) for place, one in enumerate(numbers))
-    return low, high
+    return float(numbers[0]), float(numbers[1])
 
 
 @dataclass(frozen=True)
