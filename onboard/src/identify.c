@@ -133,10 +133,20 @@ static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t
   if (!sc_spend(w, w->n_within + 1u)) {
     return 1;
   }
-  if ((partner < 0) ||
-      !sc_triad(w->body[a], w->body[b], first, w->near_icrs[w->within[partner]], m)) {
+  if (partner < 0) {
     return 0;
   }
+  real body[2][3], icrs[2][3];
+  for (uint32_t k = 0; k < 3u; k++) {
+    body[0][k] = w->body[a][k];
+    body[1][k] = w->body[b][k];
+    icrs[0][k] = first[k];
+    icrs[1][k] = w->near_icrs[w->within[partner]][k];
+  }
+  if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+    return 0;
+  }
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
   p->is_stale = 1;
   return sc_try(call, m, R(1.0));
 }

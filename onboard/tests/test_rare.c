@@ -205,7 +205,7 @@ static void check_spread(void) {
         truth.y[k] = (starcat_real)(32 + (n == 6u ? 60u : 55u) * (k / 8u));
       }
     }
-    const starcat_frame frame = {truth.count, truth.x, truth.y, NULL};
+    const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
     for (uint32_t steps = 100; steps < 10000000u; steps *= 3u) {
       unit_scratch.options.max_steps = steps;
       const starcat_status status =
