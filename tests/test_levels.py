@@ -12,6 +12,7 @@ import pytest
 from skies import product_arrays
 
 from starcat.artifact.verify import check_artifact
+from starcat.calibration.files import starting_camera
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
@@ -345,3 +346,11 @@ def test_init_writes_a_spec_for_a_range(starcat, tmp_path):
     ):
         run = starcat(["init", tmp_path / "b.toml", "--size", "1024x768", *options])
         assert (run.code, words in run.err) == (2, True)
+
+
+@pytest.mark.parametrize("fov_deg", [20.0, "5", (20.0,), (5, 20, 40), (5, "20")])
+def test_a_range_of_fields_that_is_no_pair_is_refused(sky, fov_deg):
+    with pytest.raises(ConfigError, match=r"fov_deg is .*; expected a pair of numbers"):
+        Matcher(sky).identify(np.zeros((4, 2)), fov_deg=fov_deg)
+    with pytest.raises(ConfigError, match=r"fov_deg is .*; expected a pair of numbers"):
+        starting_camera(CAMERA, fov_deg=fov_deg)

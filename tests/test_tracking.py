@@ -252,7 +252,7 @@ def test_times_that_are_not_equally_apart(sky, engine):
 def test_a_time_that_goes_back_is_refused(sky):
     tracker = Tracker(Matcher(sky, engine="numpy"))
     tracker.identify(np.zeros((0, 2)), time_s=2.0)
-    for time_s in (2.0, 1.0, math.nan, math.inf):
+    for time_s in (2.0, 1.0, math.nan, math.inf, "3"):
         with pytest.raises(ValueError, match=r"expected a number above 2\.0"):
             tracker.identify(np.zeros((0, 2)), time_s=time_s)
     tracker.reset()
@@ -299,7 +299,7 @@ def test_the_same_frames_get_the_same_answers(sky):
     assert one == other
 
 
-@pytest.mark.parametrize("max_turn_deg", [0.0, -1.0, 21.0, math.nan])
+@pytest.mark.parametrize("max_turn_deg", [0.0, -1.0, 21.0, math.nan, "5", None])
 def test_a_largest_turn_out_of_range_is_refused(sky, max_turn_deg):
     with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
         Tracker(Matcher(sky), max_turn_deg=max_turn_deg)

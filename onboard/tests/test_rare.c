@@ -191,6 +191,45 @@ static void check_lattice(void) {
   CHECK_IS(identify(&unit_pyramid), STARCAT_NO_MATCH);
 }
 
+/* Triangles of any size with an error of any size, where the scale is known to half of it; and two
+ * spots at one place, that a star finds in either order. */
+static void check_bounds_of_shapes(void) {
+  static const double sizes[4][3] = {
+      {0.02, 0.03, 0.04}, {0.3, 0.4, 0.5}, {1.4, 1.5, 1.6}, {0.002, 0.4, 0.401}};
+  static const double errors[4] = {1e-4, 0.01, 0.15, 2.0};
+  const uint32_t triple[3] = {0, 1, 2};
+  begin(&unit_triangle, 4, SKY_SPOTS, 0);
+  sc_allow_scales(&call, (starcat_real)0.5);
+  for (uint32_t n = 0; n < 16u; n++) {
+    const double *size = sizes[n % 4u];
+    const starcat_real sides[3] = {(starcat_real)size[0], (starcat_real)size[1],
+                                   (starcat_real)size[2]};
+    call.tolerance_rad = (starcat_real)errors[n / 4u];
+    unit_work.steps_left = 20000;
+    const int has_ended = sc_triangle(&call, triple, sides);
+    CHECK((has_ended == 0) || (unit_work.steps_left == 0u) ||
+          (unit_work.best.log_chance <= call.log_certain));
+  }
+  begin(&unit_triangle, 4, SKY_SPOTS, 0);
+  for (uint32_t n = 0; n < 2u; n++) {
+    starcat_real m[9];
+    unit_work.x[SKY_SPOTS - 1u] = unit_work.x[0];
+    unit_work.y[SKY_SPOTS - 1u] = unit_work.y[0];
+    sc_list_columns(&call);
+    for (uint32_t at = 1; (n > 0u) && (at < unit_work.count); at++) {
+      if (unit_work.in_column[at] == SKY_SPOTS - 1u) {
+        unit_work.in_column[at] = unit_work.in_column[at - 1u];
+        unit_work.in_column[at - 1u] = SKY_SPOTS - 1u;
+      }
+    }
+    unit_work.steps_left = 1000000;
+    matrix_of_truth(m);
+    (void)sc_try(&call, m, (starcat_real)1.0);
+    CHECK(unit_work.found.star[0] >= 0);
+    CHECK_IS(unit_work.found.star[SKY_SPOTS - 1u], -1);
+  }
+}
+
 /* So many spots of unknown brightness that only near ones make triangles: stars on a crowded sky, and
  * a lattice; with any number of steps. */
 static void check_spread(void) {
@@ -554,5 +593,6 @@ void test_rare(void) {
   check_caps();
   check_focal_length();
   check_spread();
+  check_bounds_of_shapes();
   check_clusters();
 }

@@ -17,6 +17,7 @@ from starcat.calibration.calibrate import Calibration, calibrate_frames
 from starcat.calibration.fit import PARAMETERS
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_pair
 from starcat.images.figure_file import check_kind, own_style, write_figure
 from starcat.images.solve_files import IdentifyOptions, measure
 from starcat.matcher.centroids import MeasuredFrame
@@ -107,7 +108,7 @@ def starting_camera(
             )
         focal = known.focal_length_px
         return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))
-    shortest, longest = _focal_range(wanted[0], *fov_deg)
+    shortest, longest = _focal_range(wanted[0], *checked_pair("fov_deg", fov_deg))
     if wanted != (known.width_px, known.height_px):
         known = Camera(*wanted, float(np.sqrt(shortest * longest)))
     return known, (shortest, longest)

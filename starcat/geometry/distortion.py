@@ -6,6 +6,7 @@ y/z are without distortion. Pixels are the camera's.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -41,6 +42,15 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
     below = f" and below {high:g}" if high < np.inf else ""
     text = f"{name} is {value!r}; expected a finite number{above}{below}"
     raise ConfigError(text, key=name, value=value)
+
+
+def checked_pair(name: str, value: object) -> tuple[float, float]:
+    """Return a value that has to be two numbers."""
+    numbers = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
+        text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
+        raise ConfigError(text, key=name, value=value)
+    return float(numbers[0]), float(numbers[1])
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_pair
 from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, ProductArrays, damaged
@@ -162,7 +163,7 @@ def parts_of_range(
     known: Sequence[Level], camera: Camera, fov_deg: tuple[float, float]
 ) -> list[Part]:
     """Return the parts of a range of fields of view."""
-    narrow_deg, wide_deg = (float(angle) for angle in fov_deg)
+    narrow_deg, wide_deg = checked_pair("fov_deg", fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
         raise ConfigError(
             f"fov_deg is {narrow_deg:g} to {wide_deg:g}; expected two fields of view between 0 "

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.errors import ConfigError
@@ -71,10 +72,13 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.max_turn_deg <= WIDEST_PRIOR_DEG:
+        turn_deg: object = self.max_turn_deg
+        if (
+            not isinstance(turn_deg, int | float | np.floating)
+            or not 0.0 < turn_deg <= WIDEST_PRIOR_DEG
+        ):
             raise ConfigError(
-                f"max_turn_deg is {self.max_turn_deg}; expected above 0, at most "
-                f"{WIDEST_PRIOR_DEG:g}",
+                f"max_turn_deg is {turn_deg!r}; expected above 0, at most {WIDEST_PRIOR_DEG:g}",
                 key="max_turn_deg",
                 value=self.max_turn_deg,
             )
@@ -162,14 +166,15 @@ class Tracker:
     def _next_time(self, time_s: float | None) -> float:
         if time_s is None:
             return 0.0 if math.isinf(self._time) else self._time + 1.0
-        if not self._time < time_s < math.inf:
+        now: object = time_s
+        if not isinstance(now, int | float | np.floating) or not self._time < now < math.inf:
             raise ConfigError(
-                f"time_s is {time_s}; expected a number above {self._time}, the time of the frame "
+                f"time_s is {now!r}; expected a number above {self._time}, the time of the frame "
                 "before",
                 key="time_s",
                 value=time_s,
             )
-        return float(time_s)
+        return float(now)
 
     def _predicted(
         self, now: float, camera: Camera
