@@ -11,7 +11,7 @@ FOLDER = Path(__file__).parent / "benchmarks"
 LACKING = 77
 
 BENCHMARKS = [
-    "campaign", "false_matches", "fields", "hostile", "ingest", "instructions",
+    "campaign", "engines", "false_matches", "fields", "hostile", "ingest", "instructions",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
     "matcher --of ruststartracker", "pictures", "products", "scale", "service", "sql", "tracking",
     "votable",

@@ -32,6 +32,7 @@
 #define SC_OVER_CHANCE R(2.0)    /* of the centroids within a smaller reach, over its area's share */
 #define SC_CURVATURE (R(2.0) / R(3.0))
 #define SC_REFINEMENTS 4u
+#define SC_LOG_ROUNDING R(1e-4)   /* logarithms of chances that differ by less are the same */
 #define SC_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
 #define SC_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define SC_SCALE_DEVIATIONS R(3.0)

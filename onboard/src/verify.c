@@ -371,7 +371,8 @@ static void try_rivals(sc_call *call) {
     begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], w->rival_of[n], m);
     judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
-    if (w->wider.log_chance < w->found.log_chance) {
+    /* The fit may lead back to where it began, but for rounding. */
+    if (w->wider.log_chance < w->found.log_chance - SC_LOG_ROUNDING) {
       w->found = w->wider;
       return;
     }

@@ -59,6 +59,9 @@ RIVAL_REACH = 4.0
 """A centroid without a star that is this near to one that another centroid has may have more right
 to it; in units of the final reach."""
 
+ROUNDING = 1e-4
+"""Largest relative difference of probabilities that are the same but for rounding."""
+
 ROUGH = (2.0,)
 """Reach of a first refinement where the focal length is fitted too, in units of the final reach:
 three stars leave more of an error in it than in the attitude."""
@@ -201,7 +204,8 @@ def agree(
         # nearest to the star itself. The star's own spot then has no star, and fits better.
         for rival, centroid in _rivals(refined, observation):
             other = _with_rival(found, rival, centroid, observation, database)
-            if other.false_match_probability < found.false_match_probability:
+            # The fit may lead back to where it began, but for rounding.
+            if other.false_match_probability < (1.0 - ROUNDING) * found.false_match_probability:
                 found = other
                 break
     if found.false_match_probability > certain:

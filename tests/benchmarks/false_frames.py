@@ -59,6 +59,7 @@ class Trial:
     attitudes: tuple[Array, ...] = ()  # each of them is right; none where no answer is
     camera: Camera | None = None  # the true one, where it is not the one that the matcher is told
     noise_px: float = 0.0  # true noise of the stars
+    jump_px: float = 0.0  # how far the sky moved while the frame was taken
 
 
 Make = Callable[[Generator, Scene], Trial]
@@ -185,13 +186,19 @@ def overlaid(generator: Generator, scene: Scene) -> Trial:
 
 
 def jumped(generator: Generator, scene: Scene) -> Trial:
-    """Return two pointings a few pixels apart; all attitudes from one to the other are right."""
+    """Return two pointings a few pixels apart; all attitudes from one to the other are right.
+
+    There is no single truth: an attitude that has some stars of one and some of the other may be
+    off from what lies between them by half of their distance.
+    """
     one = _stars(generator, scene)
     turn = generator.normal(scale=3.0 / scene.camera.focal_length_px, size=3)
     way = Rotation.from_rotvec(np.linspace(0.0, 1.0, 9)[:, None] * turn).as_matrix()
     way = way @ one.attitudes[0]
     other = _stars(generator, scene, attitude=way[-1])
-    return replace(_with_spots(one, other.centroids_px, generator), attitudes=tuple(way))
+    jump_px = float(np.linalg.norm(turn)) * scene.camera.focal_length_px
+    both = _with_spots(one, other.centroids_px, generator)
+    return replace(both, attitudes=tuple(way), jump_px=jump_px)
 
 
 def among_hot_pixels(generator: Generator, scene: Scene) -> Trial:

@@ -1,10 +1,10 @@
 """Whether an answer is right, and all agreements that a search comes to.
 
 An answer is wrong if its attitude puts a star anywhere in the frame farther from its place than the
-tolerance, and than five times the error that the true noise of the matched spots makes there; or
-if more than one and more than 5 % of the named spots are farther from where the true attitude puts
-their star than the matcher's reach and that error. In a frame without a true sky every answer is
-wrong.
+tolerance, and than five times the error that the true noise of the matched spots makes there (and
+than half of the jump, where the sky moved between two exposures); or if more than one and more than
+5 % of the named spots are farther from where the true attitude puts their star than the matcher's
+reach and that error. In a frame without a true sky every answer is wrong.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ def judge(
     )
     verdict: Verdict = "attitude" if trial.attitudes else "no sky"
     for truth in trial.attitudes:
-        if distance_px(matrix, camera, truth, shown) > max(tolerance_px, error_px):
+        off_px = distance_px(matrix, camera, truth, shown) - 0.5 * trial.jump_px
+        if off_px > max(tolerance_px, error_px):
             continue
         place = true_camera.pixels_from_directions(scene.database.directions[stars] @ truth.T)
         apart_px = np.hypot(*(place - trial.centroids_px[rows]).T)
