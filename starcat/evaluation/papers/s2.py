@@ -111,9 +111,9 @@ def _guide_stars_alone(grid: Attitudes) -> Row:
 def _no_star_vanishes(grid: Attitudes) -> Row:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
     experiment = _experiment("seen-magnitude-1", "dynamic_angle", grid, noise)
+    note = "the true magnitude decides what is seen, the noise only what is measured"
     return Row("Magnitude noise, no star vanishes", "dynamic angle, 1 mag", PRESET, experiment,
-               "reference", 98.84, None, 98.9,
-               note="the true magnitude decides what is seen, the noise only what is measured")  # fmt: skip
+               "reference", 98.84, None, 98.9, note=note)  # fmt: skip
 
 
 def _noise(group: str, value: float) -> Noise:
