@@ -5,9 +5,10 @@
 The frames are shared out among the presets, whose databases are built from the catalogs in
 $STARCAT_CATALOGS, and among four kinds: with noise of 0.5 px only (clean), or also with a tenth of
 the stars missing and three false spots (hard); without magnitudes, or with magnitudes of which the
-error, 0.3 mag, and that of the centroids are stated. An answer is wrong if its attitude puts a star
-of the frame farther from its true place than the tolerance. Frames with fewer than four stars have
-no right answer and may have none.
+error, 0.3 mag, and that of the centroids are stated. An answer is right if its attitude puts all stars
+of the frame within the tolerance of their true places, or else as ``judging.py`` says: four stars with
+noise may leave an attitude that is farther off. Frames with fewer than four stars have no right
+answer and may have none.
 """
 
 from __future__ import annotations
@@ -23,12 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from false_frames import Scene, Trial
+from judging import judge_answer
 from rows import FILES, Options, Rows, database, ended
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.result import MatchResult
 from starcat.simulation.selftest import answers_rightly
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 NOISE_PX, NOISE_MAG = 0.5, 0.3
 KINDS = {
@@ -54,6 +58,7 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     database = matcher.database
     given = (database.directions, database.camera, BATCH, noise, seed, database.mag)
     frames = list(simulate_frames(*given))
+    scene = Scene(database, database, NOISE_PX)
     mags = [frame.mag for frame in frames] if is_stated else None
     px = [frame.centroids_px for frame in frames]
     found = matcher.identify_many(px, magnitudes=mags, threads=1)
@@ -61,12 +66,20 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     for frame, answer in zip(frames, found, strict=True):
         counted["too few"] += frame.n_stars < MIN_STARS
         if answer.status == "identified":
-            is_right = frame.n_stars > 0 and answers_rightly(answer, frame, matcher)
-            counted["right" if is_right else "wrong"] += 1
+            counted["right" if _is_right(answer, frame, matcher, scene) else "wrong"] += 1
         else:
             counted["none"] += 1
     counted["microseconds"] += round(1e6 * float(np.sum(found.seconds)))
     return counted
+
+
+def _is_right(answer: MatchResult, frame: Frame, matcher: Matcher, scene: Scene) -> bool:
+    if not frame.n_stars:
+        return False
+    if answers_rightly(answer, frame, matcher):
+        return True
+    trial = Trial(frame.centroids_px, None, (frame.matrix,), noise_px=NOISE_PX)
+    return judge_answer(answer, trial, scene, matcher.tolerance_px) == "right"
 
 
 def main(rows: Rows) -> None:
