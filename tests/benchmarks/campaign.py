@@ -6,9 +6,9 @@ The frames are shared out among the presets, whose databases are built from the 
 $STARCAT_CATALOGS, and among four kinds: with noise of 0.5 px only (clean), or also with a tenth of
 the stars missing and three false spots (hard); without magnitudes, or with magnitudes of which the
 error, 0.3 mag, and that of the centroids are stated. An answer is right if its attitude puts all
-stars of the frame within the tolerance of their true places, or else as ``judging.py`` says, as four
-stars with noise may leave an attitude that is farther off. Frames with fewer than four stars have no
-right answer and may have none.
+stars of the frame within the tolerance of their true places, or else as ``judging.py`` says: with
+noise four stars may leave an attitude that is farther off. Frames with fewer than four stars have
+no right answer and may have none.
 """
 
 from __future__ import annotations
