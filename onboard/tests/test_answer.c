@@ -108,12 +108,38 @@ static void check_one_place(const unit_sky *sky) {
   CHECK(unit_result.covariance_rad2[0] == (starcat_real)0.0);
 }
 
+/* An answer that is fitted once more, with the stars turned about the pole: its attitude is turned
+ * back. */
+static void check_other_directions(const unit_sky *sky) {
+  static starcat_real directions[SKY_STARS][3];
+  const starcat_real s = (starcat_real)0.02, c = (starcat_real)0.99979998;
+  starcat_real before[9];
+  CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
+  sc_fit_answer(&sky->image, NULL, NULL, &unit_work, &unit_result);
+  memcpy(before, unit_result.matrix, sizeof before);
+  for (uint32_t row = 0; row < SKY_STARS; row++) {
+    starcat_real u[3];
+    sc_star(&sky->image, row, u);
+    directions[row][0] = c * u[0] - s * u[1];
+    directions[row][1] = s * u[0] + c * u[1];
+    directions[row][2] = u[2];
+  }
+  sc_fit_answer(&sky->image, &directions[0][0], NULL, &unit_work, &unit_result);
+  for (uint32_t k = 0; k < 3u; k++) {
+    const starcat_real *m = unit_result.matrix + 3u * k;
+    CHECK_NEAR(c * m[0] + s * m[1], before[3u * k], 1e-5);
+    CHECK_NEAR(c * m[1] - s * m[0], before[3u * k + 1u], 1e-5);
+    CHECK_NEAR(m[2], before[3u * k + 2u], 1e-5);
+  }
+}
+
 void test_answer(void) {
   double square, chi_square;
   unit_sky *sky = &unit_scratch;
   unit_copy(&unit_triangle);
   check_unknown(sky);
   check_one_place(sky);
+  check_other_directions(sky);
   for (int is_weighted = 0; is_weighted < 2; is_weighted++) {
     sky->options.noise_px = (starcat_real)(is_weighted ? 0.0 : NOISE_PX);
     check_means(sky, is_weighted, &square, &chi_square);

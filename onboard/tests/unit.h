@@ -48,5 +48,7 @@ void test_camera(void);
 void test_kernels(void);
 void test_rare(void);
 void test_answer(void);
+void test_crowded(void);
+void test_scale(void);
 
 #endif

@@ -33,7 +33,7 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.settings import MIN_SHARE, REACH, TriangleOrder
+from starcat.matcher.settings import REACH, TriangleOrder
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.storage.atomic import whole_file
 
@@ -76,8 +76,6 @@ class Experiment:
     # order in which the matcher takes triangles
     selection: TriangleOrder = field(default_factory=TriangleOrder)
     guide_stars_only: bool = False  # whether nothing but guide stars shines
-    # smallest share of the frame that an answer explains, as the matcher is told
-    min_share: float = MIN_SHARE
     # ``numpy``, whose records are the same everywhere, or the C library where it is installed
     engine: Literal["numpy", "auto"] = "numpy"
     # seed of all that is random. Each frame has its own, so that their number changes none
@@ -169,7 +167,6 @@ def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
         tolerance_px=experiment.tolerance_px,
         max_false_match_probability=experiment.max_false_match_probability,
         selection=experiment.selection,
-        min_share=experiment.min_share,
         engine=experiment.engine,
     )
     # Stars that noise may lift over the limit belong to the sky.

@@ -6,8 +6,9 @@ Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded
 tolerance or noise of its own, with magnitudes or without, with the focal length known or not, from
 the whole sky or near a prior. Compared are status, stars and, where it is fitted, the focal length.
 Not counted as differences are frames whose probability of chance is within 10 % of the accepted
-one, by its logarithm, and frames on which a limit of steps ended one of the searches, as the two
-count steps in their own way.
+one, by its logarithm; frames on which a limit of steps ended one of the searches, as the two count
+steps in their own way; and two answers of other stars that are both right, as to two exposures in
+one frame: they stand in a column of their own.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from false_frames import KINDS, NO_SKY, Scene, Trial
 from false_matches import NOISE_MAG, STATED, databases, matcher_of
+from judging import judge_answer
 from rows import Options, Rows, ended
 
 from starcat.geometry.attitude import after_turn, quaternion_from_matrix
@@ -68,7 +70,9 @@ def made(kind: str, generator: np.random.Generator, scene: Scene) -> Trial:
     return Trial(frame.centroids_px, mag, (frame.matrix,), noise_px=ORDINARY[kind].noise_px)
 
 
-def difference(one: MatchResult, other: MatchResult, accepted: float) -> str | None:
+def difference(
+    one: MatchResult, other: MatchResult, accepted: float, is_right: Callable[[MatchResult], bool]
+) -> str | None:
     """Return what differs between two answers to a frame; None if nothing does."""
     for answer in (one, other):
         if answer.refusal is not None and answer.refusal.reason == "steps":
@@ -84,7 +88,9 @@ def difference(one: MatchResult, other: MatchResult, accepted: float) -> str | N
     limit = math.log(accepted)
     if any(abs(log - limit) <= 0.1 * abs(limit) for log in logs):
         return "at the limit"
-    return "status" if one.status != other.status else "stars"
+    if one.status != other.status:
+        return "status"
+    return "both right" if one.ok and is_right(one) and is_right(other) else "stars"
 
 
 def run(job: Job) -> tuple[Counter[str], list[str]]:
@@ -102,10 +108,15 @@ def run(job: Job) -> tuple[Counter[str], list[str]]:
             settings |= {"noise_mag": NOISE_MAG}
         asked = _asked(generator, trial, scene)
         answers = [_identify(plain, engine, settings, trial, asked) for engine in ("c", "numpy")]
-        found = difference(*answers, plain.max_false_match_probability)
+        reach_px = replace(plain, **settings).tolerance_px
+        found = difference(
+            *answers,
+            plain.max_false_match_probability,
+            lambda answer: judge_answer(answer, trial, scene, reach_px) == "right",  # noqa: B023
+        )
         counted[found or "same"] += 1
         counted["identified"] += answers[0].ok
-        if found not in (None, "steps", "at the limit"):
+        if found in ("status", "stars", "focal length"):
             told.append(f"{job.kind} {seed}: {found}; {settings}, {sorted(asked)}: {answers}")
     return counted, told
 
@@ -142,7 +153,8 @@ def main(rows: Rows) -> None:
     # Frames without a sky take numpy its whole search: fewer of them.
     parts = [0.25 if kind in NO_SKY else 1.0 for kind in kinds]
     each = asked.frames / sum(parts)
-    columns = ("same", "identified", "at the limit", "steps", "status", "stars", "focal length")
+    columns = ("same", "identified", "at the limit", "steps", "both right", "status", "stars",
+               "focal length")  # fmt: skip
     print(f"{'kind':<22}{'frames':>8}", *(f"{name:>13}" for name in columns))
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(asked.workers) as pool:

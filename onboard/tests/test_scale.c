@@ -1,0 +1,269 @@
+/* Focal lengths that are not known, and frames of another scale than the camera's.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+#include "unit.h"
+
+static sky_frame truth;
+static sc_call call;
+
+static starcat_frame frame_of_truth(void) {
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+  return frame;
+}
+
+static starcat_status identify(const unit_sky *sky) {
+  const starcat_frame frame = frame_of_truth();
+  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                          &unit_result);
+}
+
+static starcat_status begin(const unit_sky *sky) {
+  const starcat_frame frame = frame_of_truth();
+  return sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                  &unit_result);
+}
+
+static void matrix_of_truth(starcat_real m[9]) {
+  for (uint32_t k = 0; k < 9u; k++) {
+    m[k] = (starcat_real)truth.matrix[k];
+  }
+}
+
+static uint32_t wrong_stars(void) {
+  uint32_t wrong = 0;
+  for (uint32_t i = 0; i < truth.count; i++) {
+    wrong += (uint32_t)((unit_result.star[i] >= 0) && (unit_result.star[i] != truth.star[i]));
+  }
+  return wrong;
+}
+
+/* The focal length that was found, over the true one. */
+static double found_scale(void) {
+  return (double)unit_result.focal_length_px / (double)unit_triangle.camera.focal_length_px;
+}
+
+/* Focal lengths told wrong by up to a quarter are found, with a lens and without. */
+static void check_found(void) {
+  static const double noises[3] = {0.0, 0.1, 0.3}, errors[3] = {2e-4, 1e-3, 3e-3};
+  uint64_t state = 71;
+  uint32_t found[3] = {0};
+  for (uint32_t n = 0; n < 90u; n++) {
+    const uint32_t kind = n % 3u;
+    unit_scratch = unit_triangle;
+    unit_scratch.camera.k1 = (starcat_real)(n % 2u == 0u ? 0.0 : -0.1);
+    sky_look(&unit_triangle.image, &unit_scratch.camera, &state, noises[kind], SKY_SPOTS,
+             kind == 0u ? 0u : 2u, &truth);
+    unit_scratch.camera.focal_length_px *=
+        (starcat_real)(n < 9u ? 1.0 : 0.8 + 0.45 * sky_uniform(&state));
+    unit_scratch.options.fov_error = (starcat_real)0.3;
+    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
+      CHECK_IS(wrong_stars(), 0);
+      CHECK_NEAR(found_scale(), 1.0, errors[kind]);
+      found[kind]++;
+    }
+  }
+  CHECK((found[0] >= 29u) && (found[1] >= 29u) && (found[2] >= 27u));
+}
+
+/* A lens that shows nothing in a corner with a focal length that is a tenth smaller: that is not
+ * tried, and what it can show is found. */
+static void check_lens(void) {
+  uint64_t state = 72;
+  uint32_t found = 0;
+  starcat_real x = 0, y = 0;
+  for (uint32_t n = 0; n < 20u; n++) {
+    unit_scratch = unit_triangle;
+    unit_scratch.camera.k1 = (starcat_real)-0.2;
+    unit_scratch.camera.fold_radius = (starcat_real)0.57;
+    sky_look(&unit_triangle.image, &unit_scratch.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
+    unit_scratch.options.fov_error = (starcat_real)0.2;
+    unit_scratch.camera.focal_length_px *= (starcat_real)(1.0 + 0.1 * sky_uniform(&state));
+    found += (uint32_t)((identify(&unit_scratch) == STARCAT_IDENTIFIED) && (wrong_stars() == 0u));
+  }
+  CHECK(found >= 19u);
+  CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
+  sc_set_focal(&call, (starcat_real)1.05);
+  CHECK(call.focal == (starcat_real)1.05);
+  CHECK(call.body == unit_work.scaled);
+  sc_set_focal(&call, (starcat_real)0.8);
+  CHECK(call.focal == (starcat_real)1.0);
+  CHECK(call.body == unit_work.body);
+  CHECK(call.camera.given.focal_length_px == unit_scratch.camera.focal_length_px);
+  CHECK(sc_pixel(&call.camera, unit_work.body[0], &x, &y));
+  CHECK_NEAR(x, unit_work.x[0], 1e-3);
+  CHECK_NEAR(y, unit_work.y[0], 1e-3);
+}
+
+/* A spot beside a star: of the two the one that fits is found. */
+static void check_rivals(void) {
+  uint64_t state = 73;
+  uint32_t found = 0, wrong = 0;
+  for (uint32_t n = 0; n < 40u; n++) {
+    unit_scratch = unit_triangle;
+    unit_scratch.options.fov_error = (starcat_real)0.05;
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
+    const uint32_t spot = truth.count++, beside = n % spot;
+    const double angle = 6.28 * sky_uniform(&state), apart_px = 1.0 + 4.0 * sky_uniform(&state);
+    truth.x[spot] = truth.x[beside] + (starcat_real)(apart_px * cos(angle));
+    truth.y[spot] = truth.y[beside] + (starcat_real)(apart_px * sin(angle));
+    truth.magnitudes[spot] = truth.magnitudes[beside];
+    truth.star[spot] = -1;
+    unit_scratch.camera.focal_length_px *= (starcat_real)(0.97 + 0.06 * sky_uniform(&state));
+    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
+      wrong += wrong_stars();
+      found++;
+    }
+  }
+  CHECK(found >= 36u);
+  CHECK(wrong < 2u);
+}
+
+/* Tolerances so wide that a side may be of any length: sides shorter than their error, and angles
+ * larger than a half turn. */
+static void check_wide(void) {
+  uint64_t state = 74;
+  uint32_t found = 0;
+  for (uint32_t n = 0; n < 40u; n++) {
+    static const double tolerances[4] = {20.0, 60.0, 120.0, 250.0};
+    unit_scratch = unit_triangle;
+    unit_scratch.options.fov_error = (starcat_real)(n % 8u < 4u ? 0.5 : 0.05);
+    unit_scratch.options.tolerance_px = (starcat_real)tolerances[n % 4u];
+    unit_scratch.options.max_steps = 300000;
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, 4u + n / 5u, 0, &truth);
+    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
+      CHECK_IS(wrong_stars(), 0);
+      found++;
+    }
+    CHECK(unit_result.steps <= unit_scratch.options.max_steps);
+  }
+  CHECK(found < 10u);
+}
+
+/* Directions so near each other that rounding decides what they tell of the focal length: it stays
+ * within its error, and the bound on chance a number. */
+static void check_near(void) {
+  uint64_t state = 75;
+  unit_scratch = unit_triangle;
+  unit_scratch.options.fov_error = (starcat_real)0.3;
+  for (uint32_t n = 0; n < 400u; n++) {
+    starcat_real m[9];
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
+    matrix_of_truth(m);
+    CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
+    const double size = n == 0u ? 0.0 : IF_SINGLE(1e-4, 1e-8) * sky_uniform(&state);
+    const double x = 0.3 * sky_uniform(&state), y = n == 0u ? 0.0 : 0.3 * sky_uniform(&state);
+    for (uint32_t i = 0; i < unit_work.count; i++) {
+      const double u = (n == 0u ? 0.0 : x) + size * sky_normal(&state);
+      const double v = y + size * sky_normal(&state), scale = 1.0 / sqrt(1.0 + u * u + v * v);
+      unit_work.body[i][0] = (starcat_real)(scale * u);
+      unit_work.body[i][1] = (starcat_real)(scale * v);
+      unit_work.body[i][2] = (starcat_real)scale;
+    }
+    (void)sc_try(&call, m, (starcat_real)1.0);
+    const starcat_real bound = unit_work.best.log_bound, focal = unit_work.best.focal;
+    CHECK(bound - bound == (starcat_real)0.0);
+    CHECK((focal >= (starcat_real)0.6999) && (focal <= (starcat_real)1.4287));
+  }
+}
+
+/* Frames of few stars at another scale than the camera's: they are identified where that is less
+ * than the tolerance in the corners, else it is the reason why not. */
+static void check_other_scales(void) {
+  static const double scales[4] = {0.992, 0.996, 1.004, 1.008};
+  uint64_t state = 76;
+  for (uint32_t kind = 0; kind < 4u; kind++) {
+    uint32_t found = 0, refused = 0;
+    unit_scratch = unit_triangle;
+    unit_scratch.camera.focal_length_px *= (starcat_real)scales[kind];
+    for (uint32_t n = 0; n < 40u; n++) {
+      sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.4, 6u, 0, &truth);
+      if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
+        CHECK_IS(wrong_stars(), 0);
+        found++;
+      }
+      refused += (uint32_t)(unit_result.reason == (uint32_t)STARCAT_REASON_SCALE);
+    }
+    const int is_other = (kind == 0u) || (kind == 3u);
+    CHECK(is_other ? found < 2u : found > 34u);
+    CHECK(is_other ? refused > 34u : refused < 6u);
+  }
+}
+
+/* True stars in one corner and spots elsewhere, with a focal length that is told wrong; the answer
+ * is the first attitude's, not that of the wrong one with another focal length, tried last. */
+static void check_corners(void) {
+  static const starcat_real other[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+  static const double scales[4] = {1.0, 0.985, 1.015, 1.03};
+  uint32_t found = 0, wrong = 0;
+  uint64_t state = 77;
+  unit_scratch = unit_crowded;
+  unit_scratch.options.fov_error = (starcat_real)0.05;
+  for (uint32_t n = 0; n < 120u; n++) {
+    starcat_real m[9];
+    sky_look(&unit_crowded.image, &unit_crowded.camera, &state, 0.1, STARCAT_MAX_CENTROIDS, 0,
+             &truth);
+    const starcat_real edge = (starcat_real)(140 + 40 * (n / 4u % 6u));
+    for (uint32_t k = 0; k < truth.count; k++) {
+      if ((truth.x[k] > edge) || (truth.y[k] > edge)) {
+        truth.x[k] = (starcat_real)(512.0 * sky_uniform(&state));
+        truth.y[k] = (starcat_real)(512.0 * sky_uniform(&state));
+        truth.star[k] = -1;
+      }
+    }
+    unit_scratch.camera.focal_length_px =
+        unit_crowded.camera.focal_length_px * (starcat_real)scales[n % 4u];
+    matrix_of_truth(m);
+    CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
+    (void)sc_try(&call, m, (starcat_real)1.0);
+    (void)sc_try(&call, other, (starcat_real)0.96);
+    if (sc_end(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED) {
+      for (uint32_t k = 0; k < truth.count; k++) {
+        wrong += (uint32_t)((unit_result.star[k] >= 0) && (truth.star[k] >= 0) &&
+                            (unit_result.star[k] != truth.star[k]));
+      }
+      found++;
+      CHECK_NEAR(found_scale(), 1.0, 0.02);
+    }
+  }
+  CHECK(found > 60u);
+  CHECK(wrong < 4u);
+}
+
+/* Whatever the budget, a call takes no more of it, and what it finds is right. */
+static void check_budgets(void) {
+  uint64_t state = 78;
+  uint32_t found = 0, used_up = 0;
+  unit_scratch = unit_triangle;
+  unit_scratch.camera.focal_length_px *= (starcat_real)1.04;
+  unit_scratch.options.fov_error = (starcat_real)0.1;
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 2, &truth);
+  for (uint32_t steps = 1; steps < 400000u; steps += 1u + steps / 20u) {
+    unit_scratch.options.max_steps = steps;
+    const starcat_status status = identify(&unit_scratch);
+    CHECK((unit_result.steps > 0u) && (unit_result.steps <= steps));
+    if (status == STARCAT_IDENTIFIED) {
+      CHECK_IS(wrong_stars(), 0);
+      CHECK_NEAR(found_scale(), 1.0, 2e-3);
+      found++;
+    } else {
+      CHECK_IS(status, STARCAT_E_BUDGET);
+      CHECK_IS(unit_result.reason, STARCAT_REASON_STEPS);
+      used_up++;
+    }
+  }
+  CHECK((found > 0u) && (used_up > 0u));
+}
+
+void test_scale(void) {
+  unit_copy(&unit_triangle);
+  check_found();
+  check_lens();
+  check_rivals();
+  check_wide();
+  check_near();
+  check_other_scales();
+  check_corners();
+  check_budgets();
+}
