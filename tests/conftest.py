@@ -217,6 +217,16 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
     return build(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
 
 
+@pytest.fixture(scope="session")
+def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+    """A registry with the release of the small artifact; to be copied by who uses it."""
+    from starcat.releases.publishing import publish_artifact
+
+    folder = tmp_path_factory.mktemp("published") / "registry"
+    publish_artifact(small_artifact, str(folder))
+    return folder
+
+
 @pytest.fixture
 def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
     """The small artifact as a copy that may be changed; `artifact_copies.seal` puts it right."""

@@ -11,13 +11,15 @@ import pytest
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
 
-from docs import pages
+from every_command import every_command
+
+from docs import PAGES
 from starcat.cli import main as cli
 
 
-@pytest.mark.parametrize("name", pages())
+@pytest.mark.parametrize("name", PAGES)
 def test_generated_pages_are_what_make_docs_writes(name):
-    assert (ROOT / "docs" / name).read_text() == pages()[name].rstrip() + "\n"
+    assert (ROOT / "docs" / name).read_text() == PAGES[name]().rstrip() + "\n"
 
 
 def commands(page):
@@ -29,14 +31,27 @@ def commands(page):
 
 WALKED = [
     "README.md",
-    pytest.param("docs/tutorial.md", marks=pytest.mark.slow),
-    pytest.param("docs/howto-prove.md", marks=pytest.mark.slow),
-    pytest.param("docs/howto-calibrate.md", marks=pytest.mark.slow),
-    pytest.param("docs/howto-query.md", marks=pytest.mark.slow),
-    pytest.param("docs/howto-release.md", marks=pytest.mark.slow),
+    "docs/tutorial.md",
+    "docs/howto-prove.md",
+    "docs/howto-calibrate.md",
+    "docs/howto-query.md",
+    "docs/howto-release.md",
 ]
 
 
+@pytest.mark.parametrize("name", WALKED)
+def test_every_command_of_a_page_is_understood(name):
+    """Its options and arguments are those of the command; what it does is for the slow test."""
+    found, known = commands(ROOT / name), every_command()
+    assert found
+    for text in found:
+        words = shlex.split(text)[1:]
+        count = 2 if " ".join(words[:2]) in known else 1
+        command = " ".join(words[:count])
+        known[command].make_context(command, words[count:])
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", WALKED)
 def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):

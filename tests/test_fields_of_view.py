@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scipy.spatial import cKDTree
 
+from starcat.catalog.ingest import ingest
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
@@ -37,8 +41,15 @@ from starcat.specs.reading import preset
 GIB = 2**30
 
 
+@cache
+def embedded_stars() -> pa.Table:
+    """The stars that `init` and the presets take, read once for all tests."""
+    return ingest("gaia", locate("gaia", {})).stars
+
+
 def started(fov_deg: float) -> Starter:
-    return starter_spec("camera", CameraSpec(width_px=1280, height_px=960, fov_x_deg=fov_deg))
+    camera = CameraSpec(width_px=1280, height_px=960, fov_x_deg=fov_deg)
+    return starter_spec("camera", camera, sky=embedded_stars())
 
 
 def built(spec: BuildSpec, folder: Path) -> tuple[Built, Cost]:
@@ -101,17 +112,13 @@ def test_rows_are_estimated(name, limit_mag, sky_of):
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    from starcat.catalog.ingest import ingest
-    from starcat.catalog.source_files import locate
     from starcat.pipeline.guide_stars import select_stars
-
-    stars = ingest("gaia", locate("gaia", {})).stars
 
     def make(limit_mag: float) -> ProductInputs:
         spec = preset(
             "gaia-12deg", {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"}
         )
-        selected, fields = select_stars(stars, spec)
+        selected, fields = select_stars(embedded_stars(), spec)
         return ProductInputs(directions_of(selected.guide_stars), fields, spec)
 
     return make

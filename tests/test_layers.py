@@ -140,7 +140,10 @@ def test_what_the_matcher_needs_needs_little(module):
 
 ROOM_BY_ROOM = """
 import os, sys
-import astropy.table, duckdb, fastapi, matplotlib.pyplot, pyarrow.dataset, scipy.spatial, typer
+import astropy.io.fits, astropy.io.votable, astropy.table, astropy.wcs, duckdb, fastapi, h5py
+import lxml.etree, matplotlib.pyplot, PIL.Image, pyarrow.dataset, pyarrow.parquet, requests
+import rich.table, scipy.ndimage, scipy.optimize, scipy.spatial, scipy.special, scipy.stats
+import sqlglot.optimizer, tomlkit, typer, uvicorn, vo_models.uws
 failed = []
 for room, *names in {rooms}:
     if (child := os.fork()) == 0:

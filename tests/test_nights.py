@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from starcat.pipeline.build import build
-from starcat.specs.reading import read_spec
+from starcat.pipeline.starter import starter_spec
+from starcat.specs.build_spec import CameraSpec
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "nights"
 NIGHTS = Path(os.environ.get("STARCAT_NIGHTS") or BESIDE)
@@ -29,12 +28,12 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory):
-    """What `starcat init` proposes for that camera."""
-    folder = tmp_path_factory.mktemp("nights")
-    spec = folder / "imx219.toml"
-    asked = ["init", str(spec), "--size", "1024x1024", "--fov-x-deg", "48.8"]
-    subprocess.run([sys.executable, "-m", "starcat", *asked], check=True, capture_output=True)
-    return build(read_spec(spec), {}, folder / "dist").folder
+    """What `starcat init` proposes for that camera, tested with the photographs alone."""
+    camera = CameraSpec(width_px=1024, height_px=1024, fov_x_deg=48.8)
+    spec = starter_spec("imx219", camera).spec
+    short = spec.self_test.model_copy(update={"frames": 5})
+    spec = spec.model_copy(update={"self_test": short})
+    return build(spec, {}, tmp_path_factory.mktemp("nights")).folder
 
 
 def answers(starcat, database, paths):

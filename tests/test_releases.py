@@ -75,13 +75,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture(scope="session")
-def published(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("published") / "registry"
-    publish_artifact(small_artifact, str(folder))
-    return folder
-
-
 @pytest.fixture
 def registry(published: Path, here: None) -> Path:
     """A registry with one release; ``registry`` below the current folder."""

@@ -153,10 +153,9 @@ def test_addresses_that_are_none(address, small_artifact):
 
 
 @pytest.fixture
-def registry(small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def registry(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    publish_artifact(small_artifact, "registry")
-    return Path("registry")
+    return Path(shutil.copytree(published, "registry"))
 
 
 def pull(registry: Path | str, max_bytes: int | None = None) -> Path:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from every_command import every_command
@@ -148,24 +150,23 @@ def _example(key: SpecKey) -> str:
     return "" if key.example is None else f"`{toml_value(key.example)}`"
 
 
-def pages() -> dict[str, str]:
-    """Return all generated pages by file name."""
-    return {
-        "cli.md": cli_page(),
-        "spec.md": spec_page(),
-        "sql.md": sql_page(),
-        "products.md": products_page(),
-        "sources.md": sources_page(),
-        "reproduction.md": reproduction_page(DOCS / "reproduction.json"),
-    }
+PAGES: dict[str, Callable[[], str]] = {
+    "cli.md": cli_page,
+    "spec.md": spec_page,
+    "sql.md": sql_page,
+    "products.md": products_page,
+    "sources.md": sources_page,
+    "reproduction.md": partial(reproduction_page, DOCS / "reproduction.json"),
+}
+"""What makes each generated page, by file name."""
 
 
 def main() -> None:
     """Write the pages."""
     DOCS.mkdir(exist_ok=True)
-    for name, text in pages().items():
-        (DOCS / name).write_text(text.rstrip() + "\n", encoding="utf-8")
-    sys.stderr.write(f"wrote {', '.join(pages())} in docs/\n")
+    for name, page in PAGES.items():
+        (DOCS / name).write_text(page().rstrip() + "\n", encoding="utf-8")
+    sys.stderr.write(f"wrote {', '.join(PAGES)} in docs/\n")
 
 
 if __name__ == "__main__":
