@@ -42,14 +42,6 @@ def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
     return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
 
 
-def test_the_matcher_is_told_the_share_of_the_trial(small_artifact, tmp_path):
-    noise = Noise(drop_probability=0.5, false_stars=4, limit_mag=6.0)
-    half = Experiment("half", "triangle", Attitudes("random", 30), noise, min_share=0.05)
-    whole = replace(half, name="whole", min_share=1.0)
-    assert statuses(half, small_artifact, tmp_path).count("identified") >= 10
-    assert statuses(whole, small_artifact, tmp_path).count("identified") == 0
-
-
 def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
     numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
@@ -67,7 +59,7 @@ def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
 def test_noise_of_a_magnitude_is_read_in_every_way():
     rows = {row.experiment.name: row for paper in (s2, s4) for row in paper.rows(quick=True)}
     one = rows["s2-magnitude-noise-1-dynamic_angle"]
-    for name in ("guides", "share", "seen"):
+    for name in ("guides", "seen"):
         other = rows[f"s2-{name}-magnitude-1-dynamic_angle"]
         assert other.published_percent == one.published_percent == 98.84
         assert other.experiment != one.experiment

@@ -205,7 +205,7 @@ def test_frames_may_be_given_as_one_frame_may(sky):
     for wrong in ([[1.0, 2.0, 3.0]], [1.0, 2.0], 5.0):
         with pytest.raises(ValueError, match="expected"):
             matcher.identify_many([frame.centroids_px, wrong])
-    with pytest.raises(ValueError, match=r"magnitudes have shape \(1,\); expected"):
+    with pytest.raises(ValueError, match=r"magnitudes has shape \(1,\); expected"):
         matcher.identify_many([frame.centroids_px], magnitudes=[[1.0]])
 
 

@@ -450,7 +450,7 @@ def _chi_square_of_chance(free: int) -> float:
     """Return the reduced chi-square that chance exceeds once in a thousand (Wilson, Hilferty 1931).
 
     >>> round(_chi_square_of_chance(5), 2), round(_chi_square_of_chance(40), 2)
-    (4.11, 1.84)
+    (4.15, 1.84)
     """
     part = 2.0 / (9.0 * max(1, free))
     return (1.0 - part + 3.0902 * math.sqrt(part)) ** 3
