@@ -244,8 +244,7 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
 }
 
 /* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
- * with every star, and polynomials of both are added up. Returns
- * 0 if they are used up. */
+ * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
 static int spend_on_bound(const sc_call *call) {
   starcat_workspace *w = call->work;
   const uint32_t most = w->count < w->n_within ? w->count : w->n_within;

@@ -26,14 +26,6 @@ static starcat_status begin(const unit_sky *of) {
   return sc_begin(&call, &of->image, &of->camera, &of->options, &frame, &unit_work, &unit_result);
 }
 
-static uint32_t wrong_stars(void) {
-  uint32_t wrong = 0;
-  for (uint32_t i = 0; i < truth.count; i++) {
-    wrong += (uint32_t)((unit_result.star[i] >= 0) && (unit_result.star[i] != truth.star[i]));
-  }
-  return wrong;
-}
-
 static int count_taken(sc_call *of, const uint32_t triple[3], const starcat_real sides[3]) {
   (void)of;
   CHECK((triple[0] < triple[1]) && (triple[1] < triple[2]));
@@ -127,7 +119,7 @@ static void check_stars(void) {
   for (uint32_t n = 0; n < 40u; n++) {
     sky_look(&sky.image, &sky.camera, &state, 0.2, STARCAT_MAX_CENTROIDS, 40u, &truth);
     if (identify(&sky) == STARCAT_IDENTIFIED) {
-      CHECK_IS(wrong_stars(), 0);
+      CHECK_IS(unit_wrong_stars(&truth), 0);
       found++;
     }
   }
@@ -150,7 +142,7 @@ static void check_nearer(void) {
     if (sc_try(&call, m, (starcat_real)1.0) != 0) {
       CHECK_IS(sc_end(&call, &sky.options, &unit_result), STARCAT_IDENTIFIED);
       certain++;
-      wrong += wrong_stars();
+      wrong += unit_wrong_stars(&truth);
     }
   }
   CHECK(certain >= 36u);

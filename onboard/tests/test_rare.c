@@ -10,19 +10,8 @@
 static sky_frame truth;
 static sc_call call;
 
-static starcat_frame frame_of_truth(void) {
-  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
-  return frame;
-}
-
-static starcat_status identify(const unit_sky *sky) {
-  const starcat_frame frame = frame_of_truth();
-  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                          &unit_result);
-}
-
 static starcat_status track(const unit_sky *sky, starcat_real uncertainty_rad) {
-  const starcat_frame frame = frame_of_truth();
+  const starcat_frame frame = unit_frame_of(&truth);
   return starcat_track(&sky->image, &sky->camera, &sky->options, &frame, truth.q_body_from_icrs,
                        uncertainty_rad, &unit_work, &unit_result);
 }
@@ -30,25 +19,11 @@ static starcat_status track(const unit_sky *sky, starcat_real uncertainty_rad) {
 /* A frame that the sky identifies, its stars in the workspace, and the call that found them. */
 static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t n_false) {
   sky_look(&sky->image, &sky->camera, &seed, 0.2, n_spots, n_false, &truth);
-  CHECK_IS(identify(sky), STARCAT_IDENTIFIED);
-  const starcat_frame frame = frame_of_truth();
+  CHECK_IS(unit_identify(sky, &truth), STARCAT_IDENTIFIED);
+  const starcat_frame frame = unit_frame_of(&truth);
   CHECK_IS(sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                     &unit_result),
            STARCAT_IDENTIFIED);
-}
-
-static uint32_t wrong_stars(void) {
-  uint32_t wrong = 0;
-  for (uint32_t i = 0; i < truth.count; i++) {
-    wrong += (uint32_t)((unit_result.star[i] >= 0) && (unit_result.star[i] != truth.star[i]));
-  }
-  return wrong;
-}
-
-static void matrix_of_truth(starcat_real m[9]) {
-  for (uint32_t k = 0; k < 9u; k++) {
-    m[k] = (starcat_real)truth.matrix[k];
-  }
 }
 
 /* Directions that determine no attitude. */
@@ -149,7 +124,7 @@ static void check_half_sky(void) {
     truth.magnitudes[n] = (starcat_real)n;
   }
   unit_scratch.options.max_steps = 100000;
-  CHECK(identify(&unit_scratch) != STARCAT_IDENTIFIED);
+  CHECK(unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED);
   CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_OPTIONS);
 }
 
@@ -163,12 +138,12 @@ static void check_repeated(void) {
     truth.magnitudes[n] = truth.magnitudes[k];
     truth.star[n] = -1;
   }
-  CHECK_IS(identify(&unit_pyramid), STARCAT_IDENTIFIED);
+  CHECK_IS(unit_identify(&unit_pyramid, &truth), STARCAT_IDENTIFIED);
   CHECK_IS(unit_result.star[truth.count - 1u], STARCAT_DROPPED_DUPLICATE);
   for (uint32_t k = 0; k < 4u; k++) {
     truth.x[truth.count - 4u + k] *= (starcat_real)(1.0 + IF_SINGLE(1e-7, 1e-8));
   }
-  CHECK_IS(identify(&unit_pyramid), STARCAT_IDENTIFIED);
+  CHECK_IS(unit_identify(&unit_pyramid, &truth), STARCAT_IDENTIFIED);
   CHECK_IS(track(&unit_pyramid, (starcat_real)0.01), STARCAT_IDENTIFIED);
   /* Only false spots, each twice: no pair of them is a pair of stars. */
   for (uint32_t k = 0; k < truth.count; k++) {
@@ -187,8 +162,8 @@ static void check_lattice(void) {
     truth.y[k] = (starcat_real)(56 + 100 * (k / 5u));
     truth.magnitudes[k] = (starcat_real)NAN;
   }
-  CHECK_IS(identify(&unit_triangle), STARCAT_NO_MATCH);
-  CHECK_IS(identify(&unit_pyramid), STARCAT_NO_MATCH);
+  CHECK_IS(unit_identify(&unit_triangle, &truth), STARCAT_NO_MATCH);
+  CHECK_IS(unit_identify(&unit_pyramid, &truth), STARCAT_NO_MATCH);
 }
 
 /* Triangles of any size with an error of any size, where the scale is known to half of it; and two
@@ -223,7 +198,7 @@ static void check_bounds_of_shapes(void) {
       }
     }
     unit_work.steps_left = 1000000;
-    matrix_of_truth(m);
+    unit_matrix_of(&truth, m);
     (void)sc_try(&call, m, (starcat_real)1.0);
     CHECK(unit_work.found.star[0] >= 0);
     CHECK_IS(unit_work.found.star[SKY_SPOTS - 1u], -1);
@@ -250,7 +225,7 @@ static void check_spread(void) {
       const starcat_status status =
           starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                            &unit_work, &unit_result);
-      CHECK((status != STARCAT_IDENTIFIED) || ((n < 6u) && (wrong_stars() <= 1u)));
+      CHECK((status != STARCAT_IDENTIFIED) || ((n < 6u) && (unit_wrong_stars(&truth) <= 1u)));
     }
     CHECK_IS(unit_result.reason == (uint32_t)STARCAT_REASON_NONE, n < 6u);
   }
@@ -264,7 +239,7 @@ static void check_chances(void) {
     uint64_t seed = 4;
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.2, SKY_SPOTS, 0, &truth);
     unit_scratch.options.log_chance = (starcat_real)chances[n];
-    CHECK_IS(identify(&unit_scratch), n < 3u ? STARCAT_IDENTIFIED : STARCAT_NO_MATCH);
+    CHECK_IS(unit_identify(&unit_scratch, &truth), n < 3u ? STARCAT_IDENTIFIED : STARCAT_NO_MATCH);
   }
 }
 
@@ -277,11 +252,11 @@ static void check_lenses(void) {
   truth.y[0] = (starcat_real)487.0;
   unit_scratch.camera.k1 = (starcat_real)-8.0;
   unit_scratch.camera.k2 = (starcat_real)20.0;
-  CHECK_IS(identify(&unit_scratch), STARCAT_E_CAMERA);
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_CAMERA);
   unit_scratch.camera.k1 = (starcat_real)-0.2;
   unit_scratch.camera.k2 = (starcat_real)0.0;
   unit_scratch.camera.fold_radius = (starcat_real)0.3;
-  CHECK_IS(identify(&unit_scratch), STARCAT_E_CAMERA);
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_CAMERA);
 }
 
 /* Frames of another scale than the camera's are refused, larger and smaller ones, although every
@@ -297,7 +272,7 @@ static void check_scale(void) {
         truth.x[k] = (starcat_real)256.0 + scale * (truth.x[k] - (starcat_real)256.0);
         truth.y[k] = (starcat_real)256.0 + scale * (truth.y[k] - (starcat_real)256.0);
       }
-      identified += (uint32_t)(identify(&unit_pyramid) == STARCAT_IDENTIFIED);
+      identified += (uint32_t)(unit_identify(&unit_pyramid, &truth) == STARCAT_IDENTIFIED);
     }
     CHECK_IS(identified, 0);
   }
@@ -322,7 +297,7 @@ static void check_crowded(void) {
       truth.magnitudes[0] = truth.magnitudes[1];
     }
     truth.magnitudes[2] = (starcat_real)NAN;
-    const starcat_status identified = identify(&unit_scratch);
+    const starcat_status identified = unit_identify(&unit_scratch, &truth);
     CHECK(n % 3u == 1u || identified == STARCAT_IDENTIFIED);
     CHECK(unit_result.steps <= unit_scratch.options.max_steps);
     const starcat_status tracked = track(&unit_scratch, (starcat_real)0.01);
@@ -340,7 +315,7 @@ static void check_second_rows(void) {
   }
   uint64_t seed = 4;
   sky_look(&unit_pyramid.image, &unit_pyramid.camera, &seed, 0.2, SKY_SPOTS, 0, &truth);
-  CHECK_IS(identify(&unit_scratch), STARCAT_NO_MATCH);
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_NO_MATCH);
 }
 
 /* Numbers that a damaged image, or a tolerance as wide as the frame, lead to. */
@@ -359,8 +334,8 @@ static void check_wide(void) {
     unit_scratch.options.tolerance_px = (starcat_real)(n == 2u ? 20.0 : 250.0);
     unit_scratch.options.max_steps = 200000;
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.2, SKY_SPOTS, 0, &truth);
-    CHECK((identify(&unit_scratch) != STARCAT_IDENTIFIED) || (wrong_stars() == 0u));
-    CHECK((track(&unit_scratch, (starcat_real)0.3) != STARCAT_IDENTIFIED) || (wrong_stars() == 0u));
+    CHECK((unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED) || (unit_wrong_stars(&truth) == 0u));
+    CHECK((track(&unit_scratch, (starcat_real)0.3) != STARCAT_IDENTIFIED) || (unit_wrong_stars(&truth) == 0u));
   }
 }
 
@@ -373,8 +348,8 @@ static void check_noises(void) {
     uint64_t seed = n + 50u;
     unit_scratch.options.noise_px = (starcat_real)noises[n % 4u];
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.05, 4u + n / 4u, n / 16u, &truth);
-    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
-      CHECK_IS(wrong_stars(), 0);
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      CHECK_IS(unit_wrong_stars(&truth), 0);
       identified[n % 4u]++;
     }
   }
@@ -417,7 +392,7 @@ static void check_priors(void) {
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, 30, 0, &truth);
     truth.q_body_from_icrs[n % 3u] += (starcat_real)0.015;
     CHECK_IS(track(&unit_scratch, (starcat_real)0.05), STARCAT_IDENTIFIED);
-    CHECK_IS(wrong_stars(), 0);
+    CHECK_IS(unit_wrong_stars(&truth), 0);
   }
 }
 
@@ -515,17 +490,17 @@ static void check_focal_length(void) {
     unit_scratch = unit_triangle;
     unit_scratch.camera.focal_length_px *= scale;
     unit_scratch.options.fov_error = (starcat_real)0.01;
-    CHECK_IS(identify(&unit_scratch), STARCAT_NO_MATCH);
+    CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_NO_MATCH);
     CHECK(unit_result.reason != (uint32_t)STARCAT_REASON_NONE);
     CHECK_IS(unit_result.n_usable, truth.count);
     unit_scratch.options.fov_error = (starcat_real)0.05;
-    CHECK_IS(identify(&unit_scratch), STARCAT_IDENTIFIED);
-    CHECK_IS(wrong_stars(), 0);
+    CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_IDENTIFIED);
+    CHECK_IS(unit_wrong_stars(&truth), 0);
     const starcat_real ratio = unit_result.focal_length_px / unit_triangle.camera.focal_length_px;
     CHECK((ratio > (starcat_real)0.998) && (ratio < (starcat_real)1.002));
   }
   unit_scratch.options.fov_error = (starcat_real)0.6;
-  CHECK_IS(identify(&unit_scratch), STARCAT_E_OPTIONS);
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_OPTIONS);
 }
 
 /* True stars in one corner, spots elsewhere, and an attitude that is turned: what it explains is
@@ -545,11 +520,11 @@ static void check_clusters(void) {
         truth.star[k] = -1;
       }
     }
-    const starcat_frame frame = frame_of_truth();
+    const starcat_frame frame = unit_frame_of(&truth);
     CHECK_IS(sc_begin(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
                       &frame, &unit_work, &unit_result),
              STARCAT_IDENTIFIED);
-    matrix_of_truth(m);
+    unit_matrix_of(&truth, m);
     for (uint32_t k = 0; k < 3u; k++) { /* turned by up to five reaches about y, and about z */
       const starcat_real turn = (starcat_real)(0.0025 * (n / 10u % 8u));
       const starcat_real roll = (starcat_real)(0.01 * (n / 80u));

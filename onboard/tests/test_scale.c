@@ -8,35 +8,10 @@
 static sky_frame truth;
 static sc_call call;
 
-static starcat_frame frame_of_truth(void) {
-  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
-  return frame;
-}
-
-static starcat_status identify(const unit_sky *sky) {
-  const starcat_frame frame = frame_of_truth();
-  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                          &unit_result);
-}
-
 static starcat_status begin(const unit_sky *sky) {
-  const starcat_frame frame = frame_of_truth();
+  const starcat_frame frame = unit_frame_of(&truth);
   return sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                   &unit_result);
-}
-
-static void matrix_of_truth(starcat_real m[9]) {
-  for (uint32_t k = 0; k < 9u; k++) {
-    m[k] = (starcat_real)truth.matrix[k];
-  }
-}
-
-static uint32_t wrong_stars(void) {
-  uint32_t wrong = 0;
-  for (uint32_t i = 0; i < truth.count; i++) {
-    wrong += (uint32_t)((unit_result.star[i] >= 0) && (unit_result.star[i] != truth.star[i]));
-  }
-  return wrong;
 }
 
 /* The focal length that was found, over the true one. */
@@ -58,8 +33,8 @@ static void check_found(void) {
     unit_scratch.camera.focal_length_px *=
         (starcat_real)(n < 9u ? 1.0 : 0.8 + 0.45 * sky_uniform(&state));
     unit_scratch.options.fov_error = (starcat_real)0.3;
-    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
-      CHECK_IS(wrong_stars(), 0);
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      CHECK_IS(unit_wrong_stars(&truth), 0);
       CHECK_NEAR(found_scale(), 1.0, errors[kind]);
       found[kind]++;
     }
@@ -80,7 +55,7 @@ static void check_lens(void) {
     sky_look(&unit_triangle.image, &unit_scratch.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
     unit_scratch.options.fov_error = (starcat_real)0.2;
     unit_scratch.camera.focal_length_px *= (starcat_real)(1.0 + 0.1 * sky_uniform(&state));
-    found += (uint32_t)((identify(&unit_scratch) == STARCAT_IDENTIFIED) && (wrong_stars() == 0u));
+    found += (uint32_t)((unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) && (unit_wrong_stars(&truth) == 0u));
   }
   CHECK(found >= 19u);
   CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
@@ -111,8 +86,8 @@ static void check_rivals(void) {
     truth.magnitudes[spot] = truth.magnitudes[beside];
     truth.star[spot] = -1;
     unit_scratch.camera.focal_length_px *= (starcat_real)(0.97 + 0.06 * sky_uniform(&state));
-    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
-      wrong += wrong_stars();
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      wrong += unit_wrong_stars(&truth);
       found++;
     }
   }
@@ -132,8 +107,8 @@ static void check_wide(void) {
     unit_scratch.options.tolerance_px = (starcat_real)tolerances[n % 4u];
     unit_scratch.options.max_steps = 300000;
     sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, 4u + n / 5u, 0, &truth);
-    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
-      CHECK_IS(wrong_stars(), 0);
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      CHECK_IS(unit_wrong_stars(&truth), 0);
       found++;
     }
     CHECK(unit_result.steps <= unit_scratch.options.max_steps);
@@ -150,7 +125,7 @@ static void check_near(void) {
   for (uint32_t n = 0; n < 400u; n++) {
     starcat_real m[9];
     sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
-    matrix_of_truth(m);
+    unit_matrix_of(&truth, m);
     CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
     const double size = n == 0u ? 0.0 : IF_SINGLE(1e-4, 1e-8) * sky_uniform(&state);
     const double x = 0.3 * sky_uniform(&state), y = n == 0u ? 0.0 : 0.3 * sky_uniform(&state);
@@ -179,8 +154,8 @@ static void check_other_scales(void) {
     unit_scratch.camera.focal_length_px *= (starcat_real)scales[kind];
     for (uint32_t n = 0; n < 40u; n++) {
       sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.4, 6u, 0, &truth);
-      if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
-        CHECK_IS(wrong_stars(), 0);
+      if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+        CHECK_IS(unit_wrong_stars(&truth), 0);
         found++;
       }
       refused += (uint32_t)(unit_result.reason == (uint32_t)STARCAT_REASON_SCALE);
@@ -214,7 +189,7 @@ static void check_corners(void) {
     }
     unit_scratch.camera.focal_length_px =
         unit_crowded.camera.focal_length_px * (starcat_real)scales[n % 4u];
-    matrix_of_truth(m);
+    unit_matrix_of(&truth, m);
     CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
     (void)sc_try(&call, m, (starcat_real)1.0);
     (void)sc_try(&call, other, (starcat_real)0.96);
@@ -241,10 +216,10 @@ static void check_budgets(void) {
   sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 2, &truth);
   for (uint32_t steps = 1; steps < 400000u; steps += 1u + steps / 20u) {
     unit_scratch.options.max_steps = steps;
-    const starcat_status status = identify(&unit_scratch);
+    const starcat_status status = unit_identify(&unit_scratch, &truth);
     CHECK((unit_result.steps > 0u) && (unit_result.steps <= steps));
     if (status == STARCAT_IDENTIFIED) {
-      CHECK_IS(wrong_stars(), 0);
+      CHECK_IS(unit_wrong_stars(&truth), 0);
       CHECK_NEAR(found_scale(), 1.0, 2e-3);
       found++;
     } else {

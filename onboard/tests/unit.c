@@ -36,6 +36,31 @@ starcat_status unit_open_with(size_t at, uint32_t value) {
   return starcat_open(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, 0);
 }
 
+starcat_frame unit_frame_of(const sky_frame *truth) {
+  const starcat_frame frame = {truth->count, truth->x, truth->y, truth->magnitudes, NULL};
+  return frame;
+}
+
+starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth) {
+  const starcat_frame frame = unit_frame_of(truth);
+  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                          &unit_result);
+}
+
+uint32_t unit_wrong_stars(const sky_frame *truth) {
+  uint32_t wrong = 0;
+  for (uint32_t i = 0; i < truth->count; i++) {
+    wrong += (uint32_t)((unit_result.star[i] >= 0) && (unit_result.star[i] != truth->star[i]));
+  }
+  return wrong;
+}
+
+void unit_matrix_of(const sky_frame *truth, starcat_real m[9]) {
+  for (uint32_t k = 0; k < 9u; k++) {
+    m[k] = (starcat_real)truth->matrix[k];
+  }
+}
+
 int main(void) {
   static const struct {
     const char *name;

@@ -35,6 +35,13 @@ void unit_copy(const unit_sky *from);
 /* Write a number into the scratch image, seal it again, and open it. */
 starcat_status unit_open_with(size_t at, uint32_t value);
 
+/* A frame of the sky as the library is given it, what that is identified as, the stars of the answer
+ * that are others than the true ones, and the true attitude. */
+starcat_frame unit_frame_of(const sky_frame *truth);
+starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth);
+uint32_t unit_wrong_stars(const sky_frame *truth);
+void unit_matrix_of(const sky_frame *truth, starcat_real m[9]);
+
 void test_open(void);
 void test_scrub(void);
 void test_damaged(void);
