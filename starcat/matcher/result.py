@@ -26,6 +26,7 @@ from starcat.matcher.stars import (
     NO_STARS,
     MatchedStars,
     attitude_covariance,
+    degrees_of_freedom,
     matched_stars,
     reduced_chi_square,
 )
@@ -284,14 +285,17 @@ class MatchResult:
         It is 1 on average where ``noise_px`` or ``sigma_px`` is right, the square of how many
         times too small where it is not. Errors of the camera raise it too.
         """
-        return reduced_chi_square(self.stars, 3 if self.focal_length_error_px is None else 4)
+        return reduced_chi_square(self.stars, self._free)
+
+    @property
+    def _free(self) -> int:
+        return degrees_of_freedom(self.stars, 3 if self.focal_length_error_px is None else 4)
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """What a reader of the answer should know beside it, in sentences."""
         chi_square = self.reduced_chi_square
-        free = 2 * int(np.isfinite(self.stars.sigma_px).sum()) - 3
-        if not chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(free)):
+        if not chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             return ()
         return (
             f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "

@@ -127,16 +127,20 @@ def matched_stars(
     )
 
 
-def reduced_chi_square(stars: MatchedStars, unknowns: int) -> float:
+def degrees_of_freedom(stars: MatchedStars, unknowns: int) -> int:
+    """Return two a star whose noise is known, less the ``unknowns`` that were fitted."""
+    return 2 * int(np.isfinite(stars.sigma_px).sum()) - unknowns
+
+
+def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     """Return the squared offsets of centroids, in their noise, over the degrees of freedom.
 
-    Those are two a star whose noise is known, less the ``unknowns`` that were fitted. It is 1 on
-    average where the noise is stated rightly; NaN where none is stated or nothing is left.
+    It is 1 on average where the noise is stated rightly; NaN where none is stated or nothing is
+    left.
     """
-    known = np.isfinite(stars.sigma_px)
-    free = 2 * int(np.count_nonzero(known)) - unknowns
     if free <= 0:
         return math.nan
+    known = np.isfinite(stars.sigma_px)
     square = (stars.dx_px**2 + stars.dy_px**2)[known] / stars.sigma_px[known] ** 2
     return float(square.sum()) / free
 
