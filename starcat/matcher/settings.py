@@ -61,7 +61,10 @@ LOOKUP = 10
 """Steps of looking up one pattern of a frame."""
 
 AGREEMENT = 50
-"""Steps of working out one agreement."""
+"""Steps of refining an attitude once, for each full `PAIRS` of centroids and stars."""
+
+PAIRS = 4000
+"""Pairs of a centroid and a star near the frame, up to which a refinement costs `AGREEMENT`."""
 
 
 @dataclass(frozen=True)
@@ -222,8 +225,8 @@ class Budget:
     """What is left of a search.
 
     A step is a candidate that is compared with the frame, and takes some microseconds. Looking up
-    a pattern of the frame counts as `LOOKUP` steps, working out an agreement as `AGREEMENT`. The
-    same budget in steps gives the same answer everywhere; a limit of time does not.
+    a pattern of the frame counts as `LOOKUP` steps, refining an attitude as `AGREEMENT` or more.
+    The same budget in steps gives the same answer everywhere; a limit of time does not.
     """
 
     max_steps: float = math.inf

@@ -29,7 +29,7 @@ from starcat.matcher.pose import (
     pose_at,
     scaled_directions,
 )
-from starcat.matcher.settings import AGREEMENT, MIN_SHARE, REACH
+from starcat.matcher.settings import AGREEMENT, MIN_SHARE, PAIRS, REACH
 from starcat.matcher.star_cells import cells_for, stars_in_cap
 
 Withheld = Literal["share_of_frame", "scale"] | None
@@ -195,7 +195,6 @@ def agree(
     first: tuple[float, ...] = (),
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts."""
-    observation.budget.spend(AGREEMENT)
     rough = ROUGH if observation.fov_error and not first else first
     refined = _refine(pose, observation, database, rough)
     found = _agreement_of(refined, observation)
@@ -225,7 +224,6 @@ def agree(
 def _at_own_scale(found: Agreement, observation: Observation, database: Database) -> Agreement:
     """Withhold an agreement if the frame agrees better with another focal length."""
     free = replace(observation, fov_error=OTHER_SCALES)
-    observation.budget.spend(AGREEMENT)
     scaled = _agreement_of(_refine(found.pose, free, database, ROUGH), free)
     factor = scaled.pose.camera.focal_length_px / observation.camera.focal_length_px
     corner_px = abs(factor - 1.0) * math.hypot(*observation.camera.middle_px)
@@ -249,7 +247,6 @@ def _within_less(
         near = int(np.sum(square_px <= (factor * REACH * observation.tolerance_px) ** 2))
         if near < MIN_STARS or near < OVER_CHANCE * factor * factor * count:
             continue
-        observation.budget.spend(AGREEMENT)
         narrow = _refine(found.pose, observation, database, NARROWER[:k], factor)
         other = _agreement_of(narrow, observation)
         if other.is_better_than(found):
@@ -311,6 +308,7 @@ def _refine(
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
+    observation.budget.spend(AGREEMENT * max(1, len(observation) * len(near) // PAIRS))
     u = database.directions[near]
     compatible = observation.compatible(database.mag[near])
     before: list[int] = []
