@@ -91,13 +91,13 @@ class Engine:
         self._is_late = False
         self._process = self._started()
 
-    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
+    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
         """Make views and macros by SQL; from here on the process reads nothing but some files.
 
-        ``macros`` are those that stand after FROM.
+        The SQL names them from a folder on; ``macros`` are those that stand after FROM.
         """
-        self.ask("open", sql, files, macros)
-        self._opened = sql, files, macros
+        self.ask("open", sql, folder, files, macros)
+        self._opened = sql, folder, files, macros
 
     def ask(
         self,

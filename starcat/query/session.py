@@ -7,6 +7,7 @@ or too much memory is ended.
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -193,8 +194,12 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
     files = [file for view in views for file in view.files]
     names = frozenset(macro.name for macro in macros() if macro.is_table)
+    folder = _common_folder(files)
+    # Files are named from there on: what DuckDB tells of a view is not where it lies on the machine.
+    text = preamble(targets)
+    text = text.replace(quoted(folder + os.sep)[:-1], "'") if folder else text
     try:
-        engine.open(preamble(targets), files, names)
+        engine.open(text, folder, files, names)
     except QueryError as error:
         ended = isinstance(error, WorkerEnded)
         guilty = _which_fails(engine, views) if ended else None
@@ -203,6 +208,14 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
             f"{where}: a table cannot be opened ({str(error).splitlines()[0]}); 'starcat verify' "
             "says what is wrong with an artifact"
         ) from error
+
+
+def _common_folder(files: Sequence[str]) -> str:
+    """Return the folder that all files are in; empty where that is the root, or none."""
+    try:
+        return os.path.commonpath([os.path.dirname(file) for file in files]).rstrip(os.sep)
+    except ValueError:  # no files, or files of several drives
+        return ""
 
 
 def _which_fails(engine: Engine, views: Sequence[View]) -> View | None:

@@ -107,8 +107,12 @@ class Worker:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
         )
 
-    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
-        """Make the views, and allow no other file and no other setting from here on."""
+    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
+        """Make the views, and allow no other file and no other setting from here on.
+
+        Views name their files from the folder on.
+        """
+        os.chdir(folder or os.sep)
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
