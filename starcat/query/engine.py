@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,12 +31,36 @@ _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker im
 
 @dataclass
 class Allowance:
-    """The time that a query may take."""
+    """The time that a query may take; only waiting for the answer counts.
+
+    With ``first_s`` it has so much at first, in which what is done with the answer counts too. Then
+    ``prolong`` says whether it may have the rest.
+    """
 
     total_s: float
+    first_s: float | None = None
+    prolong: Callable[[], bool] = bool
 
     def __post_init__(self) -> None:
-        self.left_s = self.total_s  # only waiting for the answer counts
+        self.left_s = self.total_s if self.first_s is None else self.first_s
+        self._ends_s = time.monotonic() + self.left_s
+
+    @property
+    def most_s(self) -> float:
+        """What is left of it, if it may have the rest."""
+        return self.left_s + (0.0 if self.first_s is None else self.total_s - self.first_s)
+
+    def begin(self) -> None:
+        """Begin to wait for an answer."""
+        if self.first_s is not None:
+            self.left_s = min(self.left_s, self._ends_s - time.monotonic())
+
+    def is_prolonged(self) -> bool:
+        """Have the rest, if there is one and it may be had."""
+        if self.first_s is None or not self.prolong():
+            return False
+        self.left_s, self.first_s = self.most_s, None
+        return True
 
 
 _waiting: list[subprocess.Popen[bytes]] = []
@@ -147,7 +171,7 @@ class Engine:
         kind = ""
         try:
             with self._within(allowance):
-                _write(self._process, (name, allowance.left_s, content))
+                _write(self._process, (name, allowance.most_s, content))
                 while kind not in ENDINGS:
                     kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
                     if kind == PROGRESS:
@@ -176,21 +200,30 @@ class Engine:
         """Kill the process when the time is over, and count the time."""
         self._question += 1
         self._is_late = False
-        timer = threading.Timer(max(0.0, allowance.left_s), self._stop, (self._question,))
-        timer.daemon = True
-        timer.start()
+        allowance.begin()
         began = time.monotonic()
+        self._watch(self._question, allowance, began)
         try:
             yield
         finally:
             with self._ending:
                 self._question += 1
-            timer.cancel()
+                self._timer.cancel()
             allowance.left_s -= time.monotonic() - began
 
-    def _stop(self, question: int) -> None:
+    def _watch(self, question: int, allowance: Allowance, began: float) -> None:
+        left_s = allowance.left_s - (time.monotonic() - began)
+        self._timer = threading.Timer(max(0.0, left_s), self._stop, (question, allowance, began))
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _stop(self, question: int, allowance: Allowance, began: float) -> None:
         with self._ending:
-            if question == self._question:
+            if question != self._question:
+                return
+            if allowance.is_prolonged():
+                self._watch(question, allowance, began)
+            else:
                 self._is_late = True
                 self._process.kill()
 

@@ -60,7 +60,7 @@ REFUSED_FUNCTIONS = {
     "json_serialize_plan": "EXPLAIN shows how a query is answered",
     "stats": "EXPLAIN shows how a query is answered",
 }
-"""Functions that take time for nothing, change the session or tell of it, and why each is refused."""
+"""Functions that only take time, or change or show the session, and why each is refused."""
 
 REFUSED_TABLES = {"pg_settings", "pragma_database_list", "duckdb_databases", "duckdb_logs"}
 """Tables of DuckDB that tell of the machine and not of the targets."""

@@ -1,28 +1,22 @@
-"""A bounded number of processes at the same time, and of threads that use them."""
+"""Processes that are kept for the next request, and query sessions in them."""
 
 from __future__ import annotations
 
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
-import anyio
-from anyio import CapacityLimiter, to_thread
-
-from starcat.errors import QueryError
+from starcat.errors import QueryError, QueryLimitError
+from starcat.query.engine import Allowance
 from starcat.query.session import Limits, Session, open_session
-from starcat.service.problems import Problem
+from starcat.service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat.service.settings import Settings
 
-WAIT_S = 10.0
-"""Seconds that a request waits while others are answered."""
-
-IDLE = 4
+IDLE = 6
 """Query sessions that are kept while nobody asks; those used longest ago are closed first."""
 
 DISK_GB = 4.0
@@ -56,47 +50,28 @@ class Pool(Generic[K, ProcessT]):
     def __init__(
         self,
         begin: Callable[[K], AbstractContextManager[ProcessT]],
-        most: int,
         most_idle: int,
         harmless: tuple[type[Exception], ...] = (),
     ) -> None:
         self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
-        self._threads = CapacityLimiter(most)
-        self._slots = threading.BoundedSemaphore(most)
         self._idle: list[tuple[K, ProcessT, ExitStack]] = []
         self._lock = threading.Lock()
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
 
-    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread when one is free; who waits for it holds no thread."""
-        borrower = object()
-        with anyio.move_on_after(WAIT_S) as waiting:
-            await self._threads.acquire_on_behalf_of(borrower)
-        if waiting.cancelled_caught:
-            raise _busy()
-        try:
-            # A thread is free already: the limiter of this call keeps nobody waiting.
-            return await to_thread.run_sync(
-                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
-            )
-        finally:
-            self._threads.release_on_behalf_of(borrower)
-
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
         """Give a process that nobody else uses meanwhile."""
-        with self._slot():
-            process, closing = self._idle_one(key) or self._begun(key)
-            is_reusable = False
-            try:
-                yield process
-                is_reusable = True
-            except self._harmless:
-                is_reusable = True
-                raise
-            finally:
-                self._give_back((key, process, closing), is_reusable and process.is_running)
+        process, closing = self._idle_one(key) or self._begun(key)
+        is_reusable = False
+        try:
+            yield process
+            is_reusable = True
+        except self._harmless:
+            is_reusable = True
+            raise
+        finally:
+            self._give_back((key, process, closing), is_reusable and process.is_running)
 
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
@@ -110,16 +85,6 @@ class Pool(Generic[K, ProcessT]):
         with self._lock:
             self._is_closed = True
         self.forget(lambda _: True)
-
-    @contextmanager
-    def _slot(self) -> Iterator[None]:
-        """Hold one of the slots, which whoever streams an answer does for longer than `run`."""
-        if not self._slots.acquire(timeout=WAIT_S):
-            raise _busy()
-        try:
-            yield
-        finally:
-            self._slots.release()
 
     def _begun(self, key: K) -> tuple[ProcessT, ExitStack]:
         with ExitStack() as closing:
@@ -158,24 +123,41 @@ class QueryPool:
     """Query sessions, which are kept for the next query about the same targets.
 
     Each is a process of its own with the guard of `starcat.query`; `run` calls what uses `session`
-    in a thread.
+    in a thread, when there is a place for it.
     """
 
     def __init__(self, settings: Settings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
-        self._open: Pool[Key, Session] = Pool(self._begin, settings.queries, IDLE, (QueryError,))
-        self.run = self._open.run
+        self._lanes = Lanes(SHORT_PLACES, settings.queries)
+        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
         self.close = self._open.close
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that only reads: where it takes long, it may be called again."""
+        return await self._lanes.run(self._limits.time_s, function, *args, **kwargs)
 
     @contextmanager
     def session(
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
-        """Give a session about some targets, which nobody else uses meanwhile."""
+        """Give a session about some targets, which nobody else uses meanwhile.
+
+        All that it is asked has one time together.
+        """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
-        with self._open.lend(tuple(map(_identity, targets))) as one:
-            yield replace(one, limits=limits)
+        place = lease.get()
+        with (
+            nullcontext() if place is None else place.used(),
+            self._open.lend(tuple(map(_identity, targets))) as one,
+        ):
+            time_of = Allowance if place is None else place.allowance
+            try:
+                yield replace(one, limits=limits, allowance=time_of(limits.time_s))
+            except QueryLimitError as error:
+                if place is not None and place.is_overdue:
+                    raise Overdue from error
+                raise
 
     def forget(self, target: str | Path) -> None:
         """Close the sessions about a target that is to be removed and that nobody uses."""
@@ -193,11 +175,3 @@ def _identity(target: str | Path) -> tuple[str, int, int]:
     except OSError:
         return str(target), 0, 0
     return str(target), found.st_ino, found.st_mtime_ns
-
-
-def _busy() -> Problem:
-    return Problem(
-        503,
-        f"the service was busy for {WAIT_S:g} s: too many requests at once; ask again later",
-        headers={"Retry-After": f"{WAIT_S:.0f}"},
-    )
