@@ -59,8 +59,8 @@ class Session:
 
     @property
     def is_running(self) -> bool:
-        """Whether its process is there; after a limit, or a failure of DuckDB, it is not."""
-        return self._engine.is_running
+        """Whether its process is there and not patient; after a limit or a failure it is gone."""
+        return self._engine.is_running and not self._engine.is_patient
 
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""

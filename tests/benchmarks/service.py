@@ -2,10 +2,10 @@
 
 It starts a server on a free port with a folder of its own, has a database built there, and then
 lets every client send one request after the other, with a pause between them as a page or a script
-has one. ``--builds`` queues so many builds meanwhile. ``--greedy`` clients beside them, each at an
-address of its own (or all at one, with ``--one-address``), send queries that have no end, several
-at a time and without a pause. Latency is measured from the first byte that is sent to the last that
-has arrived, with a new connection only where the server closed the last.
+has one. Each has an address of its own, which is a user to the service, or all have one
+(``--one-address``). ``--builds`` queues so many builds meanwhile. ``--greedy`` clients send queries
+that have no end, several at a time and without a pause. Latency is measured from the first byte
+that is sent to the last that has arrived, with a new connection only where the server closed the last.
 
     python tests/benchmarks/service.py --seconds 60 --clients 50 --builds 4
     python tests/benchmarks/service.py --seconds 60 --clients 48 --greedy 2
@@ -151,8 +151,10 @@ class Load:
         Paths and digests of its files.
     pause_s : float
         Mean pause between two requests of a client.
-    ends_at : float
-        When, by the clock of `time.monotonic`.
+    begins_at, ends_at : float
+        From when on times are noted, and until when; by the clock of `time.monotonic`.
+    is_one_address : bool
+        Whether all clients have the same address.
     """
 
     served: Served
@@ -160,12 +162,14 @@ class Load:
     job: str
     files: list[tuple[str, str]]
     pause_s: float
+    begins_at: float
     ends_at: float
+    is_one_address: bool = False
 
     async def client(self, number: int, found: Found) -> None:
         """Be one client."""
         draw = random.Random(number)
-        connection = Connection(self.served.address)
+        connection = Connection(self.served.address, self.address(number))
         kinds = list(MAX_MS)
         await asyncio.sleep(draw.uniform(0.0, self.pause_s))
         while time.monotonic() < self.ends_at:
@@ -176,15 +180,22 @@ class Load:
             except (OSError, EOFError, ValueError) as error:
                 told = f"{type(error).__name__}: {error}"
                 connection.close()
-            found.took_ms[kind].append(1e3 * (time.perf_counter() - began))
+            if time.monotonic() > self.begins_at:
+                found.took_ms[kind].append(1e3 * (time.perf_counter() - began))
             if told:
                 found.errors.append(f"{kind}: {told}")
             await asyncio.sleep(draw.uniform(0.0, 2.0 * self.pause_s))
         connection.close()
 
-    async def greedy(self, own: str, found: Found) -> None:
-        """Be a client that asks for all it can get."""
-        await asyncio.gather(*(self._greed(number, own, found) for number in range(AT_ONCE)))
+    def address(self, number: int) -> str:
+        """Return the address of a client."""
+        return "127.0.0.1" if self.is_one_address else f"127.0.1.{number + 1}"
+
+    async def greedy(self, number: int, found: Found) -> None:
+        """Be a client that asks for all it can get, once times are noted."""
+        await asyncio.sleep(self.begins_at - time.monotonic())
+        own = self.address(number)
+        await asyncio.gather(*(self._greed(one, own, found) for one in range(AT_ONCE)))
 
     async def _greed(self, number: int, own: str, found: Found) -> None:
         connection = Connection(self.served.address, own)
@@ -230,7 +241,7 @@ class Load:
 
 
 async def run(
-    load: Load, clients: int, greedy: list[str], meanwhile: Callable[[], Awaitable[None]]
+    load: Load, clients: int, greedy: int, meanwhile: Callable[[], Awaitable[None]]
 ) -> Found:
     """Let the clients do what they do.
 
@@ -240,8 +251,8 @@ async def run(
         What they do.
     clients : int
         How many.
-    greedy : list of str
-        Addresses of the greedy ones.
+    greedy : int
+        How many more that are greedy.
     meanwhile : coroutine function
         What happens beside them.
 
@@ -253,7 +264,7 @@ async def run(
     found = Found()
     await asyncio.gather(
         *(load.client(number, found) for number in range(clients)),
-        *(load.greedy(own, found) for own in greedy),
+        *(load.greedy(clients + number, found) for number in range(greedy)),
         meanwhile(),
     )
     return found
@@ -301,6 +312,7 @@ def main(rows: Rows) -> None:
     need("fastapi", "uvicorn", "jinja2")
     options = Options(__doc__)
     options.size("--seconds", 60.0, 3.0, "of load")
+    options.size("--warm-s", 5.0, 0.0, "of load before, until processes are there")
     options.size("--clients", 50, 5, "at the same time")
     options.size("--pause-s", 0.5, 0.1, "between two requests, mean")
     options.size("--builds", 0, 1, "builds that are queued meanwhile")
@@ -331,14 +343,13 @@ def main(rows: Rows) -> None:
                 queued.append(await asyncio.to_thread(client.submit, spec))
 
         before = memory_mib(served.process.pid)
-        ends_at = time.monotonic() + given.seconds
-        load = Load(served, database, job["id"], files, given.pause_s, ends_at)
-        greedy = [
-            "127.0.0.1" if given.one_address else f"127.0.0.{number + 2}"
-            for number in range(given.greedy)
-        ]
-        found = asyncio.run(run(load, given.clients, greedy, meanwhile))
-        report(rows, found, given.seconds, is_quick=given.quick, has_greedy=bool(greedy))
+        begins_at = time.monotonic() + given.warm_s
+        ends_at = begins_at + given.seconds
+        load = Load(
+            served, database, job["id"], files, given.pause_s, begins_at, ends_at, given.one_address
+        )
+        found = asyncio.run(run(load, given.clients, given.greedy, meanwhile))
+        report(rows, found, given.seconds, is_quick=given.quick, has_greedy=given.greedy > 0)
         for one in queued:
             state = client.wait(one)["state"]
             print(f"build {one}: {state}")

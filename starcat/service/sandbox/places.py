@@ -1,9 +1,10 @@
 """Places for what runs at the same time, shared by who asks.
 
-A user holds no more than half of the places, so nobody can take them all; a place that becomes free
-is for the user who holds fewest, and of those for the one who was served longest ago. A request
-begins in a short lane. What is not at its end in `SHORT_S` moves to the long lane, where it goes on
-if a place is free there; else it is ended, and begun again as soon as one is.
+A user gets another place only where more are free than he holds, and no more than half of all, so
+nobody can take them all; a place that becomes free is for the user who holds fewest, and of
+those for the one who was served longest ago. A request begins in a short lane. What is not at its
+end in `SHORT_S` moves to the long lane, where it goes on if a place is free there; else it is
+ended, and begun again as soon as one is. Who is in the long lane has one place of the short lane.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from anyio import CapacityLimiter, to_thread
 from starcat.query.engine import Allowance
 from starcat.service.problems import Problem
 
-SHORT_PLACES = 4
+SHORT_PLACES = 8
 """Places of queries that are short, beside those that `Settings.queries` gives to long ones."""
 
-SHORT_S = 0.5
-"""Seconds that a query may take in a place of the short lane."""
+SHORT_S = 0.25
+"""Seconds of a processor that a query may take in a place of the short lane."""
 
 WAIT_S = 30.0
 """Seconds that a request waits while others are answered."""
@@ -50,9 +51,10 @@ class Overdue(Exception):  # noqa: N818 - the name reads as the fact
 class Places:
     """Some places, and those who wait for one."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, has_others: Callable[[str], bool] = bool) -> None:
         self._free = count
         self._share = max(1, count // 2)
+        self._has_others = has_others  # of a user, elsewhere: one place here is enough then
         self._held: Counter[str] = Counter()
         self._served: dict[str, int] = {}  # when each user was last given a place, as a number
         self._waiting: list[tuple[str, Future[None]]] = []
@@ -62,6 +64,10 @@ class Places:
         """Return how often somebody waits."""
         with self._lock:
             return sum(one == who for one, _ in self._waiting)
+
+    def is_used_by(self, who: str) -> bool:
+        """Return whether somebody holds a place, or waits for one."""
+        return self._held[who] > 0 or self.waiting(who) > 0
 
     def try_take(self, who: str) -> bool:
         """Take a place if nobody has to be waited for."""
@@ -117,7 +123,7 @@ class Places:
 
     def _give(self) -> None:
         while self._free:
-            able = [one for one in self._waiting if self._held[one[0]] < self._share]
+            able = [one for one in self._waiting if self._may_have_another(one[0])]
             if not able:
                 break
             chosen = min(able, key=lambda one: (self._held[one[0]], self._served.get(one[0], 0)))
@@ -129,6 +135,11 @@ class Places:
             place.set_result(None)
         known = {one for one, _ in self._waiting} | set(+self._held)
         self._served = {one: when for one, when in self._served.items() if one in known}
+
+    def _may_have_another(self, who: str) -> bool:
+        held = self._held[who]
+        most = 1 if held and self._has_others(who) else self._share
+        return held < min(most, self._free)
 
 
 class Lease:
@@ -159,7 +170,7 @@ class Lease:
     def allowance(self, total_s: float) -> Allowance:
         """Return the time of a query in this place."""
         if self.is_long or total_s <= SHORT_S:
-            return Allowance(total_s)
+            return Allowance(total_s, is_patient=self.is_long)
         return Allowance(total_s, SHORT_S, self.prolong)
 
     @contextmanager
@@ -188,7 +199,8 @@ class Lanes:
     """The short lane and the long lane."""
 
     def __init__(self, short: int, long: int) -> None:
-        self.short, self.long = Places(short), Places(long)
+        self.long = Places(long)
+        self.short = Places(short, self.long.is_used_by)
 
     async def run(
         self, patience_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +17,12 @@ from starcat.query.session import Limits, Session, open_session
 from starcat.service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat.service.settings import Settings
 
-IDLE = 6
+IDLE = 8
 """Query sessions that are kept while nobody asks; those used longest ago are closed first."""
+
+BEGINNING = 2
+"""Processes with the same key that are started at the same time: one that others give back is
+there sooner than the third would be."""
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query may take for what does not fit into its memory."""
@@ -40,6 +45,10 @@ class Process(Protocol):
 ProcessT = TypeVar("ProcessT", bound=Process)
 
 
+Lent = tuple[K, ProcessT, ExitStack]
+"""A process with its key, and what closes it."""
+
+
 class Pool(Generic[K, ProcessT]):
     """Processes that are kept for the next request with the same key.
 
@@ -54,7 +63,10 @@ class Pool(Generic[K, ProcessT]):
         harmless: tuple[type[Exception], ...] = (),
     ) -> None:
         self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
-        self._idle: list[tuple[K, ProcessT, ExitStack]] = []
+        self._idle: list[Lent[K, ProcessT]] = []
+        self._lent: list[Lent[K, ProcessT]] = []
+        self._wanted: list[tuple[K, Future[Lent[K, ProcessT]]]] = []
+        self._beginning: list[K] = []  # keys of the processes that are being started
         self._lock = threading.Lock()
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
@@ -62,16 +74,18 @@ class Pool(Generic[K, ProcessT]):
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
         """Give a process that nobody else uses meanwhile."""
-        process, closing = self._idle_one(key) or self._begun(key)
+        lent = self._obtained(key)
         is_reusable = False
         try:
-            yield process
+            yield lent[1]
             is_reusable = True
         except self._harmless:
             is_reusable = True
             raise
         finally:
-            self._give_back((key, process, closing), is_reusable and process.is_running)
+            with self._lock:
+                self._lent.remove(lent)
+            self._give_back(lent, is_reusable and lent[1].is_running)
 
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
@@ -81,37 +95,80 @@ class Pool(Generic[K, ProcessT]):
         _close(gone)
 
     def close(self) -> None:
-        """Close all processes; one that is in use is closed as soon as it is given back."""
+        """Close all processes; whoever uses one finds that it has ended."""
         with self._lock:
             self._is_closed = True
+            lent = list(self._lent)
         self.forget(lambda _: True)
+        _close(lent)
 
-    def _begun(self, key: K) -> tuple[ProcessT, ExitStack]:
-        with ExitStack() as closing:
-            return closing.enter_context(self._begin(key)), closing.pop_all()
-
-    def _idle_one(self, key: K) -> tuple[ProcessT, ExitStack] | None:
+    def _obtained(self, key: K) -> Lent[K, ProcessT]:
+        """Return the process that is free first: one that others give back, or a new one."""
         with self._lock:
-            found = next((one for one in reversed(self._idle) if one[0] == key), None)
-            if found is None:
-                return None
-            self._idle.remove(found)
-        if found[1].is_running:
-            return found[1:]
-        _close([found])
-        return self._idle_one(key)
+            found = self._idle_one(key)
+            if found is not None:
+                self._lent.append(found)
+                return found
+            waiting: Future[Lent[K, ProcessT]] = Future()
+            self._wanted.append((key, waiting))
+            self._begin_wanted(key)
+        return waiting.result()
 
-    def _give_back(self, lent: tuple[K, ProcessT, ExitStack], is_reusable: bool) -> None:
+    def _begin_wanted(self, key: K) -> None:
+        wanted = sum(one == key for one, _ in self._wanted)
+        if self._beginning.count(key) < min(wanted, BEGINNING):
+            self._beginning.append(key)
+            threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+
+    def _begin_one(self, key: K) -> None:
+        made: Lent[K, ProcessT] | BaseException
+        try:
+            with ExitStack() as closing:
+                made = key, closing.enter_context(self._begin(key)), closing.pop_all()
+        except BaseException as error:
+            made = error
+        with self._lock:
+            self._beginning.remove(key)
+            if isinstance(made, BaseException):
+                waiting = self._next_wanted(key)
+                if waiting is not None:
+                    waiting.set_exception(made)
+        if not isinstance(made, BaseException):
+            self._give_back(made, True)
+        with self._lock:
+            self._begin_wanted(key)
+
+    def _next_wanted(self, key: K) -> Future[Lent[K, ProcessT]] | None:
+        for number, (one, waiting) in enumerate(self._wanted):
+            if one == key:
+                del self._wanted[number]
+                return waiting
+        return None
+
+    def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
+        for number in range(len(self._idle) - 1, -1, -1):
+            if self._idle[number][0] == key:
+                found = self._idle.pop(number)
+                if found[1].is_running:
+                    return found
+                _close([found])
+        return None
+
+    def _give_back(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
         gone = [] if is_reusable else [lent]
         with self._lock:
-            if is_reusable:
+            waiting = self._next_wanted(lent[0]) if is_reusable else None
+            if waiting is not None:
+                self._lent.append(lent)
+                waiting.set_result(lent)
+            elif is_reusable:
                 self._idle.append(lent)
             while len(self._idle) > (0 if self._is_closed else self._most_idle):
                 gone.append(self._idle.pop(0))
         _close(gone)
 
 
-def _close(idle: list[tuple[K, ProcessT, ExitStack]]) -> None:
+def _close(idle: list[Lent[K, ProcessT]]) -> None:
     while idle:
         idle.pop()[-1].close()
 
