@@ -44,13 +44,21 @@ def pool(tmp_path: Path) -> Iterator[QueryPool]:
 # Places.
 
 
-def test_a_user_holds_no_more_than_half_of_the_places():
+def test_a_user_has_another_place_only_where_more_are_free_and_half_at_most():
     shared = Places(4)
     assert [shared.try_take("greedy") for _ in range(3)] == [True, True, False]
-    assert [shared.try_take("anna") for _ in range(3)] == [True, True, False]
-    assert not shared.try_take("bob")
-    shared.release("greedy")
+    assert [shared.try_take("anna") for _ in range(2)] == [True, False]
     assert shared.try_take("bob")
+    shared.release("greedy")
+    assert not shared.try_take("greedy")
+    assert shared.try_take("carl")
+
+
+def test_who_asks_what_takes_long_has_one_place_for_what_is_short():
+    lanes = Lanes(8, 2)
+    assert lanes.long.try_take("greedy")
+    assert [lanes.short.try_take("greedy") for _ in range(2)] == [True, False]
+    assert [lanes.short.try_take("anna") for _ in range(2)] == [True, True]
 
 
 def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_longest():

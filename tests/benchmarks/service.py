@@ -5,7 +5,8 @@ lets every client send one request after the other, with a pause between them as
 has one. Each has an address of its own, which is a user to the service, or all have one
 (``--one-address``). ``--builds`` queues so many builds meanwhile. ``--greedy`` clients send queries
 that have no end, several at a time and without a pause. Latency is measured from the first byte
-that is sent to the last that has arrived, with a new connection only where the server closed the last.
+that is sent to the last that has arrived, with a new connection only where the server closed the
+last.
 
     python tests/benchmarks/service.py --seconds 60 --clients 50 --builds 4
     python tests/benchmarks/service.py --seconds 60 --clients 48 --greedy 2
@@ -298,7 +299,7 @@ def report(
         half, most, worst = np.percentile(took, [50, 99, 100]) if took else (0.0, 0.0, 0.0)
         is_fast = is_quick or most <= (500.0 if has_greedy else MAX_MS[kind])
         rows.expect(is_fast, f"{kind}: 99 % took {most:.0f} ms, which is too long")
-        rows.expect(len(took) > 0, f"{kind}: no request was sent")
+        rows.expect(is_quick or len(took) > 0, f"{kind}: no request was sent")
         rate = len(took) / seconds
         print(f"{kind:10} {len(took):9} {rate:9.1f} {half:8.1f} {most:8.1f} {worst:8.1f}")
     print(f"errors: {len(found.errors)}; load of the machine: {os.getloadavg()[0]:.1f}")
@@ -312,7 +313,7 @@ def main(rows: Rows) -> None:
     need("fastapi", "uvicorn", "jinja2")
     options = Options(__doc__)
     options.size("--seconds", 60.0, 3.0, "of load")
-    options.size("--warm-s", 5.0, 0.0, "of load before, until processes are there")
+    options.size("--warm-s", 5.0, 2.0, "of load before, until processes are there")
     options.size("--clients", 50, 5, "at the same time")
     options.size("--pause-s", 0.5, 0.1, "between two requests, mean")
     options.size("--builds", 0, 1, "builds that are queued meanwhile")

@@ -51,10 +51,10 @@ class Overdue(Exception):  # noqa: N818 - the name reads as the fact
 class Places:
     """Some places, and those who wait for one."""
 
-    def __init__(self, count: int, has_others: Callable[[str], bool] = bool) -> None:
+    def __init__(self, count: int, elsewhere: Places | None = None) -> None:
         self._free = count
         self._share = max(1, count // 2)
-        self._has_others = has_others  # of a user, elsewhere: one place here is enough then
+        self._elsewhere = elsewhere  # who has a place there is content with one here
         self._held: Counter[str] = Counter()
         self._served: dict[str, int] = {}  # when each user was last given a place, as a number
         self._waiting: list[tuple[str, Future[None]]] = []
@@ -138,8 +138,8 @@ class Places:
 
     def _may_have_another(self, who: str) -> bool:
         held = self._held[who]
-        most = 1 if held and self._has_others(who) else self._share
-        return held < min(most, self._free)
+        is_content = held > 0 and self._elsewhere is not None and self._elsewhere.is_used_by(who)
+        return held < min(1 if is_content else self._share, self._free)
 
 
 class Lease:
@@ -200,7 +200,7 @@ class Lanes:
 
     def __init__(self, short: int, long: int) -> None:
         self.long = Places(long)
-        self.short = Places(short, self.long.is_used_by)
+        self.short = Places(short, self.long)
 
     async def run(
         self, patience_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
