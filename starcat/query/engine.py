@@ -88,9 +88,9 @@ _waiting: list[subprocess.Popen[bytes]] = []
 """A process that was started before it is known what for."""
 
 
-def warm_up() -> None:
-    """Start the process of the next `Engine` now, while other modules are still imported."""
-    if not _waiting:
+def warm_up(count: int = 1) -> None:
+    """Start the processes of the next `Engine`s now, while other work is done."""
+    while len(_waiting) < count:
         _waiting.append(_spawned())
 
 
@@ -180,7 +180,10 @@ class Engine:
     def _started(self) -> subprocess.Popen[bytes]:
         shutil.rmtree(self._opening.spill, ignore_errors=True)
         self._opening.spill.mkdir()
-        process = _waiting.pop() if _waiting else _spawned()
+        try:
+            process = _waiting.pop(0)
+        except IndexError:
+            process = _spawned()
         self.is_patient = False
         with suppress(OSError):
             _write(process, self._opening)

@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
 from starcat.errors import QueryError, QueryLimitError
-from starcat.query.engine import Allowance
+from starcat.query.engine import Allowance, warm_up
 from starcat.query.session import Limits, Session, open_session
 from starcat.service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat.service.settings import Settings
 
 IDLE = 8
 """Query sessions that are kept while nobody asks; those used longest ago are closed first."""
+
+SPARE = 2
+"""Processes that are started before it is known what they are to open, which takes less time."""
 
 BEGINNING = 2
 """Processes with the same key that are started at the same time: one that others give back is
@@ -221,8 +224,11 @@ class QueryPool:
         name = str(target)
         self._open.forget(lambda key: name in [text for text, *_ in key])
 
-    def _begin(self, key: Key) -> AbstractContextManager[Session]:
-        return open_session([text for text, *_ in key], self._limits)
+    @contextmanager
+    def _begin(self, key: Key) -> Iterator[Session]:
+        with open_session([text for text, *_ in key], self._limits) as session:
+            warm_up(SPARE)
+            yield session
 
 
 def _identity(target: str | Path) -> tuple[str, int, int]:
