@@ -18,6 +18,7 @@ from starcat.service.service import TheService
 from starcat.service.settings import Settings
 
 router = page_router()
+MAX_ADDRESS = 16_000  # characters of an address: a design of a database is in one
 SHOWN = 8  # databases, jobs and releases that are shown of each
 
 
@@ -81,7 +82,7 @@ def sign_in(
     request: Request,
     service: TheService,
     token: Annotated[str, Form(max_length=200)],
-    next_address: Annotated[str, Form(alias="next", max_length=2000)] = "/",
+    next_address: Annotated[str, Form(alias="next", max_length=MAX_ADDRESS)] = "/",
 ) -> Response:
     """Begin a session, if the token is valid."""
     identities: Identities = request.app.state.identities

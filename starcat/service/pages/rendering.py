@@ -143,9 +143,20 @@ ENVIRONMENT = _environment()
 def render(request: Request, template: str, *, status: int = 200, **content: Any) -> HTMLResponse:
     """Return a page."""
     page = ENVIRONMENT.get_template(template).render(
-        principal=principal_of(request), path=request.url.path, **content
+        principal=principal_of(request),
+        path=request.url.path,
+        sign_in=sign_in_address(request),
+        **content,
     )
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def sign_in_address(request: Request) -> str:
+    """Return the address to sign in at, which leads back to the page that was asked for."""
+    if request.method != "GET" or request.url.path in ("/", "/sign-in"):
+        return "/sign-in"
+    asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    return f"/sign-in?next={quote(asked)}"
 
 
 class _PageRoute(RenderingRoute):
@@ -157,8 +168,7 @@ class _PageRoute(RenderingRoute):
             return as_json(error)
         problem = problem_of(error)
         if problem.status == 401 and request.method == "GET":
-            asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
-            return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)
+            return RedirectResponse(sign_in_address(request), 303)
         return _error_page(request, error)
 
 

@@ -2,6 +2,7 @@
 
 import { announce } from "./starcat.js";
 import { startMap } from "./sky.js";
+import { follow, startSliders } from "./sliders.js";
 
 const form = document.getElementById("design");
 const result = document.getElementById("result");
@@ -17,48 +18,7 @@ const BUSY_AFTER_MS = 2500;
 let waiting = 0;
 let asked = null;
 let tiling = { count: 0, fields: null };
-
-// Sliders
-
-function places(step) {
-  return (String(step).split(".")[1] ?? "").length;
-}
-
-function valueOf(range) {
-  const position = Number(range.value);
-  if (range.dataset.noneAt === "low" && position <= Number(range.min)) return "";
-  if (range.dataset.noneAt === "high" && position >= Number(range.max)) return "";
-  if (range.dataset.scale !== "log") return String(position);
-  const { low, high, step } = range.own;
-  const value = low * (high / low) ** (position / 1000);
-  const rounded = step < 1 ? value : Number(value.toPrecision(3));
-  return String(Number(rounded.toFixed(places(step))));
-}
-
-function follow(range) {
-  const number = document.getElementById(range.dataset.of);
-  if (range === document.activeElement && range.matches(":active")) return;
-  const value = Number(number.value);
-  if (number.value === "") range.value = range.dataset.noneAt === "low" ? range.min : range.max;
-  else if (range.dataset.scale !== "log") range.value = String(value);
-  else range.value = String((1000 * Math.log(value / range.own.low)) / Math.log(range.own.high / range.own.low));
-  const unit = document.querySelector(`label[for="${number.id}"] .unit`)?.textContent ?? "";
-  range.setAttribute("aria-valuetext", number.value === "" ? number.placeholder : `${number.value} ${unit}`);
-}
-
-const ranges = [...form.querySelectorAll("input[type=range]")];
-for (const range of ranges) {
-  const own = { low: Number(range.min), high: Number(range.max), step: Number(range.step) };
-  range.own = own;
-  if (range.dataset.scale === "log") [range.min, range.max, range.step] = ["0", "1000", "1"];
-  range.hidden = false;
-  range.closest(".slider").classList.add("live");
-  range.addEventListener("input", () => {
-    document.getElementById(range.dataset.of).value = valueOf(range);
-    follow(range);
-  });
-  follow(range);
-}
+const ranges = startSliders(form);
 
 // What the server says
 
@@ -151,8 +111,6 @@ async function ask() {
 form.addEventListener("input", (event) => {
   form.dataset.state = "changed";
   clearTimeout(waiting);
-  const range = ranges.find((one) => one.dataset.of === event.target.id);
-  if (range) follow(range);
   waiting = setTimeout(ask, event.target === text ? TEXT_AFTER_MS : FIELDS_AFTER_MS);
 });
 text.addEventListener("blur", () => { if (text.value !== before.value && text.value.trim() === before.value.trim()) text.value = before.value; });
