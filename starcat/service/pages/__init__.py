@@ -7,6 +7,7 @@ from fastapi import APIRouter
 from starcat.service.pages import (
     console,
     databases,
+    downloads,
     home,
     identify,
     jobs,
@@ -26,5 +27,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     identify.router,
     releases.router,
     sky.router,
+    downloads.router,
 )
 """Routers of the page, in the order in which they are asked."""
