@@ -28,6 +28,11 @@ SETTINGS = {"anonymous": "publisher"}
 PAGE = f"/databases/{DATABASE}"
 
 
+@pytest.fixture(scope="module")
+def small_artifact(picky_artifact: Path) -> Path:
+    return picky_artifact
+
+
 def stars_of(client, **where) -> list[dict]:
     answer = client.get(f"{PAGE}/sky.json", params=where)
     assert answer.status_code == 200, answer.text
@@ -52,6 +57,7 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
         if row["reason"] != "too_faint" and row["mag"] is not None
     }
     assert {one["label"]: one["reason"].replace(" ", "_") for one in rejected} == known
+    assert set(known.values()) == {"too_bright"}
     assert not [one for one in stars if one["kind"] == "faint"]
 
 

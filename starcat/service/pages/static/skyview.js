@@ -159,7 +159,7 @@ class Sky {
       this.stars = found.stars.map((one) => ({ ...one, u: direction(one.ra_deg, one.dec_deg) }));
       this.root.dataset.state = "stars";
       this.root.dataset.count = this.stars.length;
-      this.paint();
+      this.draw(); // at once: a star is found where it was drawn
     } catch (error) {
       if (error.name !== "AbortError") this.tell(`The stars cannot be loaded: ${error.message}`);
     }
