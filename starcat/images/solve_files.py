@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -94,6 +94,9 @@ class IdentifyOptions(BaseModel):
     max_steps: int | None = Field(None, ge=1, description="Steps of a search.")
     time_limit_s: float | None = Field(None, ge=0.001, description="Seconds that a frame may take.")
     flip: bool | None = Field(None, description="First row at the bottom; y upwards.")
+    time: str | None = Field(
+        None, max_length=40, description="Time of the frames, UTC: aberration and planets."
+    )
     psf_sigma_px: float | None = Field(
         None, ge=0.3, le=20, description="Width of a star in an image; by default measured."
     )
@@ -371,6 +374,16 @@ class FileAnswers:
         if self.measured.image is not None:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
 
+    def for_page(self, answer: FrameAnswer) -> Content:
+        """Return what a page keeps of a frame beside its answer, to link to it and to save it."""
+        from starcat.images.image_file import wcs_header
+
+        mag, wcs, flip = answer.frame.mag, None, self.options.flip
+        if answer.result.ok:
+            wcs = wcs_header(answer.result, self.path, flip=flip).decode("ascii")
+        brightness = None if mag is None else [_or_none(value) for value in mag.tolist()]
+        return {"mag": brightness, "wcs": wcs, "is_image": self.is_image}
+
 
 def _is_limited(result: MatchResult) -> bool:
     """Return whether a limit of the search ended it."""
@@ -412,6 +425,10 @@ def answers_of(
         camera = parse_camera(options.camera, Path(CAMERA_NAME))
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
+    if options.time is not None and local.observer is None:
+        from starcat.sky.observer import Observer
+
+        local = replace(local, observer=Observer.at(options.time))
     return FileAnswers(path, matcher, measured, camera, options, local, tracker)
 
 

@@ -124,8 +124,7 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     clean = built.rates[0]
     log(
         "info",
-        f"{clean.identified} of {clean.identifiable} clean frames were identified, "
-        f"{clean.wrong} wrongly",
+        f"{clean.identified} of {clean.frames} clean frames were identified, {clean.wrong} wrongly",
     )
     place_database(made, order.paths.database(database_id))
     return result

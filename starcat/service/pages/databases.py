@@ -14,13 +14,21 @@ from starcat.artifact.diff import Difference
 from starcat.errors import TargetMissing
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
-from starcat.report.coverage_map import Fields, field_at, nearest_raster, raster_png, sky_map
+from starcat.report.coverage_map import (
+    Fields,
+    bins_of,
+    field_at,
+    nearest_raster,
+    raster_png,
+    sky_map,
+)
 from starcat.service.access import Builder, Reader
 from starcat.service.api.databases import difference_of, fields_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
 from starcat.service.pages.facts import MANIFEST_DIGEST, database_rows, products_of, report_of
 from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.sky import CACHED, view_of
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
 
@@ -33,9 +41,6 @@ REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; s
 RASTER_WIDTH = 960
 FIELDS_SHOWN = 25  # fields of the tiling on a page
 DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
-
-CACHED = {"Cache-Control": "private, max-age=86400"}
-"""What never changes under its address: the id says what is in a database."""
 
 Order = Literal["fewest", "most", "number"]
 
@@ -93,6 +98,7 @@ def coverage_page(
         sky_map=sky_map(fields),
         fields=[field_at(fields, number) for number in numbers],
         fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
+        view=view_of(database, fields=f"/databases/{database.id}/fields.json"),
         order=order,
         page=page,
         pages=pages,
@@ -131,6 +137,7 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
         "ra_deg": fields.ra_deg.round(4).tolist(),
         "dec_deg": fields.dec_deg.round(4).tolist(),
         "stars": fields.stars.tolist(),
+        "bins": [{"least": one.least, "colour": one.colour} for one in bins_of(fields.stars)],
     }
     return JSONResponse(content, headers=CACHED)
 

@@ -28,9 +28,18 @@ MATCHERS = 4
 
 
 def identify(
-    folder: str, file: str, artifact: str, options: dict[str, Any], picture: str | None = None
+    folder: str,
+    file: str,
+    artifact: str,
+    options: dict[str, Any],
+    picture: str | None = None,
+    *,
+    for_page: bool = False,
 ) -> dict[str, Any]:
-    """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG."""
+    """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG.
+
+    A page is told more of each frame: the brightness of its centroids, and its WCS.
+    """
     from starcat.images.solve_files import MATCHER_OPTIONS, IdentifyOptions, identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
@@ -47,6 +56,7 @@ def identify(
         "method": answers.matcher.method,
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
+        "more": [answers.for_page(answer) for answer in found] if for_page else [],
     }
 
 
