@@ -171,9 +171,12 @@ def test_every_number_of_stars_has_one_colour(stars):
         assert (fitting[0].name == "m0") == (count < 4)
 
 
-def test_the_report_of_a_build_can_do_nothing(client, small_artifact):
+def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_artifact):
     answer = client.get(f"{PAGE}/report")
-    assert answer.content == (small_artifact / "report" / "index.html").read_bytes()
+    before, body, after = answer.text.partition("<body>")
+    way_back, line, report = after.partition("</p>")
+    assert f'href="{PAGE}"' in way_back
+    assert before + body + report == (small_artifact / "report" / "index.html").read_text("utf-8")
     policy = answer.headers["content-security-policy"]
     assert "sandbox" in policy
     assert "allow" not in policy
@@ -318,8 +321,8 @@ def test_an_evaluation_is_a_job(client):
     assert answer.status_code == 303
     page = client.get(answer.headers["location"])
     assert page.status_code == 200
-    assert "small-1.0.0 self-test" in text_of(page.text)
-    assert "small-1.0.0 self-test" in text_of(client.get("/").text)
+    assert "small-1.0.0 evaluated" in text_of(page.text)
+    assert "small-1.0.0 evaluated" in text_of(client.get("/").text)
 
 
 def test_the_start_says_how_programs_reach_the_service(client, empty):

@@ -161,7 +161,7 @@ def submit_evaluation(
         "seed": test.seed if seed is None else seed,
     }
     key = key_of("evaluate", request)
-    return submit(service, "evaluate", request, key, f"{database.title} self-test", owner)
+    return submit(service, "evaluate", request, key, f"{database.title} evaluated", owner)
 
 
 def submit(
@@ -214,7 +214,7 @@ def _check_waiting(service: Service, connection: sqlite3.Connection, owner: str)
 def _has_result(service: Service, job: Job) -> bool:
     result = job.result or {}
     if job.kind == "evaluate":
-        return "rates" in result
+        return "curves" in result
     if job.kind == "ingest":
         name = str(result.get("catalog", ""))
         return bool(name) and (service.paths.catalogs / Path(name).name).exists()
