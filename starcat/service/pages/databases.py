@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from html import escape
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -186,7 +187,16 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
         raise TargetMissing(f"{database.title} has no report; build it again to get one")
     headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
-    return Response(path.read_bytes(), media_type="text/html; charset=utf-8", headers=headers)
+    # It has no head of the service: a line above it leads back.
+    page = path.read_bytes().replace(b"<body>", b"<body>" + _way_back(database).encode(), 1)
+    return Response(page, media_type="text/html; charset=utf-8", headers=headers)
+
+
+def _way_back(database: Database) -> str:
+    return (
+        f'<p><a href="/databases/{database.id}">← {escape(database.name)} '
+        f'{escape(database.version)}</a> · <a href="/databases">Databases</a></p>'
+    )
 
 
 @router.get("/databases/{database_id}/compare")

@@ -35,7 +35,8 @@ from starcat.service.pages.answers import Shown, ShownFrame, marks_of, shown_fra
 from starcat.service.pages.notebook import Notebook, identify_code
 from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.pages.sky import view_of
-from starcat.service.problems import Problem, problem_of
+from starcat.service.pages.wording import page_problem
+from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import scratch_folder
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -83,7 +84,7 @@ async def _answered(
     try:
         answer = await service.sandbox.run(_answer, service, form, given)
     except (StarcatError, Problem) as error:
-        answer = {"problem": problem_of(error)}
+        answer = {"problem": page_problem(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
 
 
@@ -107,7 +108,7 @@ def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str
         except (StarcatError, Problem) as error:
             if len(uploads) == 1:
                 raise
-            frames.append(unusable_frame(upload.name, problem_of(error).detail))
+            frames.append(unusable_frame(upload.name, page_problem(error).detail))
             continue
         method, picture = found["method"], picture or drawn
         frames += shown_frames(found, given, epoch_jyear)
