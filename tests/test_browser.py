@@ -12,62 +12,20 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from browsing import BUILD_MS, NEEDS_BROWSER, SPEC, launched, look, opened, settled
 from served import serve
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-CHROMIUM = Path("/usr/bin/chromium")
-
-pytestmark = [
-    pytest.mark.skipif(
-        not CHROMIUM.exists(), reason=f"no browser: {CHROMIUM} is missing (Debian's chromium)"
-    ),
-    pytest.mark.timeout(150),
-]
-
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
+pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
 
 WIDTHS_PX = (360, 768, 1280)
 
 MOST_PAINT_MS = 1000.0
-
-SPEC = """\
-name = "browser"
-version = "1.0.0"
-epoch_jyear = 2016.0
-
-[catalog]
-source = "gaia"
-read_limit_mag = 7.0
-
-[selection]
-faint_limit_mag = 6.0
-
-[camera]
-width_px = 1024
-height_px = 1024
-fov_x_deg = 24.0
-
-[self_test]
-frames = 20
-"""
-"""What the path begins with: fainter stars are not needed, and take time."""
-
-BUILD_MS = 90_000.0
-"""A build of the path takes 5 s on a machine that does nothing else."""
 
 
 @pytest.fixture(scope="module")
@@ -80,26 +38,15 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+    with launched() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
 def page(browser: Browser, service: str) -> Iterator[Page]:
     """The one page that everything is done in; what its console complains of fails the test."""
-    context = browser.new_context(
-        base_url=service, viewport={"width": 1280, "height": 900}, reduced_motion="reduce"
-    )
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.complaints = []
-    page.on("pageerror", lambda error: page.complaints.append(str(error)))
-    page.on("console", lambda said: said.type == "error" and page.complaints.append(said.text))
-    yield page
-    context.close()
+    with opened(browser, service) as page:
+        yield page
 
 
 @pytest.fixture(autouse=True)
@@ -119,16 +66,11 @@ def shoot(page: Page) -> Callable[[str], None]:
     def take(name: str) -> None:
         for theme in ("light", "dark") if folder else ():
             for width in WIDTHS_PX:
-                _look(page, theme, width)
+                look(page, theme, width)
                 page.screenshot(path=f"{folder}/{name}-{width}-{theme}.png")
-        _look(page, "light", 1280)
+        look(page, "light", 1280)
 
     return take
-
-
-def _look(page: Page, theme: str, width: int) -> None:
-    page.emulate_media(color_scheme=theme)
-    page.set_viewport_size({"width": width, "height": 900 if width > 500 else 780})
 
 
 # The path
@@ -141,19 +83,19 @@ def designed(page: Page, shoot: Callable[[str], None]) -> str:
     assert page.title() == "New database · starcat"
     text = page.locator("#toml")
     text.fill(SPEC)
-    _settled(page)
+    settled(page)
     field = page.get_by_label("Field across the width deg", exact=True)
     assert field.input_value() == "24"
     before = page.locator("#summary").inner_text()
     field.fill("20")
     page.get_by_label("Boresights", exact=True).fill("400")
-    _settled(page)
+    settled(page)
     assert page.locator("#summary").inner_text() != before
     page.get_by_label("Faint limit, slider").focus()
     for _ in range(10):
         page.keyboard.press("ArrowLeft")
     page.get_by_label("grid").uncheck()
-    _settled(page)
+    settled(page)
     assert page.get_by_label("Faint limit mag", exact=True).input_value() == "5.5"
     assert tomllib.loads(text.input_value()) == tomllib.loads(SPEC) | {
         "selection": {"faint_limit_mag": 5.5},
@@ -165,17 +107,12 @@ def designed(page: Page, shoot: Callable[[str], None]) -> str:
     return text.input_value()
 
 
-def _settled(page: Page) -> None:
-    """Wait until the estimate is that of the form as it is."""
-    page.wait_for_function("() => document.getElementById('design').dataset.state === 'settled'")
-
-
 @pytest.fixture(scope="module")
 def job(designed: str, page: Page) -> str:
     """The address of the job that builds it."""
     page.goto("/new")
     page.locator("#toml").fill(designed)
-    _settled(page)
+    settled(page)
     page.get_by_role("button", name="Build").click()
     page.wait_for_url(re.compile(r"/jobs/[0-9a-f]{32}$"))
     return page.url[page.url.index("/jobs") :]
@@ -215,7 +152,7 @@ def looked_at(built: str, page: Page, shoot: Callable[[str], None]) -> str:
     page.wait_for_url(f"**/databases/{built}")
     shoot("database")
     page.get_by_role("link", name="Coverage").click()
-    page.locator(".sky .readout", has_text="arrow keys").wait_for()
+    page.locator(".skyview[data-state=stars]").wait_for()
     shoot("coverage")
     page.get_by_role("link", name="Build report").click()
     page.wait_for_url("**/report")
@@ -258,7 +195,7 @@ def identified(asked: str, page: Page, shoot: Callable[[str], None], tmp_path_fa
         page.get_by_role("link", name="The simulated frame as it came").click()
     frame = tmp_path_factory.mktemp("frame") / download.value.suggested_filename
     download.value.save_as(frame)
-    page.get_by_label("Image or file of centroids").set_input_files(frame)
+    page.get_by_label("Images or files of centroids").set_input_files(frame)
     with page.expect_navigation():
         page.get_by_role("button", name="Identify", exact=True).click()
     page.locator("#attitude .badge", has_text="identified").wait_for()
@@ -275,6 +212,7 @@ def published(identified: str, page: Page, shoot: Callable[[str], None]) -> str:
     page.get_by_role("link", name="Publish", exact=True).click()
     page.get_by_label("Note").fill("From the browser.\n<script>document.title = 'x'</script>")
     page.get_by_role("button", name="Publish").click()
+    page.get_by_role("button", name="Publish for good").click()
     page.get_by_text("browser-1.0.0 is published.").wait_for()
     assert page.title() == "Releases · starcat"
     shoot("releases")
@@ -294,21 +232,20 @@ def test_what_was_published_is_pulled_from_a_shell(published, tmp_path):
     subprocess.run(verify, check=True, capture_output=True, timeout=50)
 
 
-def test_the_map_and_the_table_tell_the_same_fields(looked_at, page):
+def test_the_sky_and_the_table_tell_the_same_fields(looked_at, page):
     page.goto(f"/databases/{looked_at}/coverage?order=number&page=9")
+    page.locator(".skyview[data-state=stars]").wait_for()
     rows = page.locator("#field-table tbody tr")
-    readout, svg = page.locator(".sky .readout"), page.locator(".sky > svg")
+    box = page.locator(".skyview canvas").bounding_box()
     for row in (rows.nth(2), rows.nth(19)):
         number, ra, dec, stars = (row.locator("th, td").nth(k).inner_text() for k in range(4))
-        row.hover()
-        cross = page.locator(".sky .cross circle").first.bounding_box()
-        page.mouse.move(cross["x"] + cross["width"] / 2, cross["y"] + cross["height"] / 2)
-        readout.get_by_text(f"Field {number}: {stars} guide stars").wait_for()
-        assert f"RA {ra}, Dec {dec}" in readout.inner_text()
+        row.locator("th a").click()
+        told = page.locator(".skyview .chosen .what")
+        told.get_by_text(f"Field {number}: {stars} guide stars").wait_for()
+        assert f"RA {ra}, Dec {dec.removeprefix('+')}" in told.inner_text()
     page.mouse.move(0, 0)
-    svg.focus()
-    page.keyboard.press("ArrowUp")
-    readout.get_by_text("Field ").wait_for()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.locator(".skyview .readout", has_text=re.compile("Field|mag")).wait_for()
 
 
 def test_a_query_that_fails_is_told_where_the_answer_would_be(asked, page):
@@ -373,14 +310,14 @@ def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, pa
     for address in addresses:
         assert min(_paint_ms(page, address)) < MOST_PAINT_MS, address
         if address.startswith("/new"):
-            _settled(page)
+            settled(page)
         for theme, width in looks:
-            _look(page, theme, width)
+            look(page, theme, width)
             assert page.evaluate("document.documentElement.scrollWidth") <= width, address
             for one in axe.run(page).response["violations"]:
                 nodes = [node["html"][:160] for node in one["nodes"][:3]]
                 found.append((address, theme, width, one["id"], nodes))
-    _look(page, "light", 1280)
+    look(page, "light", 1280)
     page.complaints = [one for one in page.complaints if not re.search("40[04]", one)]
     assert found == []
 
@@ -399,7 +336,7 @@ def _paint_ms(page: Page, address: str) -> Iterator[float]:
 
 def test_a_page_is_used_with_the_keyboard_only(built, page):
     page.goto("/new")
-    _settled(page)
+    settled(page)
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
     page.keyboard.press("Enter")
@@ -441,18 +378,18 @@ def test_the_theme_is_kept(built, page):
 
 def test_an_error_stands_beside_its_field_and_goes_again(built, page):
     page.goto("/new")
-    _settled(page)
+    settled(page)
     limit = page.get_by_label("Faint limit mag", exact=True)
     limit.fill("99")
-    _settled(page)
+    settled(page)
     assert limit.get_attribute("aria-invalid") == "true"
     told = page.locator("[id='selection.faint_limit_mag-error']").inner_text()
     assert "less than or equal to 40" in told
     limit.fill("6")
-    _settled(page)
+    settled(page)
     assert limit.get_attribute("aria-invalid") is None
     assert "guide stars" in page.locator("#summary").inner_text()
     page.locator("#toml").fill("name = ")
-    _settled(page)
+    settled(page)
     assert "not a readable TOML file" in page.locator("#toml-error").inner_text()
     assert limit.input_value() == "6"

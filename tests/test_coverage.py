@@ -317,6 +317,21 @@ def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     assert warning.split(":")[0] in (made.folder / "report" / "index.html").read_text()
 
 
+def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
+    narrow = {"camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 20.0}}
+    with pytest.raises(BuildError, match="of 200 simulated pointings, .* at least 4 stars") as told:
+        make(**narrow, boresights={"count": 2000}, self_test={"frames": 200, "noise_px": 0.1})
+    clean = told.value.built.rates[0]
+    assert clean.share_of_identifiable > 0.9 > clean.identified_share
+    assert "pointings show fewer than 4 stars: a fainter selection.faint" in str(told.value)
+    made = make(**narrow, boresights={"count": 2000}, self_test={"min_identified": 0.0})
+    (warning,) = made.warnings
+    blind = made.coverage.summary.histogram[:4].sum()
+    assert warning.startswith(f"{blind} of 2,000 fields ({blind / 2000:.2%}) hold fewer than 4 gu")
+    report = json.loads((made.folder / "report" / "report.json").read_bytes())
+    assert report["warnings"] == [warning]
+
+
 def test_a_build_without_holes_is_silent(make, caplog):
     made = make()
     assert made.warnings == ()

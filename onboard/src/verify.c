@@ -470,7 +470,8 @@ int sc_try(sc_call *call, const real m[9], real focal) {
       *found = w->wider;
     }
   }
-  if ((found->log_chance < R(0.0)) && (found->is_firm == 0u) && !is_scaled) {
+  if ((found->log_chance < R(0.0)) && !is_scaled &&
+      ((found->is_firm == 0u) || (found->share < SC_SURE_SHARE))) {
     try_other_scales(call);
   }
   if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {

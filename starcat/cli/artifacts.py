@@ -230,7 +230,7 @@ _BARS, _BAR_WIDTH = 20, 50
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of an artifact, and write its tables and plots where asked to."""
     from starcat.pipeline.report_data import artifact_coverage
-    from starcat.report.report import holes_warning, write_coverage
+    from starcat.report.report import coverage_warnings, write_coverage
 
     report = artifact_coverage(artifact)
     if as_json:
@@ -238,8 +238,7 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
     else:
         print_coverage_table(report)
         print_table("", ("stars in a field", "fields", ""), histogram_rows(report), numbers=(1,))
-    if warning := holes_warning(report.gap):
-        warn([warning])
+    warn(coverage_warnings(report.summary, report.gap))
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         title = f"{artifact.manifest['name']}-{artifact.manifest['version']}"

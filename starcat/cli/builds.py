@@ -204,9 +204,10 @@ def print_rates(rates: Sequence[Rates]) -> None:
             "4+ stars": "{0.identifiable}",
             "right": "{0.identified}",
             "wrong": "{0.wrong}",
-            "rate": "{0.identified_share:.1%}",
+            "of all": "{0.identified_share:.1%}",
+            "of 4+": "{0.share_of_identifiable:.1%}",
         },
-        numbers=range(1, 10),
+        numbers=range(1, 11),
     )
 
 

@@ -7,6 +7,8 @@ neighbour, a full well) is not in these errors.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from starcat.arrays import Array, Pixels
@@ -16,11 +18,16 @@ from starcat.matcher.result import MatchResult
 CREDIBLE_CHI_SQUARE = (0.5, 2.0)
 """Reduced chi-squares of an answer between which the noise of its spots is taken as its weights."""
 
+LEAST_DEPTH = 2.0
+"""Standard deviations from a sky that was not clipped down to its darkest pixel, at least."""
+
 
 def centroid_sigma_px(
     flux: Array, noise: Array, sigma_px: float, gain_e_per_adu: float, window_px: float
 ) -> Array:
-    """Return the standard errors of windowed centroids on each axis; infinite without light.
+    """Return the standard errors of windowed centroids on each axis; infinite where not known.
+
+    That is without light, or with a gain that is NaN.
 
     ``flux`` is the light of each spot and ``noise`` the standard deviation of a pixel of its
     background, both in steps of the image; the spot as the pixels show it and the window are
@@ -49,12 +56,15 @@ def electrons_per_step(levels: Levels) -> float:
     """Judge the gain of a camera from the noise of the sky, as if its photons were all noise.
 
     The black point is taken to be the darkest pixel. Read noise makes the gain seem smaller than
-    it is, and the errors of bright stars larger.
+    it is, and the errors of bright stars larger. NaN where the sky was clipped, so that no pixel
+    is darker than it by `LEAST_DEPTH` of its noise.
     """
     sky = float(np.median((levels.raw - levels.above)[~levels.mask]))
-    darkest = float(levels.raw[~levels.mask].min())
-    variance = float(np.median(levels.noise)) ** 2
-    return max(sky - darkest, 1e-6 * variance) / variance if variance else 1.0
+    depth = sky - float(levels.raw[~levels.mask].min())
+    noise = float(np.median(levels.noise))
+    if not noise:
+        return 1.0
+    return depth / noise**2 if depth >= LEAST_DEPTH * noise else math.nan
 
 
 def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:

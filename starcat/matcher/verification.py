@@ -214,9 +214,13 @@ def agree(
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
         wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
-        if wider.false_match_probability < found.false_match_probability:
+        # Of an agreement of hundreds of stars the probability may be too small for a number.
+        if (wider.false_match_probability, -wider.n_matched) < (
+            found.false_match_probability, -found.n_matched,
+        ):  # fmt: skip
             found = wider
-    if found.false_match_probability < 1.0 and not found.is_firm and not observation.fov_error:
+    is_doubtful = found.share < SURE_SHARE or not found.is_firm
+    if found.false_match_probability < 1.0 and is_doubtful and not observation.fov_error:
         return _at_own_scale(found, observation, database)
     return found
 

@@ -28,12 +28,12 @@ THINNED = 1.5
 def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None:
     """Check that a database identifies its own fields."""
     clean, wanted = rates[0], spec.self_test.min_identified
-    most = clean.interval[1] if clean.identifiable else 0.0
+    most = clean.interval[1] if clean.identified else 0.0
     if most < wanted:
         raise BuildError(
-            f"{spec.name}: the database identifies {clean.identified} of {clean.identifiable} "
-            f"simulated fields with at least 4 stars ({clean.frames} in all), which is "
-            f"{most:.1%} at the most; self_test.min_identified asks for {wanted:.1%}. "
+            f"{spec.name}: the database identifies {clean.identified} of {clean.frames} simulated "
+            f"pointings, {clean.identifiable} of which show at least 4 stars; that is "
+            f"{most:.1%} at the most, and self_test.min_identified asks for {wanted:.1%}. "
             + ". ".join(causes(clean, spec, gap))
         )
     wrong = sum(rate.wrong for rate in rates)
@@ -51,12 +51,15 @@ def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:
 
 def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
     middle = float(np.median(rates.missed)) if rates.missed else 0.0
-    if middle < FEW_STARS:
-        have = f"The missed frames have {middle:g} stars (median)"
-        if not rates.identifiable:
-            have = "No simulated field has 4 stars"
+    blind = rates.frames - rates.identifiable
+    if blind > len(rates.missed):
         yield (
-            f"{have}, too few: a fainter "
+            f"{blind} pointings show fewer than 4 stars: a fainter selection.faint_limit_mag or a "
+            "wider camera gives more stars a field"
+        )
+    elif middle < FEW_STARS:
+        yield (
+            f"The missed frames have {middle:g} stars (median), too few: a fainter "
             "selection.faint_limit_mag or a wider camera gives more stars a field"
         )
     if gap.has_holes:
@@ -78,11 +81,11 @@ def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | 
     """Return what to say of a database that is good only where magnitudes are given."""
     clean, bare = rates[0], rates[2]
     wanted = spec.self_test.min_identified
-    if not bare.identifiable or bare.interval[1] >= min(wanted, clean.interval[0]):
+    if not bare.frames or bare.interval[1] >= min(wanted, clean.interval[0]):
         return None
     thinned = round(THINNED * spec.boresights.brightest)
     return (
-        f"without magnitudes {bare.identified} of {bare.identifiable} simulated fields are "
-        f"identified, with them {clean.identified} of {clean.identifiable}: give the magnitudes "
+        f"without magnitudes {bare.identified} of {bare.frames} simulated pointings are "
+        f"identified, with them {clean.identified} of {clean.frames}: give the magnitudes "
         f"of the spots, or set selection.max_stars_per_field = {thinned}"
     )

@@ -49,7 +49,7 @@ from starcat.pipeline.report_data import (
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
-from starcat.report.report import CoverageReport, holes_warning, write_report
+from starcat.report.report import CoverageReport, coverage_warnings, write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder
@@ -165,7 +165,7 @@ def _make(
             *catalog.notes,
             *motion_notes(spec, products),
             *matched.notes,
-            holes_warning(report.gap),
+            *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),
         )
     )

@@ -22,17 +22,12 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
 from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
-from starcat.pipeline.guide_stars import (
-    MIN_GUIDE_STARS,
-    MOST_FIELD_STARS,
-    check_fields,
-    check_tiling,
-    thinned_stars,
-)
+from starcat.pipeline.guide_stars import MOST_FIELD_STARS, check_fields, check_tiling, thinned_stars
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
+    MIN_GUIDE_STARS,
     CoverageSummary,
     TilingGap,
     field_coverage,
@@ -41,7 +36,7 @@ from starcat.products.coverage import (
 )
 from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
-from starcat.report.report import holes_warning
+from starcat.report.report import coverage_warnings
 from starcat.specs.build_spec import BuildSpec, Selection
 from starcat.storage.schema import product_schema
 
@@ -177,18 +172,19 @@ def estimate(
             refusals.append(str(error))
     count = fields.count
     gap = _gap(spec)
+    summary = summarise_coverage(field_coverage(fields, spec.boresights.brightest))
     return Estimate(
         spec,
         cost,
         read.seconds,
         fields,
-        summarise_coverage(field_coverage(fields, spec.boresights.brightest)),
+        summary,
         float((count >= MIN_GUIDE_STARS).mean()),
         float((count >= spec.boresights.brightest).mean()),
         tuple((step.name, len(step.directions)) for step in choice.selected.steps),
         choice.rejected,
         tuple(refusals),
-        (*read.notes, *filter(None, [None if gap is None else holes_warning(gap)])),
+        (*read.notes, *coverage_warnings(summary, gap)),
     )
 
 

@@ -16,10 +16,8 @@ from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields
+from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.specs.build_spec import BuildSpec
-
-MIN_GUIDE_STARS = 4
-"""Fewer than these cannot be identified by anything."""
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""

@@ -18,11 +18,15 @@ from starcat.catalog.stars import floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
 from starcat.pipeline.counterparts import source_facts
-from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
-from starcat.products.coverage import Coverage, coverage_from_counts
-from starcat.report.report import CoverageReport, count_magnitudes, holes_warning, report_coverage
+from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
+from starcat.report.report import (
+    CoverageReport,
+    count_magnitudes,
+    coverage_warnings,
+    report_coverage,
+)
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
@@ -108,7 +112,7 @@ class BuildResults:
 def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
     """Return the report of a build as JSON holds it; its files are in the folder."""
     spec, tables = results.spec, {product.name: product.table for product in results.products}
-    recorded, warning = spec.recorded(), holes_warning(coverage.gap)
+    recorded = spec.recorded()
     products = {
         name: {**facts, "bytes": (folder / facts["parquet"]).stat().st_size}
         for name, facts in results.facts.items()
@@ -119,7 +123,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     return {
         **{name: recorded[name] for name in ("name", "version", "description", "epoch_jyear")},
         "frame": "ICRS",
-        "warnings": [warning] if warning else [],
+        "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
         "sources": sources,
         "reasons": {reason.name: reason.value for reason in Reason if reason.name in found},
         "products": products,

@@ -18,6 +18,9 @@ from starcat.products.boresights import FieldStars
 
 Counts = NDArray[np.int64]
 
+MIN_GUIDE_STARS = 4
+"""Fewer than these cannot be identified by anything."""
+
 
 @dataclass(frozen=True)
 class Coverage:

@@ -136,7 +136,11 @@ def _summary(content: Mapping[str, Any]) -> str:
         ("positions", f"{content['frame']}, epoch J{content['epoch_jyear']:g}"),
         ("camera", camera.in_words),
         ("fewest guide stars in a field", f"{content['coverage']['stars']['minimum']:,}"),
-        ("identified in the self-test", f"{clean['identified_share']:.2%} of the clean frames"),
+        (
+            "identified in the self-test",
+            f"{clean['identified_share']:.2%} of all pointings, "
+            f"{clean['share_of_identifiable']:.2%} of those with at least 4 stars",
+        ),
     ]
     return table("", ("", ""), rows)
 
@@ -216,11 +220,12 @@ def _self_test(rates: Sequence[Mapping[str, Any]]) -> str:
         (
             *("" if rate[name] is None else rate[name] for name in names),
             f"{rate['identified_share']:.2%}",
+            f"{rate['share_of_identifiable']:.2%}",
         )
         for rate in rates
     ]
     heads = (
         "fields", "noise, px", "noise, mag", "missing", "false", "tried", "4 stars or more",
-        "right", "wrong", "residual, arcsec", "rate",
+        "right", "wrong", "residual, arcsec", "of all pointings", "of 4 stars or more",
     )  # fmt: skip
-    return table("Simulated fields", heads, rows, range(1, 11))
+    return table("Simulated fields", heads, rows, range(1, 12))

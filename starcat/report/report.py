@@ -15,6 +15,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.coverage import (
+    MIN_GUIDE_STARS,
     Coverage,
     CoverageSummary,
     TilingGap,
@@ -79,16 +80,30 @@ def report_coverage(coverage: Coverage, tile_radius_rad: float) -> CoverageRepor
     return CoverageReport(coverage, summarise_coverage(coverage), gap)
 
 
-def holes_warning(gap: TilingGap) -> str | None:
-    """Return what to say about holes of a tiling."""
-    if not gap.has_holes:
-        return None
+def _holes(gap: TilingGap) -> str:
     return (
         f"boresights.count = {gap.boresights:,} leaves holes: RA {gap.ra_deg:.3f}, Dec "
         f"{gap.dec_deg:+.3f} deg lies {np.degrees(gap.covering_radius_rad):.3f} deg from every "
         f"boresight, and a field reaches {np.degrees(gap.tile_radius_rad):.3f} deg at any roll; "
         f"about {gap.boresights_needed:,} boresights leave none"
     )
+
+
+BLIND_SHARE = 0.001
+"""Largest share of fields with fewer than `MIN_GUIDE_STARS` stars that goes without a warning."""
+
+
+def coverage_warnings(summary: CoverageSummary, gap: TilingGap | None) -> tuple[str, ...]:
+    """Return what to say about holes of a tiling and about fields with too few stars."""
+    told = [] if gap is None or not gap.has_holes else [_holes(gap)]
+    blind = int(summary.histogram[:MIN_GUIDE_STARS].sum())
+    if blind > BLIND_SHARE * summary.fields:
+        told.append(
+            f"{blind:,} of {summary.fields:,} fields ({blind / summary.fields:.2%}) hold fewer "
+            f"than {MIN_GUIDE_STARS} guide stars and cannot be identified: a fainter "
+            "selection.faint_limit_mag or a wider camera gives more stars a field"
+        )
+    return tuple(told)
 
 
 def coverage_csv(coverage: Coverage) -> bytes:

@@ -43,13 +43,18 @@ class Rates:
 
     @property
     def identified_share(self) -> float:
-        """Identified over identifiable; 0 where no frame can be."""
+        """Share of all pointings that are identified; 0 where none was tried."""
+        return self.identified / self.frames if self.frames else 0.0
+
+    @property
+    def share_of_identifiable(self) -> float:
+        """Share of the frames with at least 4 stars; 0 where there are none."""
         return self.identified / self.identifiable if self.identifiable else 0.0
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's interval of 95 % of that share; 0 to 1 where no frame can be identified."""
-        return wilson_interval(self.identified, self.identifiable)
+        """Wilson's interval of 95 % of the share of all pointings."""
+        return wilson_interval(self.identified, self.frames)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the rates as the report holds them."""
@@ -61,6 +66,7 @@ class Rates:
             "identified_share": round(self.identified_share, 6),
             "least_share": least,
             "most_share": most,
+            "share_of_identifiable": round(self.share_of_identifiable, 6),
         }
 
 

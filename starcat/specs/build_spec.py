@@ -215,8 +215,8 @@ class SelfTest(Section):
         0.9,
         ge=0.0,
         le=1.0,
-        description="least share of the clean fields with at least 4 stars; the build fails if the "
-        "95 % interval of the share ends below",
+        description="least share of all pointings that is identified in clean frames; the build "
+        "fails if the 95 % interval of the share ends below",
     )
 
 

@@ -14,6 +14,7 @@ from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
 from starcat.service.library import Database
 from starcat.service.service import Service
+from starcat.simulation.selftest import rates_of
 from starcat.storage.schema import product_schema
 
 REPORT = "report/report.json"
@@ -53,7 +54,8 @@ def database_rows(service: Service, *databases: Database) -> list[Row]:
 def _rates(database: Database) -> list[Mapping[str, Any]]:
     """Return the rates of the self-test: a damaged report does not hide other databases."""
     try:
-        return list(report_of(database).get("self_test", ()))
+        # A report of an older version has no share of all pointings.
+        return [rates_of(one).as_dict() for one in report_of(database).get("self_test", ())]
     except ProductError:
         return []
 

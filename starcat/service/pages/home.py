@@ -11,13 +11,13 @@ from starcat.service.access import Identities, Reader, cookie_name, network_of, 
 from starcat.service.api import releases as api
 from starcat.service.jobs.job import ENDED
 from starcat.service.pages.facts import database_rows
-from starcat.service.pages.releases import address_of
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.security import request_limits
 from starcat.service.service import TheService
 from starcat.service.settings import Settings
 
 router = page_router()
+MAX_ADDRESS = 16_000  # characters of an address: a design of a database is in one
 SHOWN = 8  # databases, jobs and releases that are shown of each
 
 
@@ -81,7 +81,7 @@ def sign_in(
     request: Request,
     service: TheService,
     token: Annotated[str, Form(max_length=200)],
-    next_address: Annotated[str, Form(alias="next", max_length=2000)] = "/",
+    next_address: Annotated[str, Form(alias="next", max_length=MAX_ADDRESS)] = "/",
 ) -> Response:
     """Begin a session, if the token is valid."""
     identities: Identities = request.app.state.identities

@@ -17,7 +17,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.service.access import principal_of
+from starcat.service.pages.wording import in_page_words
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
+from starcat.service.service import Service
 from starcat.version import __version__
 
 NAVIGATION = (
@@ -128,6 +130,7 @@ def _environment() -> Environment:
         "duration": duration_text,
         "time": time_text,
         "moment": moment_text,
+        "plain": in_page_words,
     }
     environment.globals |= {
         "static": static_address,
@@ -143,9 +146,24 @@ ENVIRONMENT = _environment()
 def render(request: Request, template: str, *, status: int = 200, **content: Any) -> HTMLResponse:
     """Return a page."""
     page = ENVIRONMENT.get_template(template).render(
-        principal=principal_of(request), path=request.url.path, **content
+        principal=principal_of(request),
+        path=request.url.path,
+        **{"sign_in": sign_in_address(request), **content},
     )
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def address_of(request: Request, service: Service) -> str:
+    """Return the address of the service as whoever asks reaches it."""
+    return (service.settings.public_url or str(request.base_url)).rstrip("/")
+
+
+def sign_in_address(request: Request) -> str:
+    """Return the address to sign in at, which leads back to the page that was asked for."""
+    if request.method != "GET" or request.url.path in ("/", "/sign-in"):
+        return "/sign-in"
+    asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    return f"/sign-in?next={quote(asked)}"
 
 
 class _PageRoute(RenderingRoute):
@@ -157,8 +175,7 @@ class _PageRoute(RenderingRoute):
             return as_json(error)
         problem = problem_of(error)
         if problem.status == 401 and request.method == "GET":
-            asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
-            return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)
+            return RedirectResponse(sign_in_address(request), 303)
         return _error_page(request, error)
 
 

@@ -4,6 +4,8 @@ import { announce } from "./starcat.js";
 
 const EVERY_MS = 2000;
 
+let shown = "";
+
 function states(root) {
   return new Map([...root.querySelectorAll("[data-job]")].map((row) => [row.dataset.job, row]));
 }
@@ -25,7 +27,8 @@ async function refresh() {
 function show(list, html) {
   const page = new DOMParser().parseFromString(html, "text/html");
   const news = page.getElementById("jobs");
-  if (!news || news.innerHTML === list.innerHTML) return;
+  if (!news || news.innerHTML === shown) return;
+  shown = news.innerHTML;
   const before = states(list);
   for (const [id, row] of states(news)) {
     const known = before.get(id);

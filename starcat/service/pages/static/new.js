@@ -1,7 +1,9 @@
 // New database: sliders, the spec and what it would give, kept in step by the server.
 
-import { announce } from "./starcat.js";
+import { goTo } from "./address.js";
+import { announce, copy } from "./starcat.js";
 import { startMap } from "./sky.js";
+import { follow, startSliders } from "./sliders.js";
 
 const form = document.getElementById("design");
 const result = document.getElementById("result");
@@ -10,6 +12,9 @@ const body = document.getElementById("body");
 const text = document.getElementById("toml");
 const before = document.getElementById("toml-before");
 const summary = document.getElementById("summary");
+const pinned = document.getElementById("pinned");
+const share = document.getElementById("share");
+const build = document.getElementById("build");
 const FIELDS_AFTER_MS = 120;
 const TEXT_AFTER_MS = 450;
 const BUSY_AFTER_MS = 2500;
@@ -17,48 +22,7 @@ const BUSY_AFTER_MS = 2500;
 let waiting = 0;
 let asked = null;
 let tiling = { count: 0, fields: null };
-
-// Sliders
-
-function places(step) {
-  return (String(step).split(".")[1] ?? "").length;
-}
-
-function valueOf(range) {
-  const position = Number(range.value);
-  if (range.dataset.noneAt === "low" && position <= Number(range.min)) return "";
-  if (range.dataset.noneAt === "high" && position >= Number(range.max)) return "";
-  if (range.dataset.scale !== "log") return String(position);
-  const { low, high, step } = range.own;
-  const value = low * (high / low) ** (position / 1000);
-  const rounded = step < 1 ? value : Number(value.toPrecision(3));
-  return String(Number(rounded.toFixed(places(step))));
-}
-
-function follow(range) {
-  const number = document.getElementById(range.dataset.of);
-  if (range === document.activeElement && range.matches(":active")) return;
-  const value = Number(number.value);
-  if (number.value === "") range.value = range.dataset.noneAt === "low" ? range.min : range.max;
-  else if (range.dataset.scale !== "log") range.value = String(value);
-  else range.value = String((1000 * Math.log(value / range.own.low)) / Math.log(range.own.high / range.own.low));
-  const unit = document.querySelector(`label[for="${number.id}"] .unit`)?.textContent ?? "";
-  range.setAttribute("aria-valuetext", number.value === "" ? number.placeholder : `${number.value} ${unit}`);
-}
-
-const ranges = [...form.querySelectorAll("input[type=range]")];
-for (const range of ranges) {
-  const own = { low: Number(range.min), high: Number(range.max), step: Number(range.step) };
-  range.own = own;
-  if (range.dataset.scale === "log") [range.min, range.max, range.step] = ["0", "1000", "1"];
-  range.hidden = false;
-  range.closest(".slider").classList.add("live");
-  range.addEventListener("input", () => {
-    document.getElementById(range.dataset.of).value = valueOf(range);
-    follow(range);
-  });
-  follow(range);
-}
+const ranges = startSliders(form);
 
 // What the server says
 
@@ -119,15 +83,23 @@ function show(state) {
     if (hadFocus) body.querySelector(".sky svg")?.focus();
   }
   if (summary.textContent !== state.summary) summary.textContent = state.summary;
+  if (build) build.disabled = !state.can_build;
+  pinned.value = state.pinned_query;
+  share.href = state.address;
+  goTo(new URL(share.href).search);
 }
 
-async function ask() {
+// `wanted` is what a button does besides: suggest, pin or unpin.
+async function ask(wanted = "preview") {
   asked?.abort();
+  clearTimeout(waiting);
   asked = new AbortController();
   result.setAttribute("aria-busy", "true");
+  const sent = new URLSearchParams(new FormData(form));
+  sent.set("do", wanted);
   try {
     const answer = await fetch(form.dataset.preview, {
-      method: "POST", body: new URLSearchParams(new FormData(form)), signal: asked.signal,
+      method: "POST", body: sent, signal: asked.signal,
     });
     if (!answer.ok) {
       const problem = await answer.json().catch(() => null);
@@ -136,8 +108,7 @@ async function ask() {
     const state = await answer.json();
     show(state);
     if (state.is_busy) {
-      clearTimeout(waiting);
-      waiting = setTimeout(ask, BUSY_AFTER_MS);
+      waiting = setTimeout(ask, BUSY_AFTER_MS, wanted);
       return;
     }
   } catch (error) {
@@ -151,12 +122,27 @@ async function ask() {
 form.addEventListener("input", (event) => {
   form.dataset.state = "changed";
   clearTimeout(waiting);
-  const range = ranges.find((one) => one.dataset.of === event.target.id);
-  if (range) follow(range);
   waiting = setTimeout(ask, event.target === text ? TEXT_AFTER_MS : FIELDS_AFTER_MS);
 });
 text.addEventListener("blur", () => { if (text.value !== before.value && text.value.trim() === before.value.trim()) text.value = before.value; });
 // What a browser kept of a page that was left is newer than what the server sent.
 document.getElementById("update").hidden = true;
-form.addEventListener("submit", () => { announce("Sent"); clearTimeout(waiting); });
+form.addEventListener("submit", (event) => {
+  const wanted = event.submitter?.value;
+  if (["suggest", "pin", "unpin"].includes(wanted)) {
+    event.preventDefault();
+    form.dataset.state = "changed";
+    ask(wanted);
+    return;
+  }
+  announce("Sent");
+  clearTimeout(waiting);
+});
+share.addEventListener("click", async (event) => {
+  event.preventDefault();
+  const before = share.textContent;
+  share.textContent = await copy(share.href, share) === "Copied" ? "Copied" : share.href;
+  announce(share.textContent);
+  setTimeout(() => { share.textContent = before; }, 1600);
+});
 ask();

@@ -1,4 +1,6 @@
-// What every page has: the theme, and buttons that copy.
+// What every page has: the theme, buttons that copy, forms that are kept, tables as cards.
+
+import { startKeeping } from "./address.js";
 
 const THEMES = { system: "as the system", light: "light", dark: "dark" };
 
@@ -71,11 +73,29 @@ export function announce(text) {
   region.textContent = text;
 }
 
+// A table of many columns can be shown as a card for each row: its cells get the heads to show.
+function cardTables() {
+  for (const table of document.querySelectorAll("table:not(.carded, .grid)")) {
+    const heads = [...table.querySelectorAll("thead tr:last-child > *")];
+    if (heads.length < 4) continue;
+    table.classList.add("carded");
+    for (const row of table.tBodies[0]?.rows ?? []) {
+      [...row.cells].forEach((cell, k) => {
+        cell.dataset.head = heads[k]?.textContent.trim() ?? "";
+        cell.classList.toggle("empty-cell", cell.textContent.trim() === "");
+      });
+    }
+  }
+}
+
 startTheme();
 startCopying();
+startKeeping();
+cardTables();
+new MutationObserver(cardTables).observe(document.getElementById("content"), { childList: true, subtree: true });
 
 // On a narrow screen, the place where one is may lie beside it.
-for (const here of document.querySelectorAll(".nav [aria-current], .tabs [aria-current]")) {
-  const list = here.closest("nav, ul");
+for (const here of document.querySelectorAll(".tabs [aria-current]")) {
+  const list = here.closest("ul");
   if (list.scrollWidth > list.clientWidth) list.scrollLeft = here.offsetLeft - 24;
 }

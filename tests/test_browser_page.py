@@ -1,0 +1,93 @@
+"""What all pages share, in a real browser: the menu and tables of a phone, kept addresses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+from browsing import NEEDS_BROWSER, launched, look, opened
+from served import serve
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A page of a service with nothing in it."""
+    folder = tmp_path_factory.mktemp("browser")
+    with (
+        serve(folder / "service", folder / "log", anonymous="builder") as served,
+        launched() as browser,
+        opened(browser, served.address) as page,
+    ):
+        yield page
+        assert page.complaints == []
+
+
+def test_every_page_is_reached_by_the_menu_of_a_phone(page):
+    look(page, "light", 360)
+    names = []
+    for k in range(5):
+        page.goto("/")
+        assert not page.locator("#menu").is_visible()
+        page.get_by_role("button", name="Menu").click()
+        link = page.locator("#menu a").nth(k)
+        names.append(link.inner_text())
+        link.click()
+        page.wait_for_url(lambda address: not address.endswith("/"))
+        assert page.locator("#menu a[aria-current]").text_content() == names[-1]
+    assert {"New database", "Databases", "Releases"} <= set(names)
+    look(page, "light", 1280)
+    assert page.locator("#menu").is_visible()
+    assert not page.get_by_role("button", name="Menu").is_visible()
+
+
+def test_rows_of_a_table_are_cards_with_the_heads_on_a_phone(page):
+    page.goto("/")
+    page.evaluate(
+        "document.getElementById('content').innerHTML = '<table><thead><tr><th>Name</th><th>Size"
+        "</th><th>By</th><th>State</th></tr></thead><tbody><tr><th scope=row>one</th><td>4 MB</td>"
+        "<td></td><td>new</td></tr></tbody></table>'"
+    )
+    page.locator("table.carded").wait_for()
+    look(page, "light", 360)
+    size = page.locator("td").first
+    assert size.evaluate("cell => getComputedStyle(cell, '::before').content") == '"Size"'
+    boxes = [page.locator("tbody tr > *").nth(k).bounding_box() for k in (0, 1, 3)]
+    assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"]
+    assert not page.locator("td").nth(1).is_visible()  # nothing is told of an empty cell
+    look(page, "light", 1280)
+    tops = {page.locator("tbody tr > *").nth(k).bounding_box()["y"] for k in (0, 1, 3)}
+    assert len(tops) == 1
+
+
+KEEPING = """(async () => {
+  const { kept, keep, startKeeping } = await import(
+    document.querySelector("script[type=module]").src.replace("starcat.js", "address.js"));
+  document.getElementById("content").innerHTML = `<form data-keeps>
+    <input id="limit" name="limit" data-usual="6"><input id="word" name="word" data-unkept>
+    <input type="checkbox" id="flip" name="flip" value="yes"><input type="file" name="file"></form>
+    <a href="/sign-in">Sign in</a>`;
+  startKeeping();
+  keep({ sort: "mag" });
+  return kept("sort") + kept("nothing");
+})()"""
+
+
+def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
+    page.goto("/identify")
+    assert page.evaluate(KEEPING) == "mag"
+    page.locator("#limit").fill("7")
+    page.locator("#word").fill("secret")
+    page.locator("#flip").check()
+    assert page.url.endswith("/identify?sort=mag&limit=7&flip=yes")
+    assert page.locator("#content a").get_attribute("href") == (
+        "/sign-in?next=%2Fidentify%3Fsort%3Dmag%26limit%3D7%26flip%3Dyes"
+    )
+    page.locator("#limit").fill("6")
+    page.locator("#flip").uncheck()
+    assert page.url.endswith("/identify?sort=mag")
