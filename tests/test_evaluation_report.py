@@ -779,3 +779,21 @@ def test_sweeps_of_another_artifact_or_code_are_left_out(small_artifact, tmp_pat
         results.write_text(json.dumps(kept))
         (content,) = with_earlier(results, stored, small_artifact)
         assert content == stored
+
+
+def test_curves_are_of_all_pointings_with_their_intervals(small_artifact, tmp_path):
+    from starcat.evaluation.curves import QUANTITIES, measure_curves
+
+    seen = []
+    curves = measure_curves(
+        small_artifact, tmp_path, 5, 1, lambda stage, done, total: seen.append((stage, done))
+    )
+    assert [curve["quantity"] for curve in curves] == list(QUANTITIES)
+    assert seen[-1] == ("curves", sum(len(curve["points"]) for curve in curves))
+    for curve in curves:
+        assert [point["count"] for point in curve["points"]] == [5] * len(curve["points"])
+        for point in curve["points"]:
+            assert point["low_percent"] <= point["percent"] <= point["high_percent"]
+            assert point["percent"] == 20.0 * point["hits"]
+    again = measure_curves(small_artifact, tmp_path / "again", 5, 1)
+    assert again == curves

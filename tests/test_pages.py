@@ -401,7 +401,7 @@ def _sent(client: TestClient, address: str, form: dict[str, str]):
 
 
 def test_a_page_works_without_scripts(client):
-    sent = {**_form(SPEC), "selection.faint_limit_mag": "4", "do": "preview"}
+    sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4", "do": "preview"}
     page = _sent(client, "/new", sent)
     assert page.status_code == 200
     assert "faint_limit_mag = 4.0" in page.text
@@ -410,7 +410,8 @@ def test_a_page_works_without_scripts(client):
 
 
 def test_a_script_is_told_what_the_form_has_become(client):
-    sent = {**_form(SPEC), "selection.faint_limit_mag": "4", "camera.fov_x_deg": "40"}
+    sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4"}
+    sent["camera.fov_x_deg"] = "40"
     state = _sent(client, "/new/preview", sent).json()
     assert state["errors"] == {}
     assert state["values"]["camera.fov_x_deg"] == "40"
@@ -430,9 +431,12 @@ def test_a_catalog_that_is_not_here_is_told(client, monkeypatch):
     monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
     text = SPEC.replace('"gaia"', '"sao"')
     page = client.post("/new", data={"toml": text, "toml-before": "", "do": "preview"})
-    assert page.status_code == 200
-    assert "no file found" in page.text
-    assert 'class="notice bad"' in page.text
+    assert page.status_code == 422
+    told = re.search(r'id="catalog.source-error">([^<]*)<', page.text)
+    assert told is not None
+    assert "no file found" in told[1]
+    assert "starcat fetch sao" in told[1]
+    assert "--input" not in page.text
 
 
 def test_every_address_of_the_rest_interface_is_explained(client, pages):

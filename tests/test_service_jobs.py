@@ -22,6 +22,7 @@ from services import client_of, states
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
+from starcat.evaluation.curves import QUANTITIES
 from starcat.service.access import Principal
 from starcat.service.jobs import job as job_module
 from starcat.service.jobs.job import MAX_INTERRUPTED, Attempt, Job, Outcome, begin_next, interrupt
@@ -400,8 +401,18 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         wish = {"kind": "evaluate", "database": database, "frames": 4, "seed": 1}
         measured = client.post(JOBS, json=wish).json()["id"]
         client.get(f"{JOBS}/{measured}/events")
-        rates = client.get(f"{JOBS}/{measured}").json()["result"]["rates"]
-        assert [rate["frames"] for rate in rates] == [4, 4, 4, 4]
+        found = client.get(f"{JOBS}/{measured}").json()["result"]
+        assert [rate["frames"] for rate in found["rates"]] == [4, 4, 4, 4]
+        assert [curve["quantity"] for curve in found["curves"]] == list(QUANTITIES)
+        for curve in found["curves"]:
+            for point in curve["points"]:
+                assert point["count"] == 4
+                assert point["low_percent"] <= point["percent"] <= point["high_percent"]
+        page = client.get(f"/jobs/{measured}").text
+        headline = f"{100 * found['rates'][0]['identified_share']:.1f}"
+        assert f'id="headline">{headline}<' in page
+        assert page.count('<figure class="chart">') == 3
+        assert page.count('class="point"') == sum(len(curve["points"]) for curve in found["curves"])
         listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
         assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
         service = client.app.state.service

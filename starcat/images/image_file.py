@@ -34,7 +34,7 @@ from starcat.storage.atomic import write_file
 from starcat.version import install_command
 
 if TYPE_CHECKING:
-    from astropy.io.fits import Header, PrimaryHDU
+    from astropy.io.fits import HDUList, Header, PrimaryHDU
 
 Grey = NDArray[np.float32] | Array
 
@@ -357,14 +357,37 @@ def write_wcs(
     write_file(path, buffer.getvalue())
 
 
+def wcs_header(result: MatchResult, source: Path, *, flip: bool | None = None) -> bytes:
+    """Return a FITS header alone, with the world coordinates that were found for a frame."""
+    from astropy.io import fits
+
+    camera, header = result.camera, fits.PrimaryHDU().header
+    header["NAXIS"], header["NAXIS1"], header["NAXIS2"] = 2, 0, 0  # two axes, and no data
+    if camera is not None:
+        header["IMAGEW"] = (camera.width_px, "width of the frame, pixels")
+        header["IMAGEH"] = (camera.height_px, "height of the frame, pixels")
+    bottom_up = bool(flip)
+    data = _unpacked(source)
+    if data.startswith(b"SIMPLE  =") and flip is None:
+        with fits.open(io.BytesIO(data), memmap=False) as parts:
+            bottom_up = _is_bottom_up(_image_part(parts).header)
+    _add_wcs(header, result, bottom_up)
+    return str(header.tostring()).encode("ascii")
+
+
+def _image_part(parts: HDUList) -> Any:
+    """Return the first part of a FITS file that is an image."""
+    return next(
+        part for part in parts if part.is_image and len(part.shape) >= 2 and min(part.shape) > 0
+    )
+
+
 def _copy_fits(data: bytes, result: MatchResult, flip: bool | None, buffer: io.BytesIO) -> None:
     from astropy.io import fits
 
     # Values stay as they are stored, whatever the scale of the file.
     with fits.open(io.BytesIO(data), memmap=False, do_not_scale_image_data=True) as parts:
-        part = next(
-            part for part in parts if part.is_image and len(part.shape) >= 2 and min(part.shape) > 0
-        )
+        part = _image_part(parts)
         bottom_up = _is_bottom_up(part.header) if flip is None else flip
         for key in [key for key in part.header if _OF_A_WCS.fullmatch(key)]:
             del part.header[key]

@@ -128,7 +128,7 @@ def starter_spec(
     shape = spec_to(float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
-        limit = _enough(sky, shape)
+        limit = enough_limit(sky, shape)
     check_tiling(int(np.searchsorted(mag, limit, side="right")), shape, None, most_field_stars)
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
@@ -235,8 +235,8 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
 
 
-def _enough(sky: pa.Table, spec: BuildSpec) -> float:
-    """Return the limit that leaves enough stars in nearly all fields."""
+def enough_limit(sky: pa.Table, spec: BuildSpec) -> float:
+    """Return the limit that leaves enough stars in nearly all fields; that of the sky at most."""
     field = spec.camera.camera()
     fields = 4.0 * np.pi / np.radians(field.fov_x_deg) / np.radians(field.fov_y_deg)
     mag = floats_of(sky, "mag")

@@ -177,17 +177,27 @@ def bins_of(stars: Counts) -> tuple[Bin, ...]:
     return tuple(bins)
 
 
+FIXED_EDGES = (MIN_STARS, 6, 8, 10, 15, 20, 30, 50, 100)
+"""Least stars of the colours of `FIXED_BINS`, after that of too few."""
+
+FIXED_BINS = tuple(
+    Bin(f"m{k}", low, above - 1 if above else None)
+    for k, (low, above) in enumerate(zip((0, *FIXED_EDGES), (*FIXED_EDGES, None), strict=True))
+)
+"""Colours that mean the same on every map, so that two maps can be compared."""
+
+
 def bin_numbers(bins: tuple[Bin, ...], stars: Counts) -> Counts:
     """Return for each number of stars the index of its bin."""
     return np.searchsorted([one.least for one in bins], stars, side="right") - 1
 
 
-def raster_png(nearest: Array, stars: Counts) -> bytes:
+def raster_png(nearest: Array, stars: Counts, bins: tuple[Bin, ...] = ()) -> bytes:
     """Return a map as PNG from the index of the nearest field, NaN outside of the sky."""
     from PIL import Image
 
     inside = ~np.isnan(nearest)
-    bins = bins_of(stars)
+    bins = bins or bins_of(stars)
     colours = np.array([int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
     pixels = np.zeros(nearest.shape, dtype=np.uint8)
     pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside].astype(np.int64)]
@@ -221,12 +231,12 @@ class SkyMap:
     emptiest: Field
 
 
-def sky_map(fields: Fields) -> SkyMap:
-    """Return the lines and the legend of a map."""
+def sky_map(fields: Fields, bins: tuple[Bin, ...] = ()) -> SkyMap:
+    """Return the lines and the legend of a map; its colours are for its own fields by default."""
     return SkyMap(
         round(HALF_WIDTH * UNIT, 1),
         round(HALF_HEIGHT * UNIT, 1),
-        bins_of(fields.stars),
+        bins or bins_of(fields.stars),
         _meridians(),
         _parallels(),
         _milky_way(),

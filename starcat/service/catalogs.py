@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import numpy as np
 from cachetools import LRUCache
 
 from starcat.catalog.parts import CATALOGS
@@ -23,7 +24,7 @@ from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
 from starcat.pipeline.guide_stars import MOST_FIELD_STARS
-from starcat.pipeline.starter import Starter, starter_spec
+from starcat.pipeline.starter import Starter, enough_limit, starter_spec
 from starcat.service.jobs.keys import source_files
 from starcat.service.problems import Problem
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -87,6 +88,7 @@ class Catalogs:
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
+        self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
         self._slots = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
         self._underway: dict[str, Future[CatalogSnapshot]] = {}
@@ -135,6 +137,19 @@ class Catalogs:
                 sky=sky,
                 most_field_stars=MOST_FIELD_STARS,
             )
+
+    def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
+        """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
+        key = self._key(spec)
+        part = (key, "limit", spec.camera.model_dump_json(), spec.boresights.model_dump_json())
+        found = self._cached(self._limits, part)
+        if found is None:
+            read = self.read(spec, key)
+            with self._slot():
+                deepest = read.magnitudes[1] if read.magnitudes else np.inf
+                found = enough_limit(read.stars, spec), deepest
+            self._cache(self._limits, part, found)
+        return found
 
     def read(self, spec: BuildSpec, key: str | None = None) -> CatalogSnapshot:
         """Return the catalogs of a spec; read them where that was not done yet."""

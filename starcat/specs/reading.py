@@ -143,11 +143,19 @@ def what_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
 ) -> ConfigError:
     """Return the error about the first wrong key; a misspelt one first, since it is missing too."""
-    wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
-    first = wrong[0]
-    key = ".".join(_shown_key(str(part)) for part in first["loc"]) or kind
-    text = _explain(dict(first), model, kind)
-    return ConfigError(f"{origin}: {key}: {text}", key=key, value=first["input"])
+    return all_that_is_wrong(error, origin, model, kind)[0]
+
+
+def all_that_is_wrong(
+    error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
+) -> list[ConfigError]:
+    """Return an error about each wrong key, in the order of `what_is_wrong`."""
+    found = []
+    for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
+        key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or kind
+        text = _explain(dict(entry), model, kind)
+        found.append(ConfigError(f"{origin}: {key}: {text}", key=key, value=entry["input"]))
+    return found
 
 
 def _shown_key(name: str) -> str:

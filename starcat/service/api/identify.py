@@ -218,6 +218,8 @@ def identify_upload(
     frames: FrameUpload,
     options: IdentifyOptions,
     kind: Kind | None,
+    *,
+    for_page: bool = False,
 ) -> tuple[dict[str, Any], bytes]:
     """Identify frames in the sandbox; return the answers and the picture of the first."""
     artifact = service.library.find(database).folder
@@ -230,6 +232,7 @@ def identify_upload(
             "artifact": str(artifact),
             "options": options.model_dump(),
             "picture": kind,
+            "for_page": for_page,
         }
         found = service.sandbox.call("identify", arguments)
         drawn = folder / f"picture.{kind}"

@@ -24,6 +24,7 @@ from starcat.service.security.request_limits import GIB, check_disk
 from starcat.service.service import Service
 from starcat.service.settings import Role
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.product_sections import version_numbers
 from starcat.specs.reading import spec_from_dict
 
 Format = Literal["parquet", "hats"]
@@ -85,9 +86,36 @@ class Submitted:
 
 def submit_build(service: Service, spec: BuildSpec, owner: str) -> Submitted:
     """Have a database built."""
-    key = build_key(service.records, spec)
+    key = check_title(service, spec)
     title = f"{spec.name} {spec.version}"
     return submit(service, "build", {"spec": spec.recorded()}, key, title, owner)
+
+
+def check_title(service: Service, spec: BuildSpec) -> str:
+    """Return the key of a build, unless another database has its name and version.
+
+    The same database may be asked for again; a job that waits or runs has its name already.
+    """
+    key = build_key(service.records, spec)
+    taken = {(one.version, one.id) for one in service.library.databases() if one.name == spec.name}
+    for row in service.records.rows(
+        "SELECT title, key FROM jobs WHERE kind = 'build' AND state IN ('queued', 'running')"
+    ):
+        name, _, version = str(row["title"]).rpartition(" ")
+        if name == spec.name:
+            taken.add((version, str(row["key"])[:16]))
+    versions = {version for version, _ in taken}
+    if spec.version not in versions or (spec.version, key[:16]) in taken:
+        return key
+    *first, last = version_numbers(spec.version)
+    while (free := ".".join(map(str, (*first, last)))) in versions:
+        last += 1
+    raise Problem(
+        409,
+        f"{spec.name} {spec.version} is there already, made from another spec or other files; "
+        f"choose another version, such as {free}, or another name",
+        key="version",
+    )
 
 
 def submit_ingest(
@@ -133,7 +161,7 @@ def submit_evaluation(
         "seed": test.seed if seed is None else seed,
     }
     key = key_of("evaluate", request)
-    return submit(service, "evaluate", request, key, f"{database.title} self-test", owner)
+    return submit(service, "evaluate", request, key, f"{database.title} evaluated", owner)
 
 
 def submit(
@@ -186,7 +214,7 @@ def _check_waiting(service: Service, connection: sqlite3.Connection, owner: str)
 def _has_result(service: Service, job: Job) -> bool:
     result = job.result or {}
     if job.kind == "evaluate":
-        return "rates" in result
+        return "curves" in result
     if job.kind == "ingest":
         name = str(result.get("catalog", ""))
         return bool(name) and (service.paths.catalogs / Path(name).name).exists()

@@ -47,6 +47,9 @@ STAGES_A_SECOND = 4.0
 MAX_LINE = 2000
 """Characters of a line of the log that are kept."""
 
+MOST_CURVE_FRAMES = 200
+"""Frames of a point of the curves that an evaluation draws."""
+
 NO_THREAD = "can't start new thread"
 """What Python says where there is no memory for the stack of a thread."""
 
@@ -182,6 +185,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 
 def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    from starcat.evaluation.curves import measure_curves
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test
 
@@ -198,7 +202,18 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         progress,
         noise_mag=float(asked["noise_mag"]),
     )
-    return {"database": database.id, "rates": [each.as_dict() for each in rates]}
+    clean = rates[0]
+    log(
+        "info",
+        f"{clean.identified} of {clean.frames} clean pointings were identified, "
+        f"{clean.wrong} wrongly",
+    )
+    few = max(1, min(MOST_CURVE_FRAMES, int(asked["frames"])))
+    log("info", f"{few} frames for each point of the curves")
+    curves = measure_curves(database.folder, order.work, few, int(asked["seed"]), progress)
+    return {
+        "database": database.id, "rates": [each.as_dict() for each in rates], "curves": curves
+    }  # fmt: skip
 
 
 _DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
@@ -211,7 +226,7 @@ _DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
 _NEEDS: Mapping[Kind, tuple[str, ...]] = {
     "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
     "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
-    "evaluate": ("starcat.simulation.selftest",),
+    "evaluate": ("starcat.simulation.selftest", "starcat.evaluation.curves"),
 }
 
 

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from starcat.service.pages import console, databases, home, identify, jobs, new, releases, rendering
+from starcat.service.pages import (
+    console,
+    databases,
+    downloads,
+    home,
+    identify,
+    jobs,
+    new,
+    releases,
+    rendering,
+    sky,
+)
 
 ROUTERS: tuple[APIRouter, ...] = (
     rendering.static_router,
@@ -15,5 +26,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     console.router,
     identify.router,
     releases.router,
+    sky.router,
+    downloads.router,
 )
 """Routers of the page, in the order in which they are asked."""

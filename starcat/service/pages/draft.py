@@ -6,19 +6,22 @@ it has fields for and leaves all others; with a text that was edited, the fields
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import tomlkit
+from pydantic import ValidationError
 from tomlkit.exceptions import TOMLKitError
 
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
+from starcat.service.pages.naming import followed, value_at
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import content_of_toml, put_key, spec_from_dict
+from starcat.specs.reading import all_that_is_wrong, content_of_toml, put_key, spec_from_dict
 
 ORIGIN = "spec"  # what messages call the text
 TEXT = "toml"
@@ -29,6 +32,7 @@ ENABLED = "enabled"
 FIELDS = (
     "name",
     "version",
+    "description",
     "epoch_jyear",
     "catalog.source",
     "catalog.band",
@@ -75,18 +79,29 @@ class Draft:
     lens: str  # "field" or "focal": the camera is told by its field, or by its lens
     products: dict[str, bool]  # which are made
     bands: tuple[str, ...]  # of the catalog
+    content: Mapping[str, Any]  # what the text says; nothing where it cannot be read
     spec: BuildSpec | None  # None: something is wrong
-    error: ConfigError | None
+    wrong: tuple[ConfigError, ...] = ()
+
+    @property
+    def error(self) -> ConfigError | None:
+        """The first of what is wrong."""
+        return self.wrong[0] if self.wrong else None
 
     @property
     def errors(self) -> dict[str, str]:
         """What is wrong by the field that it is said beside; by `TEXT` where there is none."""
-        if self.error is None:
-            return {}
-        key = self.error.key or ""
+        found: dict[str, str] = {}
+        for error in self.wrong:
+            for key, words in self._beside(error).items():
+                found.setdefault(key, words)
+        return found
+
+    def _beside(self, error: ConfigError) -> dict[str, str]:
+        key = error.key or ""
         named = [name for name in self.values if name == key]
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
-        words = str(self.error).removeprefix(f"{ORIGIN}: ")
+        words = str(error).removeprefix(f"{ORIGIN}: ")
         told = [name for name in inside if name.rpartition(".")[2] in words]
         told.sort(key=lambda name: words.index(name.rpartition(".")[2]))
         return {(named or told or [TEXT])[0]: words}
@@ -116,7 +131,29 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
         edit = _edit(content, form)
     except ConfigError as error:
         return _draft(content, before, ConfigError(str(error), key=TEXT))
-    return _draft(edit.content, edit.text(before)) if edit.changes else known
+    return _edited(known, edit)
+
+
+def draft_with(draft: Draft, changes: Mapping[str, Any]) -> Draft:
+    """Return a draft with other values of some keys; None removes one."""
+    edit = _Edit(copy.deepcopy(dict(draft.content)))
+    for path, value in changes.items():
+        if value != value_at(edit.content, path):
+            edit.put(path, value)
+    return _edited(draft, edit)
+
+
+def _edited(draft: Draft, edit: _Edit) -> Draft:
+    """Return a draft as it was edited; its name and description follow unless they are somebody's.
+
+    What starcat has called it tells the catalog, the limit and the camera: it would be wrong.
+    """
+    if not edit.changes:
+        return draft
+    for key, value in followed(edit.content).items():
+        if key not in edit.changes:
+            edit.put(key, value)
+    return _draft(edit.content, edit.text(draft.text))
 
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
@@ -139,7 +176,7 @@ def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a spec that are not as by default."""
     kept: dict[str, Any] = {}
     for path, key in _KEYS.items():
-        value = _at(content, path)
+        value = value_at(content, path)
         if value is not None and (key.default is REQUIRED or value != key.default):
             put_key(kept, path, value)
     return kept
@@ -147,22 +184,28 @@ def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = None) -> Draft:
     spec = None
+    wrong: tuple[ConfigError, ...] = () if error is None else (error,)
     if error is None:
         try:
             spec = spec_from_dict(dict(content), ORIGIN)
         except ConfigError as found:
-            error = found
-    has_focal = any(_at(content, key) is not None for key in _OF_LENS["field"])
-    enabled = {name: _at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS}
-    source = _at(content, "catalog.source")
+            wrong = (found,)
+            if isinstance(found.__cause__, ValidationError):
+                wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN))
+    has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
+    enabled = {
+        name: value_at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS
+    }
+    source = value_at(content, "catalog.source")
     return Draft(
         text=text,
         values={key: _shown(key, content) for key in FIELDS},
         lens="focal" if has_focal else "field",
         products=enabled,
         bands=bands_of(source) if isinstance(source, str) else (),
+        content=content,
         spec=spec,
-        error=error,
+        wrong=wrong,
     )
 
 
@@ -177,7 +220,7 @@ def bands_of(source: str) -> tuple[str, ...]:
 
 
 def _shown(key: str, content: Mapping[str, Any]) -> str:
-    value = _at(content, key)
+    value = value_at(content, key)
     if value is None:
         default = _KEYS[key].default
         value = "" if default is REQUIRED or default is None else default
@@ -197,7 +240,7 @@ class _Edit:
 
     def put(self, path: str, value: Any) -> None:
         """Change a key; None removes it."""
-        if value is not None or _at(self.content, path) is not None:
+        if value is not None or value_at(self.content, path) is not None:
             put_key(self.content, path, value)
             self.changes[path] = value
 
@@ -217,13 +260,13 @@ class _Edit:
 
 def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
     edit = _Edit(content)
-    source = _at(content, "catalog.source")
+    source = value_at(content, "catalog.source")
     for key in FIELDS:
         if key in form and form[key].strip() != _shown(key, content):
             edit.put(key, _typed(key, form[key].strip()))
     if form.get("catalog.source", source) != source:
         bands = bands_of(form["catalog.source"])
-        if _at(content, "catalog.band") not in bands:
+        if value_at(content, "catalog.band") not in bands:
             edit.put("catalog.band", bands[0] if bands else None)
     lens = form.get(LENS)
     if lens in _OF_LENS:
@@ -231,7 +274,7 @@ def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
     if "products" in form:
         for name in PRODUCTS:
             is_wanted = f"products.{name}.{ENABLED}" in form
-            if is_wanted != (_at(content, f"products.{name}.{ENABLED}") is not False):
+            if is_wanted != (value_at(content, f"products.{name}.{ENABLED}") is not False):
                 edit.put(f"products.{name}.{ENABLED}", None if is_wanted else False)
     return edit
 
@@ -255,7 +298,7 @@ def _change_lens(edit: _Edit, lens: str) -> None:
 
 
 def _number(content: Mapping[str, Any], key: str) -> float | None:
-    value = _at(content, key)
+    value = value_at(content, key)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and value > 0 and math.isfinite(value) else None
 
@@ -269,12 +312,3 @@ def _typed(key: str, text: str) -> Any:
     except ValueError:
         return text[:200]
     return text or None
-
-
-def _at(content: Mapping[str, Any], path: str) -> Any:
-    value: Any = content
-    for name in path.split("."):
-        if not isinstance(value, Mapping):
-            return None
-        value = value.get(name)
-    return value

@@ -6,7 +6,10 @@ import base64
 import io
 import math
 import re
-from typing import Annotated, Any
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request
 from fastapi.responses import Response
@@ -14,8 +17,9 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
+from starcat.geometry.camera import Camera
 from starcat.images.render import write_simulated
-from starcat.images.solve_files import IdentifyOptions
+from starcat.images.solve_files import FOV_ERROR_OF_IMAGES, IdentifyOptions
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -27,11 +31,16 @@ from starcat.service.api.identify import (
     identify_upload,
 )
 from starcat.service.library import Database
-from starcat.service.pages.rendering import page_router, render
-from starcat.service.problems import Problem, problem_of
+from starcat.service.pages.answers import Shown, ShownFrame, marks_of, shown_frames, unusable_frame
+from starcat.service.pages.notebook import Notebook, identify_code
+from starcat.service.pages.rendering import address_of, page_router, render
+from starcat.service.pages.sky import view_of
+from starcat.service.pages.wording import page_problem
+from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import scratch_folder
 from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.specs.camera_file import camera_toml, parse_camera
 
 router = page_router()
 
@@ -39,46 +48,105 @@ MAX_SEED = 2**31 - 1
 MAX_PIXELS = 2**23  # frames with more are given as centroids, not as pictures
 NOISE_PX = 0.3  # noise of a centroid, each axis
 
+CAMERA = ("width_px", "height_px", "fov_x_deg", "focal_length_mm", "pixel_um")
+"""Fields of another camera, named ``camera.`` and this."""
+
 FIELDS = (
-    "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
+    "database", "method", "field_error", "fov_from", "fov_to", "tolerance_px", "time",
+    "centroids", "brightness", "seed", "lens", "camera.flip", "camera_file",
+    *(f"camera.{name}" for name in CAMERA),
 )  # fmt: skip
 """Fields of the form that are texts."""
 
+MOST_FILES = 50  # pictures at once
+
 
 @router.get("/identify")
-def identify_page(
-    request: Request,
-    service: TheService,
-    _: Reader,
-    database: Annotated[str, Query(max_length=64)] = "",
-) -> Response:
-    """Show the form."""
-    return _page(request, service, {"database": database})
+async def identify_page(request: Request, service: TheService, _: Reader) -> Response:
+    """Show the form; an address that holds a frame is answered."""
+    given = {name: request.query_params.get(name, "")[:MIB] for name in FIELDS}
+    if not (given["centroids"] or given["seed"]):
+        return await run_in_threadpool(_page, request, service, given)
+    return await _answered(request, service, FormData(), given)
 
 
 @router.post("/identify")
 async def identify(request: Request, service: TheService, _: Reader) -> Response:
-    """Identify the frame of a form, and show the form again with the answer."""
-    async with request.form(max_files=1, max_fields=20) as form:
+    """Identify the frames of a form, and show the form again with the answer."""
+    async with request.form(max_files=MOST_FILES, max_fields=40) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
-        try:
-            answer = await service.sandbox.run(_answer, service, form, given)
-        except (StarcatError, Problem) as error:
-            answer = {"problem": problem_of(error)}
+        return await _answered(request, service, form, given)
+
+
+async def _answered(
+    request: Request, service: Service, form: FormData, given: dict[str, str]
+) -> Response:
+    try:
+        answer = await service.sandbox.run(_answer, service, form, given)
+    except (StarcatError, Problem) as error:
+        answer = {"problem": page_problem(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
 
 
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
     database = service.library.database(given["database"])
-    frame, options = frame_of(form, given, database, service), options_of(given, service)
-    found, picture = identify_upload(service, database.id, frame, options, "png")
-    first = found["frames"][0]
+    uploads = frames_of(form, given, database, service)
+    options = options_of(given, service, database)
+    epoch_jyear = float(database.manifest["epoch_jyear"])
+    until_s = time.monotonic() + service.settings.query_time_s
+    frames: list[ShownFrame] = []
+    method, picture = "", b""
+    for upload in uploads:
+        if time.monotonic() > until_s:
+            frames.append(unusable_frame(upload.name, "not looked at, the others took the time"))
+            continue
+        kind: Literal["png"] | None = None if picture else "png"
+        try:
+            found, drawn = identify_upload(
+                service, database.id, upload, options, kind, for_page=True
+            )
+        except (StarcatError, Problem) as error:
+            if len(uploads) == 1:
+                raise
+            frames.append(unusable_frame(upload.name, page_problem(error).detail))
+            continue
+        method, picture = found["method"], picture or drawn
+        frames += shown_frames(found, given, epoch_jyear)
+    shown = Shown(database.title, method, frames)
+    camera = camera_of(given, database) or database.camera
+    first = shown.first.content
     return {
-        "found": found,
+        "shown": shown,
         "picture": _address(picture),
-        "errors": _errors(first),
-        "field_deg": _field_deg(first, database),
+        "errors_arcsec": _errors(first),
+        "field_deg": _field_deg(first, camera),
+        "view": _view(shown.first, database, camera),
+        "options": _options_told(options, shown.first),
     }
+
+
+def _options_told(options: IdentifyOptions, frame: ShownFrame) -> dict[str, Any]:
+    """Return the options of a frame as a program states them."""
+    told = options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
+    if frame.is_loose and not {"fov_error", "fov_deg"} & set(told):
+        told["fov_error"] = FOV_ERROR_OF_IMAGES
+    return told
+
+
+def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:
+    """Return what the view of the sky is told of an answer."""
+    content = frame.content
+    if content["status"] != "identified":
+        return None
+    found = camera.with_focal_length(float(content["focal_length_px"]))
+    ra, dec, roll = (content[f"{name}_deg"] for name in ("boresight_ra", "boresight_dec", "roll"))
+    return view_of(
+        database,
+        found,
+        frame={"ra": ra, "dec": dec, "roll": roll},
+        at={"ra": ra, "dec": dec, "size": min(2.2 * found.fov_x_deg, 360.0)},
+        marks=marks_of(frame),
+    )
 
 
 @router.get("/identify/frame/{database_id}")
@@ -100,32 +168,48 @@ async def simulated_frame(
 def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
     databases = service.library.databases()
     problem = answer.get("problem")
-    nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
+    nothing = dict.fromkeys(("shown", "picture", "problem", "errors_arcsec", "field_deg", "view"))
+    chosen = next((one for one in databases if one.id == given["database"]), None)
+    camera = (chosen or databases[0]).camera if databases else None
+    shown: Shown | None = answer.get("shown")
+    notebook = None
+    if shown is not None and shown.first.measured and chosen is not None:
+        asked = shown.first.measured, answer.pop("options")
+        code = identify_code(address_of(request, service), chosen.id, *asked)
+        notebook = Notebook(f"{shown.first.content['frame']}-answer", code)
     return render(
         request,
         "identify.html",
         status=problem.status if problem else 200,
         databases=[(one.id, one.title) for one in databases],
         methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
-        given={**dict.fromkeys(FIELDS, ""), **given},
+        given=given,
+        placeholders={
+            name: f"{getattr(camera, name):.6g}" for name in ("width_px", "height_px", "fov_x_deg")
+        }
+        if camera
+        else {},
+        errors={problem.key: problem.detail} if problem and problem.key else {},
         suffixes=",".join(SUFFIXES),
         most_mib=service.settings.upload_mib,
+        most_files=MOST_FILES,
+        notebook=notebook,
         **{**nothing, **answer},
     )
 
 
-def frame_of(
+def frames_of(
     form: FormData, given: dict[str, str], database: Database, service: Service
-) -> FrameUpload:
-    """Return the frame that a form brings."""
+) -> list[FrameUpload]:
+    """Return the files of frames that a form brings."""
     if given["seed"]:
         number = _number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
         name = f"simulated-{seed}{frame_suffix(database)}"
-        return FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))
-    upload = form.get("file")
-    if isinstance(upload, UploadFile) and upload.filename:
-        return FrameUpload.of_form(upload, service.settings.upload_mib)
+        return [FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))]
+    uploads = [one for one in form.getlist("file") if isinstance(one, UploadFile) and one.filename]
+    if uploads:
+        return [FrameUpload.of_form(one, service.settings.upload_mib) for one in uploads]
     if not given["centroids"].strip():
         raise Problem(
             422,
@@ -135,20 +219,57 @@ def frame_of(
         )
     third = "mag" if given["brightness"] == "mag" else "flux"
     suffix, text = centroid_file(given["centroids"], third)
-    return FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))
+    return [FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))]
 
 
-def options_of(given: dict[str, str], service: Service) -> IdentifyOptions:
+def options_of(given: dict[str, str], service: Service, database: Database) -> IdentifyOptions:
     """Return how a frame is to be identified."""
     percent = _number(given["field_error"], "field_error")
+    ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
+    if (ends[0] is None) != (ends[1] is None):
+        missing = "fov_from" if ends[0] is None else "fov_to"
+        raise Problem(
+            422, "give both ends of the range of fields, or leave both empty", key=missing
+        )
+    camera = camera_of(given, database)
     content = {
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
+        "fov_deg": None if ends[0] is None else ends,
         "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
+        "flip": True if given["camera.flip"] else None,
+        "time": given["time"].strip() or None,
+        "camera": None if camera is None else camera_toml(camera),
     }
     return checked_options(content).model_copy(
         update={"time_limit_s": service.settings.query_time_s}
     )
+
+
+def camera_of(given: Mapping[str, str], database: Database) -> Camera | None:
+    """Return the camera that a form describes; None for that of the database.
+
+    A size that is not given is that of the database, and so is the focal length.
+    """
+    if given["camera_file"].strip():
+        return parse_camera(given["camera_file"], Path("camera file"))
+    scale = CAMERA[3:] if given["lens"] == "focal" else CAMERA[2:3]
+    told = {name: _number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale}
+    if all(value is None for value in told.values()):
+        return None
+    own = database.camera
+    size = {name: value or getattr(own, name) for name, value in told.items() if name in CAMERA[:2]}
+    lens = {name: value for name in scale if (value := told[name]) is not None}
+    values = {**size, **(lens or {"focal_length_px": own.focal_length_px})}
+    lines = [f"{name} = {_toml_number(float(value))}" for name, value in values.items()]
+    try:
+        return parse_camera("\n".join(lines), Path("camera"))
+    except ConfigError as error:
+        raise Problem(422, str(error), key=f"camera.{error.key or CAMERA[0]}") from None
+
+
+def _toml_number(value: float) -> str:
+    return str(int(value)) if value.is_integer() else repr(value)
 
 
 def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
@@ -180,12 +301,12 @@ def _errors(answer: dict[str, Any]) -> list[str] | None:
     return known if len(known) == 3 else None
 
 
-def _field_deg(answer: dict[str, Any], database: Database) -> float | None:
+def _field_deg(answer: dict[str, Any], camera: Camera) -> float | None:
     """Return the full angle across the width, degrees, by the focal length that was found."""
     focal_length_px = answer.get("focal_length_px")
     if not focal_length_px:
         return None
-    half = 0.5 * database.camera.width_px / float(focal_length_px)
+    half = 0.5 * camera.width_px / float(focal_length_px)
     return 2.0 * math.degrees(math.atan(half))
 
 

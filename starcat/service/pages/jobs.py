@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
@@ -34,7 +35,10 @@ STEPS = {
         ("Read the catalog", ("read", "rows")),
         ("Write the stars", ("store", "margins", "write")),
     ),
-    "evaluate": (("Identify simulated frames", ("self-test", "build")),),
+    "evaluate": (
+        ("Identify simulated frames", ("self-test", "build")),
+        ("Curves against noise, false and missing stars", ("curves",)),
+    ),
 }
 """What people see of the stages of each kind of job: a name, and first words of stages."""
 
@@ -84,6 +88,9 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
         took=took_s(job),
         progress=progress_text(job),
         may_change=may_change(job, who),
+        rates=(job.result or {}).get("rates", []),
+        charts=charts_of(job),
+        chart=(CHART_WIDTH, CHART_HEIGHT),
     )
 
 
@@ -125,8 +132,64 @@ def facts_of(job: Job) -> list[tuple[str, str]]:
     return [
         (name.replace("_", " "), str(value))
         for name, value in facts.items()
-        if value is not None and name not in ("spec", "rates")
+        if value is not None and name not in ("spec", "rates", "curves")
     ]
+
+
+CHART_WIDTH, CHART_HEIGHT = 300.0, 150.0
+"""Of the area of a curve; its labels are outside of it."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A point of a curve, where it is drawn."""
+
+    x: float
+    y: float
+    low_y: float  # ends of the interval
+    high_y: float
+    value: float  # of the quantity
+    told: Mapping[str, Any]  # the share
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A curve as it is drawn: 0 to 100 % upwards."""
+
+    label: str
+    held: str  # what the other quantities are held at, where that is not nothing
+    marks: list[Mark]
+
+    @property
+    def line(self) -> str:
+        """Points of the line."""
+        return " ".join(f"{mark.x:.1f},{mark.y:.1f}" for mark in self.marks)
+
+
+def charts_of(job: Job) -> list[Chart]:
+    """Return the curves of an evaluation."""
+    return [_chart(curve) for curve in (job.result or {}).get("curves", ())]
+
+
+def _chart(curve: Mapping[str, Any]) -> Chart:
+    points = curve["points"]
+    most = max(point["x"] for point in points) or 1.0
+
+    def y(percent: float | None) -> float:
+        return CHART_HEIGHT * (1.0 - (percent or 0.0) / 100.0)
+
+    marks = [
+        Mark(
+            CHART_WIDTH * point["x"] / most,
+            y(point["percent"]),
+            y(point["low_percent"]),
+            y(point["high_percent"]),
+            point["x"],
+            point,
+        )
+        for point in points
+    ]
+    return Chart(curve["label"], curve["held"], marks)
 
 
 def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-import base64
-from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Any
+from urllib.parse import quote
 
-import numpy as np
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import ValidationError
 
-from starcat.arrays import Array
-from starcat.errors import StarcatError
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
-from starcat.pipeline.estimate import Estimate
-from starcat.report.coverage_map import (
-    Bin,
-    Counts,
-    Fields,
-    SkyMap,
-    bins_of,
-    nearest_raster,
-    raster_png,
-    sky_map,
-)
+from starcat.catalog.source import data_source
+from starcat.errors import SourceMissing, StarcatError
+from starcat.pipeline.starter import advice
 from starcat.service.access import Reader, principal_of
-from starcat.service.jobs.submission import submit_build
+from starcat.service.catalogs import is_here
+from starcat.service.jobs.submission import check_title, submit_build
+from starcat.service.pages.design import (
+    PINNED,
+    PRESET,
+    differences,
+    draft_of_query,
+    pinned_draft,
+    query_of,
+)
 from starcat.service.pages.draft import (
+    PRODUCTS,
     TEXT,
     Draft,
     draft_of_content,
     draft_of_form,
+    draft_with,
     without_defaults,
 )
+from starcat.service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_of
 from starcat.service.pages.rendering import (
     ENVIRONMENT,
     count_text,
@@ -42,16 +41,15 @@ from starcat.service.pages.rendering import (
     render,
     size_text,
 )
-from starcat.service.problems import Problem, ProblemDetails, problem_of
+from starcat.service.pages.wording import page_problem
+from starcat.service.problems import Problem, ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
+from starcat.specs.build_spec import CameraSpec
 from starcat.specs.reading import preset, preset_names
 
-MOST_FIELDS = 100  # fields of a form; this one has 30
-MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
-MOST_BARS = 48
-MOST_MAPPED = 50_000
-"""Of more boresights than these no map is drawn: their fields would be finer than its dots."""
+MOST_FIELDS = 100  # fields of a form; this one has 33
+MOST_KEYS = 200  # of an address
 
 router = page_router()
 
@@ -70,65 +68,64 @@ def new_page(
     request: Request,
     service: TheService,
     _: Reader,
-    chosen: Annotated[str | None, Query(alias="preset")] = None,
+    chosen: Annotated[str, Query(alias=PRESET)] = "",
+    pinned: Annotated[str, Query()] = "",
     job: Annotated[str | None, Query()] = None,
     database: Annotated[str | None, Query()] = None,
 ) -> Response:
-    """Show the form with a preset, or with the spec of a job or of a database."""
-    if job is not None:
-        spec = service.jobs.get(job).request.get("spec")
-    elif database is not None:
-        spec = service.library.database(database).manifest["spec"]
+    """Show the form with the design of the address, or with that of a job or of a database."""
+    if job is None and database is None:
+        draft = draft_of_query(dict(request.query_params.multi_items()[:MOST_KEYS]))
     else:
-        chosen = chosen or preset_names()[0]
-        spec = preset(chosen).recorded()
+        draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
+    # A page that waits for no catalog is there at once; its script asks for the estimate.
+    form = {PRESET: chosen or preset_names()[0], PINNED: pinned}
+    return _page(request, service, draft, form, is_first=True)
+
+
+def _spec_of(service: Service, job: str | None, database: str | None) -> dict[str, Any]:
+    if job is None:
+        return dict(service.library.database(database or "").manifest["spec"])
+    spec = service.jobs.get(job).request.get("spec")
     if spec is None:
         raise Problem(404, f"job {job} builds nothing; choose one that does")
-    # A page that waits for no catalog is there at once; its script asks for the estimate.
-    return _page(
-        request, service, draft_of_content(without_defaults(spec)), chosen or "", is_first=True
-    )
+    return dict(spec)
 
 
 @router.post("/new")
 def sent_page(request: Request, service: TheService, form: Form, _: Reader) -> Response:
     """Build what the form has, or show what it would give."""
-    draft = draft_of_form(form)
+    draft, told = _asked(service, form)
     if form.get("do") != "build" or draft.spec is None:
-        return _page(request, service, draft, form.get("preset", ""))
+        return _page(request, service, draft, form, told)
     who = principal_of(request)
     try:
         if who.role < Role.BUILDER:
-            raise Problem(
-                403,
-                "building needs the role builder; sign in with a token that has it "
-                "('starcat token create --role builder')",
-            )
+            raise Problem(403, "building needs the role builder; sign in with a token that has it")
         job = submit_build(service, draft.spec, who.name).job
     except (StarcatError, Problem) as error:
-        return _page(request, service, draft, form.get("preset", ""), error)
+        return _page(request, service, draft, form, refused=page_problem(error))
     return RedirectResponse(f"/jobs/{job.id}", 303)
 
 
 @router.post("/new/preview")
 def preview(request: Request, service: TheService, form: Form, _: Reader) -> Response:
     """Tell a script what the form has become, and what that would give."""
-    draft = draft_of_form(form)
-    seen, error = _preview(service, draft)
-    told = {"problem": error and error.detail, "errors": draft.errors}
+    draft, told = _asked(service, form)
+    found = _shown(service, draft, form, told)
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
         "lens": draft.lens,
         "products": draft.products,
         "bands": draft.bands,
-        "errors": draft.errors,
-        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(told),
-        "result": ENVIRONMENT.get_template("new_result.html").render(preview=seen),
-        "summary": _summary(seen, draft, error),
-        "is_busy": error is not None and error.status == 503,
-        "is_known": seen is not None,
-        "stars": [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist(),
+        **{name: found[name] for name in ("errors", "summary", "address", "pinned_query")},
+        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(found),
+        "result": ENVIRONMENT.get_template("new_result.html").render(found),
+        "is_busy": found["is_busy"],
+        "is_known": found["preview"] is not None,
+        "can_build": found["can_build"],
+        "stars": _counts(found["preview"]),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
 
@@ -136,61 +133,209 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
 @router.get("/new/tiling")
 def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Response:
     """Tell a script where the fields of a tiling are."""
-    ra_deg, dec_deg = _tiling(count)
+    ra_deg, dec_deg = tiling_of(count)
     content = {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
     return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
+
+
+def _asked(service: Service, form: dict[str, str]) -> tuple[Draft, list[str]]:
+    """Return the design that a form asks for, and what is to be said of it."""
+    draft = draft_of_form(form)
+    if form.get("do") == "pin":
+        form[PINNED] = query_of(draft, form.get(PRESET, "")).removeprefix("?") or f"{PRESET}="
+    elif form.get("do") == "unpin":
+        form[PINNED] = ""
+    elif form.get("do") == "suggest":
+        try:
+            return suggested(service, draft)
+        except (StarcatError, Problem) as error:
+            return draft, [f"No limits can be suggested: {page_problem(error).detail}"]
+    return draft, []
+
+
+def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
+    """Return a design with the limits that its camera needs, and what is to be said of them."""
+    try:
+        camera = CameraSpec.model_validate(draft.content.get("camera"))
+    except ValidationError:
+        return draft, ["No limits can be suggested before the fields of the camera are right."]
+    starter = service.catalogs.starter("camera", camera)
+    limit = starter.spec.selection.faint_limit_mag
+    if draft.spec is not None and draft.spec.catalog.source != starter.spec.catalog.source:
+        limit, _ = service.catalogs.enough_limit(draft.spec)
+    selection, boresights = starter.spec.selection, starter.spec.boresights
+    changes: dict[str, Any] = {
+        "selection.faint_limit_mag": limit,
+        "selection.max_stars_per_field": selection.max_stars_per_field,
+        "selection.doubles.min_separation_deg": selection.doubles.min_separation_deg,
+        "selection.doubles.max_delta_mag": selection.doubles.max_delta_mag,
+        "boresights.count": boresights.count,
+        "boresights.brightest": boresights.brightest,
+    }
+    for name in PRODUCTS:
+        changes[f"products.{name}.enabled"] = False if name in starter.left_out else None
+    fov = camera.camera()
+    told = (
+        f"For {fov.fov_x_deg:.4g} x {fov.fov_y_deg:.4g} deg: faint limit {limit:g}, the "
+        f"{selection.max_stars_per_field} brightest of each field, "
+        f"{count_text(boresights.count)} boresights."
+    )
+    return draft_with(draft, changes), [told, *(f"{one}." for one in advice(starter))]
+
+
+def _shown(
+    service: Service, draft: Draft, form: dict[str, str], told: list[str] | None = None
+) -> dict[str, Any]:
+    """Return what page and script are told of a design and of what it would give."""
+    errors, problem = dict(draft.errors), None
+    seen, found = _preview(service, draft)
+    if found is not None and found.key in draft.values:
+        errors[found.key] = found.detail
+    else:
+        problem = found
+    if draft.spec is not None:
+        errors |= _taken(service, draft)
+    is_refused = seen is not None and bool(seen.estimate.refusals)
+    is_busy = problem is not None and problem.status == 503
+    return {
+        "preview": seen,
+        "problem": problem and problem.detail,
+        "errors": errors,
+        "told": told or [],
+        "summary": _summary(seen, errors, problem),
+        "is_busy": is_busy,
+        "can_build": not errors and not is_refused and (problem is None or is_busy),
+        "address": _address(draft, form),
+        "pinned_query": form.get(PINNED, ""),
+        **_pinned(service, draft, form),
+    }
+
+
+def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+    """Return what a page is told of a design of which no estimate was made yet."""
+    errors = draft.errors | (_taken(service, draft) if draft.spec else {})
+    return {
+        **dict.fromkeys(("preview", "pinned", "problem")),
+        "errors": errors,
+        "told": [],
+        "differing": [],
+        "summary": "",
+        "can_build": not errors,
+        "address": _address(draft, form),
+        "pinned_query": form.get(PINNED, ""),
+    }
+
+
+def _address(draft: Draft, form: dict[str, str]) -> str:
+    return f"/new{query_of(draft, form.get(PRESET, ''), form.get(PINNED, ''))}"
+
+
+def _taken(service: Service, draft: Draft) -> dict[str, str]:
+    """Return the error where a database of this name and version is there already."""
+    try:
+        if draft.spec is not None:
+            check_title(service, draft.spec)
+    except Problem as error:
+        return {error.key or TEXT: error.detail}
+    except StarcatError:
+        pass  # its catalog is missing, which is said elsewhere
+    return {}
 
 
 def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
     if draft.spec is None:
         return None, None
     try:
-        return preview_of(service.catalogs.estimate(draft.spec)), None
+        return preview_of(service.catalogs, draft.spec), None
+    except SourceMissing as error:
+        return None, page_problem(error).model_copy(update={"key": "catalog.source"})
     except (StarcatError, Problem) as error:
-        return None, problem_of(error)
+        return None, page_problem(error)
+
+
+def _pinned(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+    """Return what is told of the design that is pinned, to compare this one with it."""
+    query = form.get(PINNED, "")
+    if not query:
+        return {"pinned": None, "differing": []}
+    try:
+        other = pinned_draft(query)
+    except StarcatError:
+        return {"pinned": None, "differing": []}
+    return {"pinned": _preview(service, other)[0], "differing": differences(draft, other)}
+
+
+def _counts(seen: Preview | None) -> list[int]:
+    return [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist()
 
 
 def _page(
     request: Request,
     service: Service,
     draft: Draft,
-    chosen: str,
-    refused: StarcatError | Problem | None = None,
+    form: dict[str, str],
+    told: list[str] | None = None,
+    refused: ProblemDetails | None = None,
     *,
     is_first: bool = False,
 ) -> Response:
-    seen, error = (None, None) if is_first else _preview(service, draft)
-    problem = None if refused is None else problem_of(refused)
-    status = problem.status if problem else 422 if draft.errors else 200
+    found = _first(service, draft, form) if is_first else _shown(service, draft, form, told)
+    if refused is not None and refused.key in draft.values:
+        found["errors"][refused.key] = refused.detail
+        refused = None
+    status = refused.status if refused else 422 if found["errors"] else 200
     return render(
         request,
         "new.html",
         status=status,
+        **found,
         draft=draft,
-        preview=seen,
-        problem=error and error.detail,
-        errors=draft.errors,
-        refused=problem and problem.detail,
-        summary=_summary(seen, draft, error),
+        refused=refused and refused.detail,
         is_first=is_first,
-        presets=[(name, preset(name).description) for name in preset_names()],
-        chosen=chosen,
+        presets=_presets(),
+        chosen=form.get(PRESET, ""),
         sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
-        text_error=draft.errors.get(TEXT),
+        sign_in=f"/sign-in?next={quote(str(found['address']), safe='')}",
+        text_error=found["errors"].get(TEXT),
     )
 
 
-def _summary(seen: Preview | None, draft: Draft, problem: ProblemDetails | None) -> str:
+def _summary(seen: Preview | None, errors: dict[str, str], problem: ProblemDetails | None) -> str:
     if seen is None:
-        why = next(iter(draft.errors.values()), problem.detail if problem else "")
+        why = next(iter(errors.values()), problem.detail if problem else "")
         return f"No estimate: {why}" if why else ""
+    if errors:
+        return f"Cannot be built: {next(iter(errors.values()))}"
     found = seen.estimate
+    if found.refusals:
+        return f"Cannot be built: {found.refusals[0]}"
     stars = found.coverage.stars
     return (
         f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "
         f"field ({stars.minimum} to {stars.maximum}), {size_text(found.total_bytes)}, built in "
         f"about {duration_text(max(1.0, found.build_seconds))}"
+    )
+
+
+def _presets() -> list[tuple[str, str, str]]:
+    """Return name, description, and what is lacking, of the presets."""
+    found = []
+    for name in preset_names():
+        spec = preset(name)
+        missing = [source for source in spec.sources if not is_here(source)]
+        found.append((name, spec.description, lacking(missing) if missing else ""))
+    return found
+
+
+def lacking(sources: list[str]) -> str:
+    """Return what to say where the files of catalogs are not on the server."""
+    known = [(one, data_source(one).identifier.partition(";")[0]) for one in sources]
+    names = " and ".join(f"{one} ({identifier})" for one, identifier in known)
+    is_one = len(sources) == 1
+    return (
+        f"the files of {names} are not on this server; whoever runs it gets "
+        f"{'them' if is_one else 'each'} with starcat fetch {' and starcat fetch '.join(sources)}"
     )
 
 
@@ -201,70 +346,3 @@ def _sources(service: Service) -> list[tuple[str, str]]:
         told = one.source.identifier if one.is_here else "its files are not here"
         found.append((one.source.name, f"{one.source.name} – {told}"))
     return found
-
-
-# What a spec would give: sizes, a histogram, and the map of the sky.
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A bar of the histogram of stars in a field."""
-
-    least: int  # stars of a field
-    most: int
-    fields: int
-    colour: str  # class of the colour that the map has for them
-
-
-@dataclass(frozen=True)
-class Preview:
-    """What a spec would give."""
-
-    estimate: Estimate
-    files: list[tuple[str, int | None, int]]  # name, rows of a product, bytes; the largest first
-    bars: list[Bar]
-    map: SkyMap | None  # None: the tiling is too fine for a map
-    picture: str  # the raster, as an address that holds it
-
-
-def preview_of(estimate: Estimate) -> Preview:
-    """Return what the page shows of an estimate."""
-    counts = estimate.fields.count.astype(np.int64)
-    ra_deg, dec_deg = _tiling(len(counts))
-    none = np.zeros_like(counts)
-    fields = Fields(ra_deg, dec_deg, counts, none, none)
-    bins = bins_of(counts)
-    is_mapped = len(counts) <= MOST_MAPPED
-    return Preview(
-        estimate,
-        sorted(estimate.files, key=lambda file: (-file[2], file[0])),
-        _bars(counts, bins),
-        sky_map(fields) if is_mapped else None,
-        _picture(counts) if is_mapped else "",
-    )
-
-
-@lru_cache(maxsize=4)
-def _tiling(count: int) -> tuple[Array, Array]:
-    return radec_from_directions(saff_kuijlaars(count))
-
-
-def _bars(counts: Counts, bins: tuple[Bin, ...]) -> list[Bar]:
-    least, most = int(counts.min()), int(counts.max())
-    step = -(-(most - least + 1) // MOST_BARS)
-    fields = np.bincount((counts - least) // step)
-    bars = []
-    for low, count in zip(range(least, most + 1, step), fields.tolist(), strict=True):
-        colour = next((one.name for one in reversed(bins) if one.least <= low), bins[0].name)
-        bars.append(Bar(low, low + step - 1, count, colour))
-    return bars
-
-
-@lru_cache(maxsize=4)
-def _nearest(count: int) -> Array:
-    return nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
-
-
-def _picture(counts: Counts) -> str:
-    raster = raster_png(_nearest(len(counts)), counts)
-    return f"data:image/png;base64,{base64.b64encode(raster).decode()}"

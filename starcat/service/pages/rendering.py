@@ -17,7 +17,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.service.access import principal_of
+from starcat.service.pages.wording import in_page_words
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
+from starcat.service.service import Service
 from starcat.version import __version__
 
 NAVIGATION = (
@@ -128,6 +130,7 @@ def _environment() -> Environment:
         "duration": duration_text,
         "time": time_text,
         "moment": moment_text,
+        "plain": in_page_words,
     }
     environment.globals |= {
         "static": static_address,
@@ -145,10 +148,14 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
     page = ENVIRONMENT.get_template(template).render(
         principal=principal_of(request),
         path=request.url.path,
-        sign_in=sign_in_address(request),
-        **content,
+        **{"sign_in": sign_in_address(request), **content},
     )
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def address_of(request: Request, service: Service) -> str:
+    """Return the address of the service as whoever asks reaches it."""
+    return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
 def sign_in_address(request: Request) -> str:

@@ -1,26 +1,14 @@
-// Coverage of a database: the map tells its fields, a row of the table shows where its field is.
+// Coverage of a database: a row of the table leads to its field in the view of the sky.
 
-import { startMap } from "./sky.js";
-
-const figure = document.querySelector("figure.sky");
-const cross = figure.querySelector(".cross");
-
-startMap(figure, async () => {
-  const answer = await fetch(figure.dataset.sky);
-  if (!answer.ok) throw new Error(String(answer.status));
-  return answer.json();
-});
+const sky = document.querySelector(".skyview").sky;
 
 for (const row of document.querySelectorAll("#field-table tbody tr")) {
-  const show = () => {
-    cross.setAttribute("transform", `translate(${row.dataset.at})`);
-    cross.setAttribute("visibility", "visible");
-  };
-  const hide = () => cross.setAttribute("visibility", "hidden");
-  row.addEventListener("pointerenter", show);
-  row.addEventListener("pointerleave", hide);
-  row.addEventListener("focusin", show);
-  row.addEventListener("focusout", hide);
+  row.querySelector("th a").addEventListener("click", (event) => {
+    if (!sky.fields) return; // the address leads there too
+    event.preventDefault();
+    sky.show(Number(row.dataset.field));
+    sky.root.scrollIntoView({ block: "nearest" });
+  });
 }
 
 const order = document.getElementById("order");

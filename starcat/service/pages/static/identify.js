@@ -1,5 +1,8 @@
-// Identify: a file can be dropped, and it is said that the answer is being looked for.
+// Identify: files can be dropped, it is said that the answer is being looked for, and the address
+// becomes that of the answer.
 
+import { goTo } from "./address.js";
+import { startSliders } from "./sliders.js";
 import { announce } from "./starcat.js";
 
 const form = document.getElementById("identify");
@@ -10,6 +13,7 @@ if (form) {
   const file = document.getElementById("file");
   const centroids = document.getElementById("centroids");
   document.getElementById("drop-words").hidden = false;
+  startSliders(form);
 
   const over = (event) => {
     if (![...event.dataTransfer.types].includes("Files")) return;
@@ -23,10 +27,9 @@ if (form) {
     event.preventDefault();
     drop.classList.remove("over");
     if (!event.dataTransfer.files.length) return;
-    const one = new DataTransfer();
-    one.items.add(event.dataTransfer.files[0]);
-    file.files = one.files;
-    announce(`${file.files[0].name} is chosen`);
+    file.files = event.dataTransfer.files;
+    centroids.value = "";
+    announce([...file.files].map((one) => one.name).join(", "));
   });
 
   // A file goes before what was pasted: whoever pastes means that.
@@ -37,6 +40,17 @@ if (form) {
     answer.setAttribute("aria-busy", "true");
     announce("Identifying");
   });
+  if (answer.dataset.link && !location.search) goTo(answer.dataset.link.replace("/identify", ""));
+
+  // Browsers save no address of more than 2 MB as a file: it is made one first.
+  answer.addEventListener("click", (event) => {
+    const link = event.target.closest('a[download][href^="data:"]');
+    if (!link || link.href.length < 1_000_000) return;
+    const [kind, content] = link.href.slice(5).split(";base64,");
+    const bytes = Uint8Array.from(atob(content), (one) => one.codePointAt(0));
+    link.href = URL.createObjectURL(new Blob([bytes], { type: kind }));
+  });
+
   // Coming back by the browser's button, nothing is under way.
   addEventListener("pageshow", () => answer.removeAttribute("aria-busy"));
   if (answer.querySelector(".card, .notice") && !matchMedia("(min-width: 62rem)").matches) {

@@ -73,7 +73,7 @@ async function redraw() {
   job.querySelector(".page-head").replaceWith(news.querySelector(".page-head"));
   job.querySelectorAll(":scope > .notice").forEach((notice) => notice.remove());
   job.querySelector(".page-head").after(...news.querySelectorAll(":scope > .notice"));
-  for (const part of ["#steps", ".facts"]) job.querySelector(part).replaceWith(news.querySelector(part));
+  for (const part of ["#found", "#steps", ".facts"]) job.querySelector(part).replaceWith(news.querySelector(part));
   const [bar, next] = [document.getElementById("bar"), news.querySelector("#bar")];
   if (bar && next) bar.replaceWith(next);
   else bar?.remove();

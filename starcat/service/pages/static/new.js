@@ -1,6 +1,7 @@
 // New database: sliders, the spec and what it would give, kept in step by the server.
 
-import { announce } from "./starcat.js";
+import { goTo } from "./address.js";
+import { announce, copy } from "./starcat.js";
 import { startMap } from "./sky.js";
 import { follow, startSliders } from "./sliders.js";
 
@@ -11,6 +12,9 @@ const body = document.getElementById("body");
 const text = document.getElementById("toml");
 const before = document.getElementById("toml-before");
 const summary = document.getElementById("summary");
+const pinned = document.getElementById("pinned");
+const share = document.getElementById("share");
+const build = document.getElementById("build");
 const FIELDS_AFTER_MS = 120;
 const TEXT_AFTER_MS = 450;
 const BUSY_AFTER_MS = 2500;
@@ -79,15 +83,23 @@ function show(state) {
     if (hadFocus) body.querySelector(".sky svg")?.focus();
   }
   if (summary.textContent !== state.summary) summary.textContent = state.summary;
+  if (build) build.disabled = !state.can_build;
+  pinned.value = state.pinned_query;
+  share.href = state.address;
+  goTo(new URL(share.href).search);
 }
 
-async function ask() {
+// `wanted` is what a button does besides: suggest, pin or unpin.
+async function ask(wanted = "preview") {
   asked?.abort();
+  clearTimeout(waiting);
   asked = new AbortController();
   result.setAttribute("aria-busy", "true");
+  const sent = new URLSearchParams(new FormData(form));
+  sent.set("do", wanted);
   try {
     const answer = await fetch(form.dataset.preview, {
-      method: "POST", body: new URLSearchParams(new FormData(form)), signal: asked.signal,
+      method: "POST", body: sent, signal: asked.signal,
     });
     if (!answer.ok) {
       const problem = await answer.json().catch(() => null);
@@ -96,8 +108,7 @@ async function ask() {
     const state = await answer.json();
     show(state);
     if (state.is_busy) {
-      clearTimeout(waiting);
-      waiting = setTimeout(ask, BUSY_AFTER_MS);
+      waiting = setTimeout(ask, BUSY_AFTER_MS, wanted);
       return;
     }
   } catch (error) {
@@ -116,5 +127,22 @@ form.addEventListener("input", (event) => {
 text.addEventListener("blur", () => { if (text.value !== before.value && text.value.trim() === before.value.trim()) text.value = before.value; });
 // What a browser kept of a page that was left is newer than what the server sent.
 document.getElementById("update").hidden = true;
-form.addEventListener("submit", () => { announce("Sent"); clearTimeout(waiting); });
+form.addEventListener("submit", (event) => {
+  const wanted = event.submitter?.value;
+  if (["suggest", "pin", "unpin"].includes(wanted)) {
+    event.preventDefault();
+    form.dataset.state = "changed";
+    ask(wanted);
+    return;
+  }
+  announce("Sent");
+  clearTimeout(waiting);
+});
+share.addEventListener("click", async (event) => {
+  event.preventDefault();
+  const before = share.textContent;
+  share.textContent = await copy(share.href, share) === "Copied" ? "Copied" : share.href;
+  announce(share.textContent);
+  setTimeout(() => { share.textContent = before; }, 1600);
+});
 ask();

@@ -1,15 +1,12 @@
 // A map of the sky tells the field under the pointer, or under a cross that arrow keys move.
 
+import { direction } from "./sphere.js";
+
 const HALF_WIDTH = 200 * Math.SQRT2;
 const HALF_HEIGHT = 100 * Math.SQRT2;
 const DEG = Math.PI / 180;
 const IDLE = "Point at the map, or choose it and use the arrow keys, to see a field.";
 const STEPS = { ArrowLeft: [5, 0], ArrowRight: [-5, 0], ArrowUp: [0, 5], ArrowDown: [0, -5] };
-
-export function direction(ra, dec) {
-  const across = Math.cos(dec * DEG);
-  return [across * Math.cos(ra * DEG), across * Math.sin(ra * DEG), Math.sin(dec * DEG)];
-}
 
 // Mollweide's projection back to the sky; null outside of the map.
 function skyAt(x, y) {

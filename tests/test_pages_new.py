@@ -1,0 +1,271 @@
+"""The page *New database*: designs as addresses, names that follow, suggestions and verdicts."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from fastapi.testclient import TestClient
+
+from starcat.errors import ConfigError
+from starcat.service.pages.design import differences, draft_of_query, pinned_draft, query_of
+from starcat.service.pages.draft import draft_of_text, draft_with
+from starcat.specs.reading import preset_names
+
+SETTINGS = {"anonymous": "builder"}
+
+SPEC = """\
+name = "mine"
+version = "1.0.0"
+epoch_jyear = 2016.0
+
+[catalog]
+source = "gaia"
+
+[selection]
+faint_limit_mag = 4.5
+
+[camera]
+width_px = 512
+height_px = 512
+fov_x_deg = 20.0
+
+[boresights]
+count = 300
+"""
+
+
+def _sent(client: TestClient, address: str, text: str, **more: str):
+    """Send a text, again while the catalog is being read: a busy machine takes long for it."""
+    sent = {"toml": text, "toml-before": "", **more}
+    answer = client.post(address, data=sent)
+    while "being read, which takes longer" in answer.text:
+        answer = client.post(address, data=sent)
+    return answer
+
+
+# The address
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_preset_has_a_short_address(name):
+    is_default = name == preset_names()[0]
+    draft = draft_of_query({"preset": name})
+    assert query_of(draft, name) == ("" if is_default else f"?preset={name}")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera.fov_x_deg": 20.0, "selection.faint_limit_mag": 5.6},
+        {"catalog.motions": ["tycho2"], "products.grid.enabled": False},
+        {"name": "12", "description": 'a "b" & c=d; ü #1'},
+        {"camera.fov_x_deg": None, "camera.focal_length_mm": 25.0, "camera.pixel_um": 5.5},
+        {"selection.faint_limit_mag": 99.0, "epoch_jyear": "soon"},
+        {"selection.nothing": 3, "catalog.band": ""},
+    ],
+    ids=["numbers", "a list", "texts", "another lens", "wrong values", "an unknown key"],
+)
+def test_an_address_gives_the_design_again(changes):
+    for base in ("gaia-12deg", "sao-12deg-512"):
+        draft = draft_with(draft_of_query({"preset": base}), changes)
+        again = pinned_draft(query_of(draft, base))
+        assert again.content == draft.content
+        assert again.errors == draft.errors
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f"# mine\n{SPEC}", "name = ", f"{SPEC}[a.'b.c']\nd = 1\n", "", "preset = 3\n"],
+    ids=["a comment", "no TOML", "a dotted name", "nothing", "a name of the address"],
+)
+def test_a_text_that_is_more_than_keys_is_in_the_address_as_it_is(text):
+    assert pinned_draft(query_of(draft_of_text(text), "gaia-12deg")).text == text
+
+
+def test_an_address_of_no_design_is_told(client):
+    with pytest.raises(ConfigError, match=r"the address is of no design: name\.x"):
+        draft_of_query({"name.x": "3"})
+    answer = client.get("/new?name.x=3")
+    assert answer.status_code == 422
+    assert "of no design" in answer.text
+
+
+def test_the_page_shows_the_design_of_its_address_and_gives_it_back(client):
+    text = client.get("/new?preset=sao-12deg&camera.fov_x_deg=16").text
+    assert "fov_x_deg = 16" in text
+    assert 'href="/new?preset=sao-12deg&amp;camera.fov_x_deg=16"' in text
+    state = _sent(client, "/new/preview", SPEC).json()
+    again = pinned_draft(state["address"].partition("?")[2])
+    assert again.spec == draft_of_text(SPEC).spec
+
+
+def test_a_reader_signs_in_and_comes_back_to_the_design(reader):
+    page = reader.get("/new?camera.fov_x_deg=16").text
+    [address] = re.findall(r'class="button" href="(/sign-in[^"]*)">Sign in to build', page)
+    form = reader.get(address.replace("&amp;", "&")).text
+    assert 'name="next" value="/new?camera.fov_x_deg=16"' in form
+
+
+@pytest.fixture
+def reader(root):
+    from services import client_of
+
+    with client_of(root, anonymous="reader") as client:
+        yield client
+
+
+# Names
+
+
+def test_name_and_description_of_a_preset_follow_the_camera():
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
+    assert draft.values["name"] == "gaia-20deg"
+    told = "gaia, G <= 6, for a 20 x 20 deg camera of 1024 x 1024 px"
+    assert draft.values["description"] == told
+    wrong = draft_with(draft, {"camera.fov_x_deg": 500.0})
+    assert wrong.values["description"] == told
+    again = draft_with(wrong, {"camera.fov_x_deg": 7.25, "selection.faint_limit_mag": 7.0})
+    assert again.values["name"] == "gaia-7-25deg"
+    assert "G <= 7, for a 7.25 x 7.25 deg" in again.values["description"]
+
+
+def test_what_somebody_has_called_a_design_stays():
+    mine = {"name": "polaris", "description": "For the second flight."}
+    draft = draft_with(draft_with(draft_of_query({}), mine), {"camera.fov_x_deg": 20.0})
+    assert {key: draft.values[key] for key in mine} == mine
+    draft = draft_with(draft_of_query({}), {"version": "1.0.1"})
+    assert draft.values["description"].startswith("Embedded sky (Gaia DR3")
+
+
+def test_a_second_database_of_one_name_and_version_is_refused(client):
+    first = client.post(
+        "/new", data={"toml": SPEC, "toml-before": "", "do": "build"}, follow_redirects=False
+    )
+    assert first.status_code == 303
+    other = SPEC.replace("4.5", "4.4")
+    page = _sent(client, "/new", other, do="build")
+    assert page.status_code == 422
+    told = re.search(r'id="version-error">([^<]*)<', page.text)
+    assert told is not None
+    assert "mine 1.0.0 is there already" in told[1]
+    assert "such as 1.0.1" in told[1]
+    wish = {"kind": "build", "spec": other}
+    answer = client.post("/api/v1/jobs", json=wish)
+    assert (answer.status_code, answer.json()["key"]) == (409, "version")
+    again = client.post("/api/v1/jobs", json={"kind": "build", "spec": SPEC})
+    assert again.status_code == 200  # the same database: the job that makes it
+    later = other.replace("1.0.0", "1.0.1")
+    assert client.post("/api/v1/jobs", json={"kind": "build", "spec": later}).status_code == 201
+
+
+# What it would give
+
+
+def test_limits_are_suggested_for_the_camera(client):
+    state = _sent(client, "/new/preview", SPEC.replace("4.5", "3"), do="suggest").json()
+    draft = draft_of_text(state["toml"])
+    assert draft.spec is not None
+    assert draft.spec.selection.faint_limit_mag == 5.2
+    assert draft.spec.selection.max_stars_per_field == 12
+    assert draft.spec.boresights.count == 2000
+    assert draft.spec.name == "mine"
+    assert "For 20 x 20 deg: faint limit 5.2" in state["wrong"]
+    assert "Good: 99 % of the fields have 12 guide stars" in state["result"]
+    page = _sent(client, "/new", SPEC, do="suggest")  # without scripts
+    assert "faint_limit_mag = 5.2" in page.text
+
+
+def test_no_limits_are_suggested_for_a_wrong_camera(client):
+    state = _sent(client, "/new/preview", SPEC.replace("20.0", "500"), do="suggest").json()
+    assert "before the fields of the camera are right" in state["wrong"]
+    assert "500" in state["toml"]
+
+
+@pytest.mark.parametrize(
+    ("limit", "level", "words"),
+    [
+        ("3.5", "bad", r"\d\d % of the sky is blind: .* Go to G 5\.2\."),
+        ("4.9", "warn", r"Thin: 1 % of the fields have 7 .* Go to G 5\.2\."),
+        ("5.5", "good", r"Good: 99 % of the fields have \d\d guide stars"),
+        ("7.5", "good", r"more than are needed: G 5\.2, or a limit of stars per field"),
+    ],
+)
+def test_an_estimate_has_a_verdict_in_words(client, limit, level, words):
+    text = SPEC.replace("4.5", limit).replace('source = "gaia"', 'source = "gaia"\nband = "G"')
+    state = _sent(client, "/new/preview", text).json()
+    told = re.search(r'<p class="verdict (\w+)" id="verdict">([^<]*)<', state["result"])
+    assert told is not None
+    assert told[1] == level
+    assert re.search(words, told[2]), told[2]
+
+
+def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
+    text = f"{SPEC}brightest = 3\n".replace("4.5", "6.0\nmax_stars = 400")
+    state = _sent(client, "/new/preview", text).json()
+    assert "is faint enough: the other rules remove the stars" in state["result"]
+
+
+def test_presets_of_catalogs_that_are_not_here_are_grey(client, monkeypatch):
+    monkeypatch.setenv("STARCAT_CACHE", "/nonexistent")
+    monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
+    text = client.get("/new").text
+    assert 'href="/new?preset=gaia-12deg"' in text
+    assert 'href="/new?preset=sao-12deg"' not in text
+    assert 'aria-describedby="presets-lack">sao-12deg<' in text
+    assert "gets each with starcat fetch sao and starcat fetch hipparcos" in text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "keys"),
+    [
+        ("", []),
+        ("faint_limit_mag = 99", ["selection.faint_limit_mag"]),
+        ("faint_limit_mag = 99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
+        ("faint_limit_mag = -28", [None]),
+        ("faint_limit_mag = 5", []),
+    ],
+    ids=["as it is", "one", "two", "no star is left", "another"],
+)
+def test_nothing_is_built_while_anything_is_wrong(client, wrong, keys):
+    text = SPEC.replace("mine", "checked").replace(
+        "faint_limit_mag = 4.5", wrong or "faint_limit_mag = 4.6"
+    )
+    state = _sent(client, "/new/preview", text).json()
+    assert state["can_build"] == (not keys)
+    assert len(state["errors"]) == len([key for key in keys if key])
+    assert set(keys) - {None} <= set(state["errors"])
+    page = _sent(client, "/new", text, do="preview").text
+    [button] = re.findall(r'<button [^>]*id="build"[^>]*>', page)
+    assert ("disabled" in button) == bool(keys)
+    for key in state["errors"]:
+        assert re.search(rf'id="{re.escape(key)}-error">[^<]+<', page), key
+
+
+def test_a_pinned_design_is_compared_with_the_present_one(client):
+    pinned = _sent(client, "/new/preview", SPEC, do="pin").json()
+    query = pinned["pinned_query"]
+    assert "It is the same as this one" in pinned["result"]
+    text = SPEC.replace("4.5", "5.5")
+    state = _sent(client, "/new/preview", text, pinned=query).json()
+    row = re.search(r"selection.faint_limit_mag</th><td>(.*?)</td><td>(.*?)</td>", state["result"])
+    assert row is not None
+    assert row.groups() == ("5.5", "4.5")
+    assert state["result"].count("data:image/png") == 2
+    legends = re.findall(r'<ul class="legend".*?</ul>', state["result"], re.DOTALL)
+    assert legends[0] == legends[1]  # the colours mean the same
+    assert "pinned=" in state["address"]
+    page = client.get(state["address"]).text
+    assert "faint_limit_mag = 5.5" in page
+    assert 'id="pinned" value="name=mine' in page
+    gone = _sent(client, "/new/preview", text, pinned=query, do="unpin").json()
+    assert gone["result"].count("data:image/png") == 1
+    assert "pinned" not in gone["address"]
+
+
+def test_designs_differ_by_their_keys():
+    mine, other = draft_of_text(SPEC), draft_of_text(SPEC.replace("4.5", "5").replace("300", "400"))
+    assert differences(mine, other) == [
+        ("selection.faint_limit_mag", "4.5", "5"),
+        ("boresights.count", "300", "400"),
+    ]
