@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from starcat.images.picture import short_name
-from starcat.images.solve_files import FOV_ERROR_OF_IMAGES
+from starcat.images.second_look import FOV_ERROR
 from starcat.matcher.settings import SCALE_FREE
 from starcat.service.pages.sky import names_of
 
@@ -125,7 +125,7 @@ def link_of(measured: Mapping[str, Any], given: Mapping[str, str], *, is_loose: 
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
         values.pop("camera.flip", None)  # of what was measured y counts down
         if is_loose and not (values.get("field_error") or values.get("fov_from")):
-            values["field_error"] = f"{100 * FOV_ERROR_OF_IMAGES:g}"
+            values["field_error"] = f"{100 * FOV_ERROR:g}"
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MOST_LINK else ""
 

@@ -18,8 +18,9 @@ from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry.camera import Camera
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
-from starcat.images.solve_files import FOV_ERROR_OF_IMAGES, IdentifyOptions
+from starcat.images.second_look import FOV_ERROR
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -129,7 +130,7 @@ def _options_told(options: IdentifyOptions, frame: ShownFrame) -> dict[str, Any]
     """Return the options of a frame as a program states them."""
     told = options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
     if frame.is_loose and not {"fov_error", "fov_deg"} & set(told):
-        told["fov_error"] = FOV_ERROR_OF_IMAGES
+        told["fov_error"] = FOV_ERROR
     return told
 
 
