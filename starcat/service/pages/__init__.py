@@ -7,6 +7,7 @@ from fastapi import APIRouter
 from starcat.service.pages import (
     console,
     databases,
+    documentation,
     home,
     identify,
     jobs,
@@ -25,6 +26,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     console.router,
     identify.router,
     releases.router,
+    documentation.router,
     sky.router,
 )
 """Routers of the page, in the order in which they are asked."""
