@@ -218,6 +218,21 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 
 
 @pytest.fixture(scope="session")
+def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+    """The same without its brightest stars, so that stars are rejected for two reasons."""
+    from starcat.pipeline.build import build
+    from starcat.specs.reading import spec_from_dict
+
+    folder = tmp_path_factory.mktemp("picky")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    spec = tomllib.loads(SMALL_SPEC.replace("faint", "bright_limit_mag = 2.2\nselection.faint"))
+    built = build(
+        spec_from_dict(spec, "small.toml"), {"sao": [folder / "sao.dat"]}, folder / "dist"
+    )
+    return built.folder
+
+
+@pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
     """A registry with the release of the small artifact; to be copied by who uses it."""
     from starcat.releases.publishing import publish_artifact

@@ -64,7 +64,7 @@ def test_the_list_has_what_there_is(client, small_artifact):
     assert "small 1.1.0" in words
     assert f" {manifest['products']['stars']['rows']} " in words
     assert "512 x 512 px, 40 x 40 deg" in words
-    assert "not released" in words
+    assert "not published" in words
 
 
 def test_a_list_without_databases_says_what_to_do(empty):
@@ -273,7 +273,11 @@ def test_an_answer_comes_as_a_file(client, form):
 
 
 def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
-    form = {"database": DATABASE, "note": "For June.\r\n<script>alert(1)</script>"}
+    form = {
+        "database": DATABASE,
+        "confirmed": "true",
+        "note": "For June.\r\n<script>alert(1)</script>",
+    }
     answer = client.post("/releases", data=form, follow_redirects=False)
     assert answer.status_code == 303
     page = client.get(answer.headers["location"].partition("#")[0]).text
@@ -284,7 +288,7 @@ def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
     assert f"starcat pull small@1.0.0 --registry {LOCAL}/registry" in words
     assert f'value="{DATABASE}"' not in page
     assert f'value="{LATER}"' in page
-    assert " released " in text_of(client.get(PAGE).text)
+    assert " published " in text_of(client.get(PAGE).text)
     made_up = text_of(client.get("/releases?published=other-1.0.0").text)
     assert "other-1.0.0" not in made_up
     for link in re.findall(r'href="(/registry/[^"]+)"', page):
@@ -297,14 +301,15 @@ def test_another_content_of_a_release_is_refused_in_words(
     add_database(tmp_path / "service", small_artifact)
     add_database(tmp_path / "service", artifact_version("1.0.0"), LATER)
     with client_of(tmp_path / "service", anonymous="publisher") as client:
-        assert client.post("/releases", data={"database": DATABASE}).status_code == 200
-        form = {"database": LATER, "note": "kept <b>"}
+        sound = {"database": DATABASE, "confirmed": "true"}
+        assert client.post("/releases", data=sound).status_code == 200
+        form = {"database": LATER, "note": "kept <b>", "confirmed": "true"}
         answer = client.post("/releases", data=form)
         assert answer.status_code == 409
         assert "has small-1.0.0 already, with another content" in text_of(answer.text)
         assert "kept &lt;b&gt;</textarea>" in answer.text
         page = client.get("/databases").text
-        assert (page.count(">released<"), page.count(">not released<")) == (1, 1)
+        assert (page.count(">published<"), page.count(">not published<")) == (1, 1)
 
 
 def test_who_only_reads_publishes_and_evaluates_nothing(root):

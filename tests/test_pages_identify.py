@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import csv
+import html
 import io
 import json
 import re
@@ -10,6 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,6 +25,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_frames
 from starcat.matcher.database import open_database
+from starcat.service.pages.answers import shown_frames
 from starcat.service.pages.identify import NOISE_PX, centroid_file
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -82,6 +88,138 @@ def test_centroids_are_pasted(client, simulated, separator):
     answer = asked(client, centroids="\r\n".join(lines), brightness="light")
     assert answer.status_code == 200
     assert error_rad(answer.text, simulated.matrix) < 2e-3
+
+
+def pasted(frame, *, is_up: bool = False, scale: float = 1.0, height: float = 512.0) -> str:
+    """The centroids of a frame, with magnitudes, as somebody pastes them."""
+    x, y = (frame.centroids_px * scale).T
+    rows = zip(x, height * scale - y if is_up else y, frame.mag, strict=True)
+    return "\n".join(f"{one:.4f} {two:.4f} {mag:.3f}" for one, two, mag in rows)
+
+
+def test_a_frame_of_another_camera_is_identified(client, simulated):
+    twice = {"centroids": pasted(simulated, scale=2.0), "brightness": "mag"}
+    assert "not identified" in asked(client, **twice).text
+    by_field = {"camera.width_px": 1024, "camera.height_px": 1024, "camera.fov_x_deg": 40}
+    by_lens = {"lens": "focal", "camera.focal_length_mm": 14.0671, "camera.pixel_um": 10.0}
+    size = dict.fromkeys(("camera.width_px", "camera.height_px"), 1024)
+    text = {"camera_file": "width_px = 1024\nheight_px = 1024\nfov_x_deg = 40.0"}
+    for camera in (by_field, {**size, **by_lens}, text):
+        answer = asked(client, **twice, **camera)
+        assert error_rad(answer.text, simulated.matrix) < 2e-3, camera
+    assert 'id="other-camera"' in answer.text
+    wrong = asked(client, **twice, **{"camera.width_px": "-4"})
+    assert wrong.status_code == 422
+    assert re.search(r'id="camera.width_px"[^>]*aria-invalid="true"', wrong.text)
+
+
+def test_a_mirrored_frame_is_identified_where_that_is_said(client, simulated):
+    up = {"centroids": pasted(simulated, is_up=True), "brightness": "mag"}
+    assert ">identified<" not in asked(client, **up).text
+    answer = asked(client, **up, **{"camera.flip": "on"})
+    assert error_rad(answer.text, simulated.matrix) < 2e-3
+
+
+def test_a_scale_that_is_off_is_found_within_what_is_stated(client, simulated):
+    wide = {"centroids": pasted(simulated), "brightness": "mag", "camera.fov_x_deg": "41.5"}
+    answer = asked(client, **wide, field_error="6")
+    assert error_rad(answer.text, simulated.matrix) < 2e-3
+    by_range = asked(client, **wide, fov_from="30", fov_to="50")
+    assert by_range.status_code == 422  # of a database that serves one field
+    assert "no product &#39;levels&#39;" in by_range.text
+    half = asked(client, **wide, fov_from="30")
+    assert half.status_code == 422
+    assert "both ends" in half.text
+
+
+def test_a_time_gives_the_attitude_without_aberration(client, simulated):
+    frame = {"centroids": pasted(simulated), "brightness": "mag"}
+    answer = asked(client, **frame, time="2026-11-22T10:00:00")
+    assert "Without aberration" in answer.text
+    [off] = re.findall(r"attitude, ([0-9.]+) arcsec", answer.text)
+    assert 0.0 < float(off) < 26.0
+    wrong = asked(client, **frame, time="yesterday")
+    assert wrong.status_code == 422
+    assert "expected date and time in UTC" in wrong.text
+
+
+def files_of(page: str) -> dict[str, bytes]:
+    """The files that an answer offers, by the end of their names."""
+    found = re.findall(r'href="data:([^"]*);base64,([^"]*)" download="[^"]*-?answer\.?(\w*)"', page)
+    files = {kind: base64.b64decode(content) for _, content, kind in found}
+    [wcs] = re.findall(r'href="data:application/fits;base64,([^"]*)"', page)
+    return {**files, "fits": base64.b64decode(wcs)}
+
+
+def test_an_answer_is_saved_as_json_csv_and_wcs(client, simulated):
+    page = asked(client, seed=SEED).text
+    files = files_of(page)
+    [frame] = json.loads(files["json"])
+    assert frame["q_body_from_icrs"] == pytest.approx(quaternion_in(page), abs=1e-8)
+    rows = list(csv.DictReader(files["csv"].decode().splitlines()))
+    assert len(rows) == len(frame["stars"])
+    assert {row["star"] for row in rows if row["star"]} == {
+        one["star"] for one in frame["stars"] if one["star"]
+    }
+    with fits.open(io.BytesIO(files["fits"])) as parts:
+        header, data = parts[0].header, parts[0].data
+    assert data.size == 0
+    matched = [one for one in frame["stars"] if one["star"]]
+    pixels = np.array([[one["x_px"], one["y_px"]] for one in matched]) - 0.5
+    sky = WCS(header).pixel_to_world(*pixels.T)
+    off = sky.separation(SkyCoord([one["ra_deg"] for one in matched],
+                                  [one["dec_deg"] for one in matched], unit="deg"))  # fmt: skip
+    assert off.arcsec.max() < 1.5 * 512  # a centroid is off by a pixel or so, of 281 arcsec
+    assert (header["IMAGEW"], header["IMAGEH"]) == (512, 512)
+
+
+def test_a_link_keeps_an_answer(client, simulated):
+    frame = client.get(f"/identify/frame/{DATABASE}?seed={SEED}").content
+    page = asked(client, {"file": ("frame.png", frame)}, tolerance_px="3").text
+    [link] = re.findall(r'href="(/identify[?][^"]+)">Link to this answer', page)
+    again = client.get(html.unescape(link))
+    assert again.status_code == 200
+    assert error_rad(again.text, simulated.matrix) < 2e-3
+    assert np.allclose(quaternion_in(again.text), quaternion_in(page), atol=1e-5)
+    assert 'name="tolerance_px" type="text" value="3"' in again.text
+    [seeded] = re.findall(r'href="(/identify[?][^"]+)">Link', asked(client, seed=SEED).text)
+    assert f"seed={SEED}" in seeded
+    assert "centroids" not in seeded
+
+
+def test_many_pictures_are_identified_at_once(client):
+    frames = [
+        ("file", (f"f{k}.png", client.get(f"/identify/frame/{DATABASE}?seed={k}").content))
+        for k in (SEED, SEED + 1)
+    ]
+    page = client.post(
+        "/identify",
+        data={"database": DATABASE},
+        files=[*frames[:1], ("file", ("broken.png", b"no picture")), *frames[1:]],
+    ).text
+    assert "2 of 3 frames identified" in page
+    assert re.search(r">broken.png</th><td>[^<]{20}", page)
+    assert len(json.loads(files_of(page)["json"])) == 2
+    assert len(re.findall(r'<th scope="row"><a href="/identify[?]', page)) == 2
+
+
+def test_the_table_has_the_names_of_the_picture():
+    content = {
+        "frame": "f",
+        "status": "identified",
+        "stars": [
+            {"x_px": 1.0, "y_px": 2.0, "star": star, "mag": mag, "ra_deg": ra, "dec_deg": dec}
+            for star, mag, ra, dec in (
+                ("Gaia DR3 3043755000000000000", 0.3, 114.8219, 5.2185),
+                ("Gaia DR3 1234567890123456789", 9.9, 20.0, 20.0),
+            )
+        ]
+        + [{"x_px": 3.0, "y_px": 4.0, "star": None, "mag": None}],
+    }
+    found = {"frames": [content], "more": [{"mag": None, "wcs": None, "is_image": False}],
+             "notes": [], "method": "triangle"}  # fmt: skip
+    [frame] = shown_frames(found, {"database": DATABASE}, 2016.0)
+    assert [one["name"] for one in frame.stars] == ["Procyon", "Gaia …23456789"]
 
 
 def test_a_refusal_has_the_words_of_the_matcher(client):

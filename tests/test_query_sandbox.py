@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,7 +25,12 @@ from hypothesis import strategies as st
 from starcat.errors import ProductError, QueryError, QueryLimitError, SchemaVersionError
 from starcat.query.engine import Engine
 from starcat.query.session import Limits, Session, open_session, preamble_of
-from starcat.query.statement import check_statement
+from starcat.query.statement import (
+    EXPLAIN_FORMATS,
+    REFUSED_FUNCTIONS,
+    TABLE_FUNCTIONS,
+    check_statement,
+)
 from starcat.query.worker import BESIDE_BYTES
 
 
@@ -130,6 +136,14 @@ ATTEMPTS = {
     "python-function": "SELECT * FROM python_map_function(1)",
     "environment": "SELECT getenv('HOME')",
     "directory": "SELECT * FROM duckdb_secrets()",
+    "sleep": "SELECT sleep_ms(25000)",
+    "sleep-of-a-column": "SELECT max(range.sleep_ms()) FROM range(100)",
+    "sleep-as-in-postgres": "SELECT PG_Sleep(100)",
+    "sleep-where": "FROM stars ORDER BY system.main.sleep_ms(mag::INTEGER)",
+    "settings": "SELECT * FROM duckdb_settings()",
+    "settings-as-in-postgres": "SELECT * FROM pg_catalog.pg_settings",
+    "one-setting": "SELECT current_setting('allowed_paths')",
+    "variable": "SELECT getvariable('x')",
 }
 
 
@@ -258,6 +272,42 @@ def test_what_duckdb_writes_from_the_tree_means_what_was_asked(folder, text):
         assert ([column[0] for column in written.description], written.fetchall()) == expected
 
 
+HARMLESS = {
+    "current_connection_id", "current_query", "current_query_id", "current_transaction_id", "error",
+    "gen_random_uuid", "random", "uuid", "uuidv4", "uuidv7", "vector_type",
+}  # fmt: skip
+
+
+def test_functions_that_do_something_are_known():
+    """A DuckDB that comes with another one is noticed here, and somebody decides about it."""
+    asked = "SELECT function_name FROM duckdb_functions() WHERE has_side_effects"
+    with duckdb.connect() as connection:
+        found = {str(name) for (name,) in connection.execute(asked).fetchall()}
+    assert found == HARMLESS | (found & set(REFUSED_FUNCTIONS))
+
+
+def test_nothing_tells_where_the_files_are(session, folder):
+    """Each table of DuckDB, each function that tells of tables, and each way to explain."""
+    with duckdb.connect() as connection:
+        views = connection.execute(
+            "SELECT schema_name || '.' || view_name FROM duckdb_views() WHERE internal"
+        ).fetchall()
+    asked = [f"FROM {name}" for (name,) in views]
+    asked += [f"FROM {name}()" for name in TABLE_FUNCTIONS if name.startswith("duckdb_")]
+    asked += [f"EXPLAIN (ANALYZE, FORMAT {form}) FROM stars" for form in EXPLAIN_FORMATS]
+    asked += ["EXPLAIN ANALYZE FROM stars", "SHOW ALL TABLES", "DESCRIBE stars", "FROM nowhere.x"]
+    answered = 0
+    for text in asked:
+        try:
+            told = str(rows_of(session, text, 10_000))
+            answered += 1
+        except QueryError as error:
+            told = str(error)
+        for place in (folder.parent, os.getcwd(), Path.home(), tempfile.gettempdir()):
+            assert str(place) not in told, text
+    assert answered > 40
+
+
 PIECES = st.sampled_from(
     [
         "EXPLAIN", "ANALYZE", "(ANALYZE)", "(FORMAT json)", "SELECT 1", "FROM stars", "COPY",
@@ -316,7 +366,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
     engine = Engine(scratch, 0.5, 0.1)
     try:
         victim.chmod(0o666)
-        engine.open("SELECT 1", [str(victim)], frozenset())
+        engine.open("SELECT 1", str(folder), [str(victim)], frozenset())
         for text in (
             f"COPY (SELECT 1) TO '{victim}' (FORMAT parquet, USE_TMP_FILE false)",
             f"COPY (SELECT 1) TO '{victim}'",
@@ -349,7 +399,6 @@ ONE_CALL = {
     "FROM range(2000000000, 2000000002)",
     "printf": "SELECT length(printf('%2000000000d', 1))",
     "format": "SELECT length(format('{{:>2000000000}}', 1))".replace("{{", "{").replace("}}", "}"),
-    "sleep": "SELECT pg_sleep(100)",
     "rows": "SELECT repeat('x', 50000000) FROM range(100)",
 }
 

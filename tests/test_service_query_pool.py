@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,8 +11,6 @@ import pytest
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
-from starcat.service.problems import Problem
-from starcat.service.sandbox import pool
 from starcat.service.sandbox.pool import IDLE, QueryPool
 from starcat.service.settings import Settings
 
@@ -110,31 +106,6 @@ def test_a_target_that_was_replaced_is_opened_anew(sessions, small_artifact, tmp
     assert second != first
     sessions.forget(folder)
     assert not is_there(second)
-
-
-def test_who_waits_too_long_is_told_to_come_again(sessions, small_artifact, monkeypatch):
-    monkeypatch.setattr(pool, "WAIT_S", 0.05)
-    with (
-        sessions.session([small_artifact]),
-        pytest.raises(Problem, match="ask again later") as caught,
-        sessions.session([small_artifact]),
-    ):
-        pass
-    assert caught.value.status == 503
-    assert int(caught.value.headers["Retry-After"]) >= 0
-
-    held = threading.Event()
-
-    async def both() -> list[object]:
-        holding = asyncio.create_task(sessions.run(held.wait, 10.0))
-        waiting = asyncio.create_task(sessions.run(held.is_set))
-        [refused] = await asyncio.gather(waiting, return_exceptions=True)
-        held.set()
-        return [refused, await holding]
-
-    refused, answer = asyncio.run(both())
-    assert isinstance(refused, Problem)
-    assert answer is True
 
 
 def test_checked_queries_do_not_grow_without_end(sessions, small_artifact):

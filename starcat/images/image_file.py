@@ -362,6 +362,7 @@ def wcs_header(result: MatchResult, source: Path, *, flip: bool | None = None) -
     from astropy.io import fits
 
     camera, header = result.camera, fits.PrimaryHDU().header
+    header["NAXIS"], header["NAXIS1"], header["NAXIS2"] = 2, 0, 0  # two axes, and no data
     if camera is not None:
         header["IMAGEW"] = (camera.width_px, "width of the frame, pixels")
         header["IMAGEH"] = (camera.height_px, "height of the frame, pixels")

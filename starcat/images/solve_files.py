@@ -374,16 +374,6 @@ class FileAnswers:
         if self.measured.image is not None:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
 
-    def for_page(self, answer: FrameAnswer) -> Content:
-        """Return what a page keeps of a frame beside its answer, to link to it and to save it."""
-        from starcat.images.image_file import wcs_header
-
-        mag, wcs, flip = answer.frame.mag, None, self.options.flip
-        if answer.result.ok:
-            wcs = wcs_header(answer.result, self.path, flip=flip).decode("ascii")
-        brightness = None if mag is None else [_or_none(value) for value in mag.tolist()]
-        return {"mag": brightness, "wcs": wcs, "is_image": self.is_image}
-
 
 def _is_limited(result: MatchResult) -> bool:
     """Return whether a limit of the search ended it."""

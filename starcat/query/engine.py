@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,29 +23,74 @@ from typing import Any
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.progress import Progress, no_progress
-from starcat.query.messages import BROKEN, DONE, ENDINGS, PART, PROGRESS, REFUSED, SHORT, Opening
+from starcat.query.messages import (
+    BROKEN,
+    DONE,
+    ENDINGS,
+    INTERRUPT,
+    PART,
+    PROGRESS,
+    REFUSED,
+    SHORT,
+    Opening,
+)
 
+CLOCK_TIMES = 10  # how much longer something short may take than its time of a processor
+HEARING_S = 0.5  # how long a process may take to hear that it is interrupted
+TICKS = os.sysconf("SC_CLK_TCK") if os.name == "posix" else 1
+PATIENT = 19  # the priority of a process that leaves the processors to others
 OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
 
 
 @dataclass
 class Allowance:
-    """The time that a query may take."""
+    """The time that a query may take; only waiting for the answer counts.
+
+    One that is ``short`` may take so many seconds of a processor, or ten times that of the clock;
+    then ``prolong`` says whether it may go on.
+    """
 
     total_s: float
+    short_s: float | None = None
+    prolong: Callable[[], bool] = bool
+    is_patient: bool = False  # whether it leaves the processors to others where they want them
 
     def __post_init__(self) -> None:
-        self.left_s = self.total_s  # only waiting for the answer counts
+        self.left_s, self.used_s = self.total_s, 0.0
+        self._begun_s = time.monotonic()
+
+    def is_overdue(self, used_s: float) -> bool:
+        """Return whether it is not short any more, after some time of a processor more."""
+        if self.short_s is None:
+            return False
+        ends_s = self._begun_s + CLOCK_TIMES * self.short_s
+        return self.used_s + used_s >= self.short_s or time.monotonic() >= ends_s
+
+    def is_prolonged(self) -> bool:
+        """Have the rest, if that may be had."""
+        if self.prolong():
+            self.short_s, self.is_patient = None, True
+        return self.short_s is None
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What a process is asked now."""
+
+    number: int
+    allowance: Allowance
+    begun_s: float  # `time.monotonic`
+    used_s: float  # what the process had taken of processors
 
 
 _waiting: list[subprocess.Popen[bytes]] = []
 """A process that was started before it is known what for."""
 
 
-def warm_up() -> None:
-    """Start the process of the next `Engine` now, while other modules are still imported."""
-    if not _waiting:
+def warm_up(count: int = 1) -> None:
+    """Start the processes of the next `Engine`s now, while other work is done."""
+    while len(_waiting) < count:
         _waiting.append(_spawned())
 
 
@@ -90,14 +135,15 @@ class Engine:
         self._question = 0
         self._is_late = False
         self._process = self._started()
+        self.is_patient = False
 
-    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
+    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
         """Make views and macros by SQL; from here on the process reads nothing but some files.
 
-        ``macros`` are those that stand after FROM.
+        The SQL names them from a folder on; ``macros`` are those that stand after FROM.
         """
-        self.ask("open", sql, files, macros)
-        self._opened = sql, files, macros
+        self.ask("open", sql, folder, files, macros)
+        self._opened = sql, folder, files, macros
 
     def ask(
         self,
@@ -120,6 +166,13 @@ class Engine:
         """Whether the process is there; after a limit, or a failure of DuckDB, it is not."""
         return self._process.poll() is None
 
+    def yield_processors(self) -> None:
+        """Let the process run where nobody else wants to; that cannot be taken back."""
+        self.is_patient = True
+        with suppress(OSError):
+            for thread in Path(f"/proc/{self._process.pid}/task").iterdir():
+                os.setpriority(os.PRIO_PROCESS, int(thread.name), PATIENT)
+
     def close(self) -> None:
         """End the process."""
         _end(self._process)
@@ -127,7 +180,11 @@ class Engine:
     def _started(self) -> subprocess.Popen[bytes]:
         shutil.rmtree(self._opening.spill, ignore_errors=True)
         self._opening.spill.mkdir()
-        process = _waiting.pop() if _waiting else _spawned()
+        try:
+            process = _waiting.pop(0)
+        except IndexError:
+            process = _spawned()
+        self.is_patient = False
         with suppress(OSError):
             _write(process, self._opening)
         return process
@@ -168,31 +225,76 @@ class Engine:
                 f"{self._opening.disk_gb:g} GB of disk; ask for less, or allow more with "
                 "--memory-limit-gb"
             )
+        if self._is_late:
+            raise _late(allowance)
         told = "DuckDB failed: " if kind == BROKEN else ""
         raise QueryError(f"{told}{found}")
 
     @contextmanager
     def _within(self, allowance: Allowance) -> Iterator[None]:
-        """Kill the process when the time is over, and count the time."""
+        """End the question when its time is over, and count the time."""
         self._question += 1
         self._is_late = False
-        timer = threading.Timer(max(0.0, allowance.left_s), self._stop, (self._question,))
-        timer.daemon = True
-        timer.start()
-        began = time.monotonic()
+        if allowance.is_patient and not self.is_patient:
+            self.yield_processors()
+        asked = _Question(self._question, allowance, time.monotonic(), self._used_s())
+        self._watch(asked)
         try:
             yield
         finally:
             with self._ending:
                 self._question += 1
-            timer.cancel()
-            allowance.left_s -= time.monotonic() - began
+                self._timer.cancel()
+            allowance.left_s -= time.monotonic() - asked.begun_s
+            allowance.used_s += max(0.0, self._used_s() - asked.used_s)
 
-    def _stop(self, question: int) -> None:
+    def _watch(self, asked: _Question) -> None:
+        wait_s = asked.allowance.left_s - (time.monotonic() - asked.begun_s)
+        if asked.allowance.short_s is not None:
+            wait_s = min(wait_s, asked.allowance.short_s / 2)
+        self._begin_timer(wait_s, self._look, asked)
+
+    def _begin_timer(self, wait_s: float, function: Callable[..., None], *given: object) -> None:
+        self._timer = threading.Timer(max(0.0, wait_s), function, given)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _look(self, asked: _Question) -> None:
+        """End a question that takes too long."""
+        allowance = asked.allowance
         with self._ending:
-            if question == self._question:
+            if asked.number != self._question:
+                return
+            if time.monotonic() - asked.begun_s >= allowance.left_s:
+                self._stop(asked)
+            elif not allowance.is_overdue(self._used_s() - asked.used_s):
+                self._watch(asked)
+            elif allowance.is_prolonged():
+                self.yield_processors()
+                self._watch(asked)
+            else:
                 self._is_late = True
-                self._process.kill()
+                # The process is kept, if it hears in time.
+                self._process.send_signal(INTERRUPT)
+                self._begin_timer(HEARING_S, self._stop_later, asked)
+
+    def _stop_later(self, asked: _Question) -> None:
+        with self._ending:
+            if asked.number == self._question:
+                self._stop(asked)
+
+    def _stop(self, asked: _Question) -> None:
+        self._is_late = True
+        self._process.kill()
+
+    def _used_s(self) -> float:
+        """Return the time of processors that it has taken, where that can be read, or any time."""
+        try:
+            text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii")
+        except OSError:
+            return time.monotonic()
+        user, system = text.rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / TICKS
 
     def _ended(self, allowance: Allowance) -> QueryError:
         """Return what to say of a process that ended before it answered."""
@@ -206,10 +308,7 @@ class Engine:
         code = self._process.returncode
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         if self._is_late or name == "SIGXCPU":
-            return QueryLimitError(
-                f"stopped after {allowance.total_s:g} s; ask for less, or allow more with "
-                "--time-limit-s"
-            )
+            return _late(allowance)
         if name == "SIGKILL":
             return QueryLimitError(
                 "the process of the query was killed from outside, as a system does that runs out "
@@ -220,6 +319,12 @@ class Engine:
             f"the process of the query ended by itself ({name}{last}); DuckDB cannot answer it. "
             "Ask in another way; other queries are answered as before"
         )
+
+
+def _late(allowance: Allowance) -> QueryLimitError:
+    return QueryLimitError(
+        f"stopped after {allowance.total_s:g} s; ask for less, or allow more with --time-limit-s"
+    )
 
 
 def _write(process: subprocess.Popen[bytes], content: Any) -> None:

@@ -6,6 +6,8 @@ are pairs of a kind and what it brings. Both are pickled: each end is a process 
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +17,7 @@ DONE = "done"  # the answer, or the last part of it
 REFUSED = "refused"  # a message: the query cannot be answered
 SHORT = "short"  # a message: memory or disk ran out
 BROKEN = "broken"  # a message: DuckDB failed, and should answer nothing more
+INTERRUPT = signal.SIGUSR1 if os.name == "posix" else signal.SIGTERM  # end what is asked
 ENDINGS = {DONE, REFUSED, SHORT, BROKEN}
 
 

@@ -7,6 +7,7 @@ or too much memory is ended.
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,6 +49,8 @@ class Session:
     limits: Limits
     _engine: Engine = field(repr=False)
     _checked: dict[str, Statement] = field(default_factory=dict, repr=False)
+    # What all queries together may take; None where each has the time of the limits.
+    allowance: Allowance | None = field(default=None, repr=False)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -56,19 +59,20 @@ class Session:
 
     @property
     def is_running(self) -> bool:
-        """Whether its process is there; after a limit, or a failure of DuckDB, it is not."""
-        return self._engine.is_running
+        """Whether its process is there and not patient; after a limit or a failure it is gone."""
+        return self._engine.is_running and not self._engine.is_patient
 
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""
         [found] = self._engine.ask("statements", text)
         return list(found)
 
-    def check(self, text: str) -> Statement:
+    def check(self, text: str, allowance: Allowance | None = None) -> Statement:
         """Check that a text is a query that may run."""
         known = self._checked.pop(text, None)
         if known is None:
-            [known] = self._engine.ask("check", text, allowance=self._allowance())
+            given = allowance or self._allowance()
+            [known] = self._engine.ask("check", text, allowance=given)
         self._checked[text] = known
         if len(self._checked) > MAX_CHECKED:
             del self._checked[next(iter(self._checked))]
@@ -79,13 +83,13 @@ class Session:
         self, text: str, values: Mapping[str, Any] | None = None, progress: Progress = no_progress
     ) -> Iterator[RunningQuery]:
         """Ask a query; its rows are read within the context."""
-        statement = self.check(text)
+        allowance = self._allowance()
+        statement = self.check(text, allowance)
         given = values or {}
         for name in statement.parameters:
             if name not in given:
                 raise QueryError(f"the query has ${name}: give its value with --set {name}=VALUE")
         used = {name: given[name] for name in statement.parameters} or None
-        allowance = self._allowance()
         runs = statement.text
         if statement.is_description:
             runs = self._described(statement, used, allowance)
@@ -93,7 +97,7 @@ class Session:
         yield RunningQuery(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
 
     def _allowance(self) -> Allowance:
-        return Allowance(self.limits.time_s)
+        return self.allowance or Allowance(self.limits.time_s)
 
     def _described(
         self, statement: Statement, values: dict[str, Any] | None, allowance: Allowance
@@ -193,8 +197,12 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
     files = [file for view in views for file in view.files]
     names = frozenset(macro.name for macro in macros() if macro.is_table)
+    folder = _common_folder(files)
+    # Files are named from there on: DuckDB tells of a view, and not where it lies on the machine.
+    text = preamble(targets)
+    text = text.replace(quoted(folder + os.sep)[:-1], "'") if folder else text
     try:
-        engine.open(preamble(targets), files, names)
+        engine.open(text, folder, files, names)
     except QueryError as error:
         ended = isinstance(error, WorkerEnded)
         guilty = _which_fails(engine, views) if ended else None
@@ -203,6 +211,14 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
             f"{where}: a table cannot be opened ({str(error).splitlines()[0]}); 'starcat verify' "
             "says what is wrong with an artifact"
         ) from error
+
+
+def _common_folder(files: Sequence[str]) -> str:
+    """Return the folder that all files are in; empty where that is the root, or none."""
+    try:
+        return os.path.commonpath([os.path.dirname(file) for file in files]).rstrip(os.sep)
+    except ValueError:  # no files, or files of several drives
+        return ""
 
 
 def _which_fails(engine: Engine, views: Sequence[View]) -> View | None:

@@ -36,7 +36,6 @@ TABLE_FUNCTIONS = {
     "duckdb_columns",
     "duckdb_functions",
     "duckdb_schemas",
-    "duckdb_settings",
     "duckdb_tables",
     "duckdb_types",
     "duckdb_views",
@@ -47,6 +46,24 @@ TABLE_FUNCTIONS = {
     "pragma_version",
 }
 """Functions of DuckDB that make rows or tell about tables; they read no file but those of views."""
+
+REFUSED_FUNCTIONS = {
+    "sleep_ms": "it only waits",
+    "pg_sleep": "it only waits",
+    "write_log": "a query only reads",
+    "setseed": "a query only reads",
+    "setval": "a query only reads",
+    "nextval": "a query only reads",
+    "currval": "a query only reads",
+    "current_setting": "settings are the operator's",
+    "getvariable": "variables are not the query's",
+    "json_serialize_plan": "EXPLAIN shows how a query is answered",
+    "stats": "EXPLAIN shows how a query is answered",
+}
+"""Functions that only take time, or change or show the session, and why each is refused."""
+
+REFUSED_TABLES = {"pg_settings", "pragma_database_list", "duckdb_databases", "duckdb_logs"}
+"""Tables of DuckDB that tell of the machine and not of the targets."""
 
 EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "mermaid"}
 
@@ -200,6 +217,14 @@ def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:
     if kind.endswith("_NODE") and kind not in READING_NODES:
         word = kind.removesuffix("_NODE").removesuffix("_QUERY")
         raise QueryError(f"{word} is refused: a query only reads; -o writes the answer to a file")
+    called = str(part.get("function_name") or "").lower()
+    if called in REFUSED_FUNCTIONS:
+        raise QueryError(f"{called}() is refused: {REFUSED_FUNCTIONS[called]}; leave it out")
+    if kind == "BASE_TABLE" and str(part.get("table_name")).lower() in REFUSED_TABLES:
+        raise QueryError(
+            f"{part['table_name']} is refused: a query reads the named targets only; SHOW TABLES "
+            "lists what they have"
+        )
     if kind == "TABLE_FUNCTION":
         name = str(part["function"].get("function_name") or "").lower()
         if name not in TABLE_FUNCTIONS | macros:

@@ -23,7 +23,17 @@ import duckdb
 
 from starcat.errors import QueryError
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.query.messages import BROKEN, DONE, PART, PROGRESS, REFUSED, SHORT, Opening, Statement
+from starcat.query.messages import (
+    BROKEN,
+    DONE,
+    INTERRUPT,
+    PART,
+    PROGRESS,
+    REFUSED,
+    SHORT,
+    Opening,
+    Statement,
+)
 from starcat.query.names import quoted_name
 from starcat.query.statement import check_statement
 
@@ -45,6 +55,8 @@ def serve() -> None:
     """Answer requests until there are no more."""
     # Ctrl-C reaches every process of a terminal; the one that asks decides what becomes of this.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if os.name == "posix":  # it is one thread that waits for it
+        signal.pthread_sigmask(signal.SIG_BLOCK, {INTERRUPT})
     sys.setrecursionlimit(NESTED_CALLS)
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     # Whatever a library prints goes where nobody reads it, unless the process dies.
@@ -74,6 +86,8 @@ class Worker:
         self._connection = duckdb.connect(":memory:", config=_settings(opening))
         limit_memory(int(opening.memory_gb * 1e9) + BESIDE_BYTES)
         threading.Thread(target=self._watch, daemon=True).start()
+        if os.name == "posix":
+            threading.Thread(target=self._hear, daemon=True).start()
 
     def answer(self, name: str, time_s: float, arguments: bytes) -> None:
         """Answer a request."""
@@ -107,8 +121,12 @@ class Worker:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
         )
 
-    def open(self, sql: str, files: list[str], macros: frozenset[str]) -> None:
-        """Make the views, and allow no other file and no other setting from here on."""
+    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
+        """Make the views, and allow no other file and no other setting from here on.
+
+        Views name their files from the folder on.
+        """
+        os.chdir(folder or os.sep)
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
@@ -180,6 +198,14 @@ class Worker:
     def _send(self, kind: str, found: Any) -> None:
         pickle.dump((kind, found), self._replies, pickle.HIGHEST_PROTOCOL)
         self._replies.flush()
+
+    def _hear(self) -> None:
+        """Interrupt what runs when that is wanted."""
+        while True:
+            signal.sigwait({INTERRUPT})
+            with self._sending:
+                if self._is_running:
+                    self._connection.interrupt()
 
     def _watch(self) -> None:
         """Tell how far a query is; end this process when the one that asks is gone."""

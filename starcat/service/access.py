@@ -24,6 +24,7 @@ from starlette.types import Scope
 
 from starcat.service.problems import Problem
 from starcat.service.records import Records
+from starcat.service.sandbox.places import asker
 from starcat.service.security.request_limits import Buckets, address_of, later
 from starcat.service.security.tokens import SessionStore, Token, TokenStore, digest_of
 from starcat.service.settings import Role, Settings
@@ -143,9 +144,11 @@ class Authentication:
         """Give a request its principal, or refuse it."""
         address = network_of(address_of(scope))
         found = self._found(Headers(scope=scope), address)
+        who = address if found is None else f"token {found.name}"
+        asker.set(who)
         path = scope["path"]
         if path != "/healthz":
-            wait_s = self._asked.take(address if found is None else f"token {found.name}")
+            wait_s = self._asked.take(who)
             if wait_s:
                 raise Problem(
                     429,

@@ -15,19 +15,22 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
+from starcat.service.access import network_of
 from starcat.service.app import make_app
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.paths import ServicePaths
 from starcat.service.security.middleware import log_settings
-from starcat.service.security.request_limits import MOST_HEADER_BYTES, MOST_TARGET_BYTES
+from starcat.service.security.request_limits import (
+    CONNECTIONS,
+    MOST_HEADER_BYTES,
+    MOST_TARGET_BYTES,
+    OWN_CONNECTIONS,
+)
 from starcat.service.security.tokens import TokenStore
 from starcat.service.service import Service
 from starcat.service.settings import Role, Settings
 from starcat.storage.atomic import make_folder
 from starcat.storage.locks import locked
-
-CONNECTIONS = 1_000
-"""Connections at the same time; of more, the server says that it is busy."""
 
 SWITCH_S = 0.001
 """Seconds until a thread that works lets others in, five times less than usual: the event loop is
@@ -40,22 +43,37 @@ Announce = Callable[[str], None]
 """Takes the address that people open, when the server listens."""
 
 
+TOO_MANY = (
+    b"HTTP/1.1 429 Too Many Requests\r\nConnection: close\r\nRetry-After: 1\r\n"
+    b"Content-Type: text/plain\r\nContent-Length: 46\r\n\r\n"
+    b"too many connections of this address; use less"
+)
+
 HEAD_S = 15.0
 """Seconds in which the head of a request has to be there, and what is left of the one before."""
 
 
-class HeaderTimeout(H11Protocol):
+class OurProtocol(H11Protocol):
     """The protocol of the server, with an end to its patience between requests.
 
     While a request is answered its handler decides how long that takes; `BodyLimits` sees to the
-    time of what it reads.
+    time of what it reads. An address has a share of the connections; behind a proxy all have that
+    of the proxy, and what is counted there are requests (`Shares`).
     """
 
     _waiting: asyncio.TimerHandle | None = None
+    _network = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first request."""
         super().connection_made(transport)
+        self._network = network_of(self.client[0]) if self.client else ""
+        others = (one for one in self.connections if isinstance(one, OurProtocol))
+        own = sum(one._network == self._network for one in others)
+        if own > OWN_CONNECTIONS and not self.config.proxy_headers:
+            transport.write(TOO_MANY)
+            transport.close()
+            return
         self._watch()
 
     def data_received(self, data: bytes) -> None:
@@ -125,7 +143,7 @@ def _serve(settings: Settings, announce: Announce) -> None:
     listening = listen(settings)
     config = uvicorn.Config(
         app,
-        http=HeaderTimeout,
+        http=OurProtocol,
         log_config=log_settings(),
         access_log=False,
         server_header=False,

@@ -26,6 +26,9 @@ ENDED: tuple[State, ...] = ("done", "failed", "cancelled")
 QUERY = "query"
 """Kind of the rows that are asynchronous queries of TAP, which only `starcat.service.vo` shows."""
 
+ASKER = "asker"
+"""Key of a request: who is counted as one user, where the owner is somebody without a name."""
+
 MAX_INTERRUPTED = 8
 """So often a job may lose its server before it is taken for the cause."""
 
@@ -141,17 +144,28 @@ def job_of(row: sqlite3.Row) -> Job:
 
 def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
     """Return whether a job of some kinds waits."""
-    return bool(records.rows(_first(kinds), *kinds))
+    waiting = f"SELECT 1 FROM jobs WHERE state = 'queued' AND kind IN ({_marks(kinds)}) LIMIT 1"
+    return bool(records.rows(waiting, *kinds))
 
 
 def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
-    """Begin the job of some kinds that has waited for longest; None where none waits."""
+    """Begin a job of some kinds; None where none waits.
+
+    It is the oldest of the user of whom fewest run, and of those of the one who waits for longest.
+    """
+    marks = _marks(kinds)
+    of = f"owner || ' ' || coalesce(json_extract(request, '$.{ASKER}'), '')"
+    first = (
+        f"SELECT id FROM jobs LEFT JOIN (SELECT {of} AS who, sum(state = 'running') AS running, "
+        f"max(started_s) AS served_s FROM jobs WHERE kind IN ({marks}) GROUP BY who) "
+        f"ON who = {of} WHERE state = 'queued' AND kind IN ({marks}) "
+        "ORDER BY running, served_s NULLS FIRST, queued_s, id LIMIT 1"
+    )
     with records.writing() as connection:
         row = connection.execute(
             "UPDATE jobs SET state = 'running', started_s = ?, attempt = attempt + 1, "
-            f"cancel_requested = 0, {NO_STAGE}, error = NULL WHERE id = ({_first(kinds)}) "
-            "RETURNING *",
-            (time.time(), *kinds),
+            f"cancel_requested = 0, {NO_STAGE}, error = NULL WHERE id = ({first}) RETURNING *",
+            (time.time(), *kinds, *kinds),
         ).fetchone()
         if row is None:
             return None
@@ -160,12 +174,8 @@ def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
     return job
 
 
-def _first(kinds: Sequence[str]) -> str:
-    marks = ", ".join("?" * len(kinds))
-    return (
-        f"SELECT id FROM jobs WHERE state = 'queued' AND kind IN ({marks}) "
-        "ORDER BY queued_s, id LIMIT 1"
-    )
+def _marks(values: Sequence[str]) -> str:
+    return ", ".join("?" * len(values))
 
 
 def running_jobs(records: Records) -> list[Job]:

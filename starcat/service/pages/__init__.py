@@ -8,6 +8,7 @@ from starcat.service.pages import (
     console,
     databases,
     documentation,
+    downloads,
     home,
     identify,
     jobs,
@@ -28,5 +29,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     releases.router,
     documentation.router,
     sky.router,
+    downloads.router,
 )
 """Routers of the page, in the order in which they are asked."""

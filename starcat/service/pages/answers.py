@@ -32,6 +32,8 @@ class ShownFrame:
     wcs: str = ""  # FITS header as an address; empty unless identified
     unusable: str = ""  # why the file has no answer
     notes: tuple[str, ...] = ()
+    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag where known
+    is_loose: bool = False  # a picture, whose field may be off where nothing is said
 
     @property
     def stars(self) -> list[dict[str, Any]]:
@@ -73,12 +75,16 @@ def shown_frames(
     shown: list[ShownFrame] = []
     for content, more in zip(found["frames"], found["more"], strict=True):
         _name_stars(content, epoch_jyear)
+        measured = _measured(content["stars"], more["mag"])
+        is_loose = bool(more["is_image"]) and found["method"] in SCALE_FREE
         shown.append(
             ShownFrame(
                 content,
-                link_of(content, more, found["method"], given),
+                link_of(measured, given, is_loose=is_loose),
                 _address(more["wcs"], "fits") if more["wcs"] else "",
                 notes=tuple(found["notes"]) if not shown else (),
+                measured=measured,
+                is_loose=is_loose,
             )
         )
     return shown
@@ -98,29 +104,30 @@ def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
         one["name"] = name or short_name(one["star"])
 
 
-def link_of(
-    content: Mapping[str, Any], more: Mapping[str, Any], method: str, given: Mapping[str, str]
-) -> str:
+def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None) -> dict[str, Any]:
+    """Return the centroids of a frame, as programs send them, to a thousandth of a pixel."""
+    spots = [(round(one["x_px"], 3), round(one["y_px"], 3)) if one["x_px"] is not None
+             and one["y_px"] is not None else None for one in stars]  # fmt: skip
+    known = [k for k, spot in enumerate(spots) if spot is not None]
+    measured: dict[str, Any] = {"centroids_px": [list(spots[k] or ()) for k in known]}
+    if mag is not None and all(mag[k] is not None for k in known):
+        measured["mag"] = [round(mag[k] or 0.0, 3) for k in known]
+    return measured
+
+
+def link_of(measured: Mapping[str, Any], given: Mapping[str, str], *, is_loose: bool) -> str:
     """Return the address that repeats an answer: the centroids that were found are in it."""
     values = {name: text for name, text in given.items() if text}
     if not values.get("seed"):
-        mag = more["mag"] or [None] * len(content["stars"])
-        is_bright = all(value is not None for value in mag)
-        lines = []
-        for star, value in zip(content["stars"], mag, strict=True):
-            place = f"{_short(star['x_px'])} {_short(star['y_px'])}"
-            lines.append(f"{place} {_short(value)}" if is_bright else place)
-        values |= {"centroids": "\n".join(lines), "brightness": "mag" if is_bright else ""}
+        lines = [f"{x:.8g} {y:.8g}" for x, y in measured["centroids_px"]]
+        if "mag" in measured:
+            lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
+        values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
         values.pop("camera.flip", None)  # of what was measured y counts down
-        is_any = values.get("field_error") or values.get("fov_from")
-        if more["is_image"] and method in SCALE_FREE and not is_any:
+        if is_loose and not (values.get("field_error") or values.get("fov_from")):
             values["field_error"] = f"{100 * FOV_ERROR_OF_IMAGES:g}"
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MOST_LINK else ""
-
-
-def _short(value: float | None) -> str:
-    return "nan" if value is None else f"{value:.3f}".rstrip("0").rstrip(".")
 
 
 def csv_of(contents: Sequence[Mapping[str, Any]]) -> str:

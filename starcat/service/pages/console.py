@@ -17,14 +17,18 @@ from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_qu
 from starcat.query.result import ResultTable
 from starcat.service.access import Reader
 from starcat.service.api.sql import SqlQuery, result_file, result_table
+from starcat.service.library import Database
 from starcat.service.pages.facts import database_rows, products_of
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.notebook import Notebook, query_code
+from starcat.service.pages.rendering import address_of, page_router, render
+from starcat.service.pages.sky import around, view_of
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
 
 router = page_router()
 ROWS = (20, 100, 500, 2000)  # rows that can be shown
 VALUE = "value."  # what the names of fields with values of ``$name`` begin with
+MARKS = 2000  # rows that are shown in the sky
 MAX_TEXT = 8_000  # characters of a query, which is part of an address
 
 FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIMIT 20"
@@ -82,7 +86,7 @@ async def console(
             raise  # the page itself is not there
         except (StarcatError, Problem) as error:
             problem = problem_of(error)
-    content = {"asked": form, "answer": answer, "problem": problem}
+    content = {"asked": form, "answer": answer, "problem": problem, "notebook": None, "view": None}
     return await run_in_threadpool(
         _page, request, service, database_id, content, is_part=bool(part)
     )
@@ -128,6 +132,9 @@ def _page(
     database = service.library.database(database_id)
     problem: ProblemDetails | None = content["problem"]
     status = 200 if problem is None else problem.status
+    if content["answer"] is not None:
+        content["notebook"] = _notebook(request, service, database, content["asked"])
+        content["view"] = _view(database, content["answer"])
     if is_part:
         return render(request, "console_answer.html", status=status, **content)
     form: ConsoleForm = content["asked"]
@@ -152,6 +159,36 @@ def _page(
         row_choices=ROWS,
         max_text=MAX_TEXT,
     )
+
+
+def _notebook(
+    request: Request, service: Service, database: Database, form: ConsoleForm
+) -> Notebook:
+    asked = _checked(service, database.id, form, min(form.rows, service.settings.max_rows))
+    code = query_code(
+        address_of(request, service), list(asked.targets), asked.text, asked.values, asked.max_rows
+    )
+    return Notebook(f"{database.title}-query", code)
+
+
+def _view(database: Database, answer: ResultTable) -> dict[str, Any] | None:
+    """Return the rows of an answer as places in the sky, if that is what they are."""
+    columns = {column.name: k for k, column in enumerate(answer.columns)}
+    if not {"ra_deg", "dec_deg"} <= set(columns):
+        return None
+    known = {name: columns.get(name) for name in ("designation", "mag", "star_id", "reason")}
+    marks = []
+    for row in answer.rows[:MARKS]:
+        ra, dec = row[columns["ra_deg"]], row[columns["dec_deg"]]
+        if not all(isinstance(one, int | float) for one in (ra, dec)):
+            continue
+        said = {name: None if k is None else row[k] for name, k in known.items()}
+        mag = said["mag"] if isinstance(said["mag"], int | float) else None
+        label = str(said["designation"] or f"{answer.columns[0].name} {row[0]}")
+        reason = None if said["reason"] is None else str(said["reason"]).replace("_", " ")
+        one = {"label": label, "ra_deg": ra, "dec_deg": dec, "mag": mag, "reason": reason}
+        marks.append(one if said["star_id"] is None else {**one, "id": str(said["star_id"])})
+    return view_of(database, marks=marks, at=around(marks)) if marks else None
 
 
 def _chosen(name: str) -> NamedQuery | None:

@@ -27,8 +27,10 @@ from starcat.service.access import Builder, Reader
 from starcat.service.api.databases import difference_of, fields_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
+from starcat.service.pages.downloads import image_choices
 from starcat.service.pages.facts import MANIFEST_DIGEST, database_rows, products_of, report_of
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.notebook import Notebook, database_code, query_code
+from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.pages.sky import CACHED, view_of
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
@@ -43,7 +45,7 @@ RASTER_WIDTH = 960
 FIELDS_SHOWN = 25  # fields of the tiling on a page
 DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
 
-Order = Literal["fewest", "most", "number"]
+Order = Literal["fewest", "most", "number", "ra", "dec"]
 
 
 @router.get("/databases")
@@ -65,6 +67,8 @@ def one_database(
         **_head(service, database, "overview"),
         report=report_of(database),
         products=products_of(manifest),
+        image=image_choices(database),
+        notebook=Notebook(database.title, database_code(address_of(request, service), database.id)),
         methods=[
             name
             for name, method in METHODS.items()
@@ -84,13 +88,19 @@ def coverage_page(
     database_id: str,
     order: Annotated[Order, Query()] = "fewest",
     page: Annotated[int, Query(ge=1, le=1_000_000)] = 1,
+    at_most: Annotated[str, Query(pattern=r"^\d{0,9}$")] = "",
 ) -> Response:
-    """Show the map of the sky and the fields of the tiling."""
+    """Show the view of the sky and the fields of the tiling."""
     database = service.library.database(database_id)
     fields = fields_of(database)
-    pages = max(1, -(-len(fields) // FIELDS_SHOWN))
+    chosen = [
+        number
+        for number in _ordered(fields, order)
+        if not at_most or fields.stars[number] <= int(at_most)
+    ]
+    pages = max(1, -(-len(chosen) // FIELDS_SHOWN))
     page = min(page, pages)
-    numbers = _ordered(fields, order)[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
+    numbers = chosen[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
     return render(
         request,
         "coverage.html",
@@ -103,15 +113,41 @@ def coverage_page(
         order=order,
         page=page,
         pages=pages,
+        at_most=at_most,
         count=len(fields),
+        chosen=len(chosen),
+        notebook=_fields_notebook(request, service, database, order, page, at_most),
     )
 
 
+_SQL_ORDER = {
+    "fewest": "star_count, boresight",
+    "most": "star_count DESC, boresight",
+    "number": "boresight",
+    "ra": "ra_deg, boresight",
+    "dec": "dec_deg, boresight",
+}
+
+
+def _fields_notebook(
+    request: Request, service: Service, database: Database, order: Order, page: int, at_most: str
+) -> Notebook | None:
+    """Return Python that asks for the fields on the page; None where no product has them."""
+    if "boresights" not in database.products:
+        return None
+    query = (
+        "SELECT boresight, ra_deg, dec_deg, star_count FROM boresights\n"
+        + (f"WHERE star_count <= {int(at_most)}\n" if at_most else "")
+        + f"ORDER BY {_SQL_ORDER[order]} LIMIT {FIELDS_SHOWN} OFFSET {(page - 1) * FIELDS_SHOWN}"
+    )
+    code = query_code(address_of(request, service), [database.id], query, {}, FIELDS_SHOWN)
+    return Notebook(f"{database.title}-fields", code)
+
+
 def _ordered(fields: Fields, order: Order) -> list[int]:
-    if order == "number":
-        return list(range(len(fields)))
-    stars = fields.stars if order == "fewest" else -fields.stars
-    return list(np.argsort(stars, kind="stable").tolist())
+    keys = {"fewest": fields.stars, "most": -fields.stars, "ra": fields.ra_deg}
+    keys |= {"dec": fields.dec_deg, "number": np.arange(len(fields))}
+    return list(np.argsort(keys[order], kind="stable").tolist())
 
 
 @lru_cache(maxsize=16)

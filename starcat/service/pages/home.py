@@ -11,8 +11,7 @@ from starcat.service.access import Identities, Reader, cookie_name, network_of, 
 from starcat.service.api import releases as api
 from starcat.service.jobs.job import ENDED
 from starcat.service.pages.facts import database_rows
-from starcat.service.pages.releases import address_of
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.security import request_limits
 from starcat.service.service import TheService
 from starcat.service.settings import Settings

@@ -19,7 +19,7 @@ from starlette.datastructures import FormData, UploadFile
 from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry.camera import Camera
 from starcat.images.render import write_simulated
-from starcat.images.solve_files import IdentifyOptions
+from starcat.images.solve_files import FOV_ERROR_OF_IMAGES, IdentifyOptions
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -32,9 +32,11 @@ from starcat.service.api.identify import (
 )
 from starcat.service.library import Database
 from starcat.service.pages.answers import Shown, ShownFrame, marks_of, shown_frames, unusable_frame
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.notebook import Notebook, identify_code
+from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.pages.sky import view_of
-from starcat.service.problems import Problem, problem_of
+from starcat.service.pages.wording import page_problem
+from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import scratch_folder
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -82,7 +84,7 @@ async def _answered(
     try:
         answer = await service.sandbox.run(_answer, service, form, given)
     except (StarcatError, Problem) as error:
-        answer = {"problem": problem_of(error)}
+        answer = {"problem": page_problem(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
 
 
@@ -106,7 +108,7 @@ def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str
         except (StarcatError, Problem) as error:
             if len(uploads) == 1:
                 raise
-            frames.append(unusable_frame(upload.name, problem_of(error).detail))
+            frames.append(unusable_frame(upload.name, page_problem(error).detail))
             continue
         method, picture = found["method"], picture or drawn
         frames += shown_frames(found, given, epoch_jyear)
@@ -119,7 +121,16 @@ def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str
         "errors_arcsec": _errors(first),
         "field_deg": _field_deg(first, camera),
         "view": _view(shown.first, database, camera),
+        "options": _options_told(options, shown.first),
     }
+
+
+def _options_told(options: IdentifyOptions, frame: ShownFrame) -> dict[str, Any]:
+    """Return the options of a frame as a program states them."""
+    told = options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
+    if frame.is_loose and not {"fov_error", "fov_deg"} & set(told):
+        told["fov_error"] = FOV_ERROR_OF_IMAGES
+    return told
 
 
 def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:
@@ -160,6 +171,12 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     nothing = dict.fromkeys(("shown", "picture", "problem", "errors_arcsec", "field_deg", "view"))
     chosen = next((one for one in databases if one.id == given["database"]), None)
     camera = (chosen or databases[0]).camera if databases else None
+    shown: Shown | None = answer.get("shown")
+    notebook = None
+    if shown is not None and shown.first.measured and chosen is not None:
+        asked = shown.first.measured, answer.pop("options")
+        code = identify_code(address_of(request, service), chosen.id, *asked)
+        notebook = Notebook(f"{shown.first.content['frame']}-answer", code)
     return render(
         request,
         "identify.html",
@@ -176,6 +193,7 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         suffixes=",".join(SUFFIXES),
         most_mib=service.settings.upload_mib,
         most_files=MOST_FILES,
+        notebook=notebook,
         **{**nothing, **answer},
     )
 

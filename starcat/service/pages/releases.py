@@ -10,18 +10,14 @@ from fastapi.responses import RedirectResponse, Response
 from starcat.errors import StarcatError
 from starcat.service.access import Publisher, Reader
 from starcat.service.api import releases as api
+from starcat.service.library import Database
 from starcat.service.pages.facts import database_rows
-from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
 
 router = page_router()
-
-
-def address_of(request: Request, service: Service) -> str:
-    """Return the address of the service as whoever asks reaches it."""
-    return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
 @router.get("/releases")
@@ -43,9 +39,13 @@ def publish(
     publisher: Publisher,
     database: Annotated[str, Form(max_length=64)],
     note: Annotated[str, Form(max_length=api.MAX_NOTE)] = "",
+    confirmed: Annotated[bool, Form()] = False,
 ) -> Response:
-    """Publish a database, and show the release."""
+    """Ask whether a database is to be published for good, or publish it and show it."""
     wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
+    if not confirmed:
+        asked = service.library.database(database)
+        return _page(request, service, publisher, database=database, note=wanted.note, asked=asked)
     try:
         released = api.publish(wanted, Response(), service, publisher)
     except (StarcatError, Problem) as error:
@@ -63,9 +63,11 @@ def _page(
     note: str = "",
     published: str = "",
     problem: ProblemDetails | None = None,
+    asked: Database | None = None,
 ) -> Response:
     listed = api.all_releases(service, principal).releases
     newest_first = sorted(listed, key=lambda one: one.published_s or 0.0, reverse=True)
+    rows = database_rows(service)
     return render(
         request,
         "releases.html",
@@ -74,9 +76,11 @@ def _page(
         address=address_of(request, service),
         unreleased=[
             (row.database.id, f"{row.database.name} {row.database.version}")
-            for row in database_rows(service)
+            for row in rows
             if not row.is_released
         ],
+        has_databases=bool(rows),
+        asked=asked,
         may_publish=principal.role >= Role.PUBLISHER,
         most_note=api.MAX_NOTE,
         database=database,

@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starcat.service.access import principal_of
 from starcat.service.pages.wording import in_page_words
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
+from starcat.service.service import Service
 from starcat.version import __version__
 
 NAVIGATION = (
@@ -151,6 +152,11 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
         **{"sign_in": sign_in_address(request), **content},
     )
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def address_of(request: Request, service: Service) -> str:
+    """Return the address of the service as whoever asks reaches it."""
+    return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
 def sign_in_address(request: Request) -> str:

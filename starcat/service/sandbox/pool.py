@@ -1,29 +1,31 @@
-"""A bounded number of processes at the same time, and of threads that use them."""
+"""Processes that are kept for the next request, and query sessions in them."""
 
 from __future__ import annotations
 
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
-import anyio
-from anyio import CapacityLimiter, to_thread
-
-from starcat.errors import QueryError
+from starcat.errors import QueryError, QueryLimitError
+from starcat.query.engine import Allowance, warm_up
 from starcat.query.session import Limits, Session, open_session
-from starcat.service.problems import Problem
+from starcat.service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat.service.settings import Settings
 
-WAIT_S = 10.0
-"""Seconds that a request waits while others are answered."""
-
-IDLE = 4
+IDLE = 8
 """Query sessions that are kept while nobody asks; those used longest ago are closed first."""
+
+SPARE = 2
+"""Processes that are started before it is known what they are to open, which takes less time."""
+
+BEGINNING = 2
+"""Processes with the same key that are started at the same time: one that others give back is
+there sooner than the third would be."""
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query may take for what does not fit into its memory."""
@@ -46,6 +48,10 @@ class Process(Protocol):
 ProcessT = TypeVar("ProcessT", bound=Process)
 
 
+Lent = tuple[K, ProcessT, ExitStack]
+"""A process with its key, and what closes it."""
+
+
 class Pool(Generic[K, ProcessT]):
     """Processes that are kept for the next request with the same key.
 
@@ -56,47 +62,33 @@ class Pool(Generic[K, ProcessT]):
     def __init__(
         self,
         begin: Callable[[K], AbstractContextManager[ProcessT]],
-        most: int,
         most_idle: int,
         harmless: tuple[type[Exception], ...] = (),
     ) -> None:
         self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
-        self._threads = CapacityLimiter(most)
-        self._slots = threading.BoundedSemaphore(most)
-        self._idle: list[tuple[K, ProcessT, ExitStack]] = []
+        self._idle: list[Lent[K, ProcessT]] = []
+        self._lent: list[Lent[K, ProcessT]] = []
+        self._wanted: list[tuple[K, Future[Lent[K, ProcessT]]]] = []
+        self._beginning: list[K] = []  # keys of the processes that are being started
         self._lock = threading.Lock()
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
 
-    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread when one is free; who waits for it holds no thread."""
-        borrower = object()
-        with anyio.move_on_after(WAIT_S) as waiting:
-            await self._threads.acquire_on_behalf_of(borrower)
-        if waiting.cancelled_caught:
-            raise _busy()
-        try:
-            # A thread is free already: the limiter of this call keeps nobody waiting.
-            return await to_thread.run_sync(
-                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
-            )
-        finally:
-            self._threads.release_on_behalf_of(borrower)
-
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
         """Give a process that nobody else uses meanwhile."""
-        with self._slot():
-            process, closing = self._idle_one(key) or self._begun(key)
-            is_reusable = False
-            try:
-                yield process
-                is_reusable = True
-            except self._harmless:
-                is_reusable = True
-                raise
-            finally:
-                self._give_back((key, process, closing), is_reusable and process.is_running)
+        lent = self._obtained(key)
+        is_reusable = False
+        try:
+            yield lent[1]
+            is_reusable = True
+        except self._harmless:
+            is_reusable = True
+            raise
+        finally:
+            with self._lock:
+                self._lent.remove(lent)
+            self._give_back(lent, is_reusable and lent[1].is_running)
 
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
@@ -106,47 +98,80 @@ class Pool(Generic[K, ProcessT]):
         _close(gone)
 
     def close(self) -> None:
-        """Close all processes; one that is in use is closed as soon as it is given back."""
+        """Close all processes; whoever uses one finds that it has ended."""
         with self._lock:
             self._is_closed = True
+            lent = list(self._lent)
         self.forget(lambda _: True)
+        _close(lent)
 
-    @contextmanager
-    def _slot(self) -> Iterator[None]:
-        """Hold one of the slots, which whoever streams an answer does for longer than `run`."""
-        if not self._slots.acquire(timeout=WAIT_S):
-            raise _busy()
-        try:
-            yield
-        finally:
-            self._slots.release()
-
-    def _begun(self, key: K) -> tuple[ProcessT, ExitStack]:
-        with ExitStack() as closing:
-            return closing.enter_context(self._begin(key)), closing.pop_all()
-
-    def _idle_one(self, key: K) -> tuple[ProcessT, ExitStack] | None:
+    def _obtained(self, key: K) -> Lent[K, ProcessT]:
+        """Return the process that is free first: one that others give back, or a new one."""
         with self._lock:
-            found = next((one for one in reversed(self._idle) if one[0] == key), None)
-            if found is None:
-                return None
-            self._idle.remove(found)
-        if found[1].is_running:
-            return found[1:]
-        _close([found])
-        return self._idle_one(key)
+            found = self._idle_one(key)
+            if found is not None:
+                self._lent.append(found)
+                return found
+            waiting: Future[Lent[K, ProcessT]] = Future()
+            self._wanted.append((key, waiting))
+            self._begin_wanted(key)
+        return waiting.result()
 
-    def _give_back(self, lent: tuple[K, ProcessT, ExitStack], is_reusable: bool) -> None:
+    def _begin_wanted(self, key: K) -> None:
+        wanted = sum(one == key for one, _ in self._wanted)
+        if self._beginning.count(key) < min(wanted, BEGINNING):
+            self._beginning.append(key)
+            threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+
+    def _begin_one(self, key: K) -> None:
+        made: Lent[K, ProcessT] | BaseException
+        try:
+            with ExitStack() as closing:
+                made = key, closing.enter_context(self._begin(key)), closing.pop_all()
+        except BaseException as error:
+            made = error
+        with self._lock:
+            self._beginning.remove(key)
+            if isinstance(made, BaseException):
+                waiting = self._next_wanted(key)
+                if waiting is not None:
+                    waiting.set_exception(made)
+        if not isinstance(made, BaseException):
+            self._give_back(made, True)
+        with self._lock:
+            self._begin_wanted(key)
+
+    def _next_wanted(self, key: K) -> Future[Lent[K, ProcessT]] | None:
+        for number, (one, waiting) in enumerate(self._wanted):
+            if one == key:
+                del self._wanted[number]
+                return waiting
+        return None
+
+    def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
+        for number in range(len(self._idle) - 1, -1, -1):
+            if self._idle[number][0] == key:
+                found = self._idle.pop(number)
+                if found[1].is_running:
+                    return found
+                _close([found])
+        return None
+
+    def _give_back(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
         gone = [] if is_reusable else [lent]
         with self._lock:
-            if is_reusable:
+            waiting = self._next_wanted(lent[0]) if is_reusable else None
+            if waiting is not None:
+                self._lent.append(lent)
+                waiting.set_result(lent)
+            elif is_reusable:
                 self._idle.append(lent)
             while len(self._idle) > (0 if self._is_closed else self._most_idle):
                 gone.append(self._idle.pop(0))
         _close(gone)
 
 
-def _close(idle: list[tuple[K, ProcessT, ExitStack]]) -> None:
+def _close(idle: list[Lent[K, ProcessT]]) -> None:
     while idle:
         idle.pop()[-1].close()
 
@@ -158,32 +183,52 @@ class QueryPool:
     """Query sessions, which are kept for the next query about the same targets.
 
     Each is a process of its own with the guard of `starcat.query`; `run` calls what uses `session`
-    in a thread.
+    in a thread, when there is a place for it.
     """
 
     def __init__(self, settings: Settings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
-        self._open: Pool[Key, Session] = Pool(self._begin, settings.queries, IDLE, (QueryError,))
-        self.run = self._open.run
+        self._lanes = Lanes(SHORT_PLACES, settings.queries)
+        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
         self.close = self._open.close
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that only reads: where it takes long, it may be called again."""
+        return await self._lanes.run(self._limits.time_s, function, *args, **kwargs)
 
     @contextmanager
     def session(
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
-        """Give a session about some targets, which nobody else uses meanwhile."""
+        """Give a session about some targets, which nobody else uses meanwhile.
+
+        All that it is asked has one time together.
+        """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
-        with self._open.lend(tuple(map(_identity, targets))) as one:
-            yield replace(one, limits=limits)
+        place = lease.get()
+        with (
+            nullcontext() if place is None else place.used(),
+            self._open.lend(tuple(map(_identity, targets))) as one,
+        ):
+            time_of = Allowance if place is None else place.allowance
+            try:
+                yield replace(one, limits=limits, allowance=time_of(limits.time_s))
+            except QueryLimitError as error:
+                if place is not None and place.is_overdue:
+                    raise Overdue from error
+                raise
 
     def forget(self, target: str | Path) -> None:
         """Close the sessions about a target that is to be removed and that nobody uses."""
         name = str(target)
         self._open.forget(lambda key: name in [text for text, *_ in key])
 
-    def _begin(self, key: Key) -> AbstractContextManager[Session]:
-        return open_session([text for text, *_ in key], self._limits)
+    @contextmanager
+    def _begin(self, key: Key) -> Iterator[Session]:
+        with open_session([text for text, *_ in key], self._limits) as session:
+            warm_up(SPARE)
+            yield session
 
 
 def _identity(target: str | Path) -> tuple[str, int, int]:
@@ -193,11 +238,3 @@ def _identity(target: str | Path) -> tuple[str, int, int]:
     except OSError:
         return str(target), 0, 0
     return str(target), found.st_ino, found.st_mtime_ns
-
-
-def _busy() -> Problem:
-    return Problem(
-        503,
-        f"the service was busy for {WAIT_S:g} s: too many requests at once; ask again later",
-        headers={"Retry-After": f"{WAIT_S:.0f}"},
-    )

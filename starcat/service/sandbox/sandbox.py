@@ -9,18 +9,26 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Callable, Mapping
+from contextlib import closing, nullcontext
+from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from starcat.errors import QueryLimitError, error_of_kind
 from starcat.service.problems import Problem
 from starcat.service.sandbox.child import Child
+from starcat.service.sandbox.places import WAIT_S, Places, asker, held, in_thread
 from starcat.service.sandbox.pool import Pool
 from starcat.service.settings import Settings
 
 GIB = 2**30
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_has_place: ContextVar[bool] = ContextVar("has_place", default=False)
 
 
 class Sandbox:
@@ -30,13 +38,25 @@ class Sandbox:
         self._time_s = settings.query_time_s
         self._scratch = scratch
         self._memory_bytes = int(settings.query_memory_gib * GIB)
-        self._children: Pool[None, Child] = Pool(self._begin, settings.queries, settings.queries)
-        self.run = self._children.run
+        self._places = Places(settings.queries)
+        self._children: Pool[None, Child] = Pool(self._begin, settings.queries)
         self.close = self._children.close
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that has tasks done in a thread, when there is a place for it."""
+        who = asker.get()
+        await self._places.take_later(who, WAIT_S)
+        token = _has_place.set(True)
+        try:
+            return await in_thread(partial(function, *args, **kwargs))
+        finally:
+            _has_place.reset(token)
+            self._places.release(who)
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Have a task of `starcat.service.sandbox.worker.TASKS` done; its error is raised here."""
-        with self._children.lend(None) as child:
+        place = nullcontext() if _has_place.get() else held(self._places, asker.get())
+        with place, self._children.lend(None) as child:
             answer = self._answer(child, {"task": task, "arguments": arguments})
             if answer.get("kind") == "MemoryError":
                 raise Problem(

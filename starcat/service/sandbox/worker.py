@@ -7,6 +7,7 @@ run anything.
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import sys
@@ -20,7 +21,7 @@ from starcat.service.sandbox.child import own_output
 from starcat.vo.uploads import upload_facts
 
 if TYPE_CHECKING:
-    from starcat.images.solve_files import IdentifyOptions
+    from starcat.images.solve_files import FileAnswers, FrameAnswer, IdentifyOptions
     from starcat.matcher.matcher import Matcher
 
 MATCHERS = 4
@@ -56,8 +57,22 @@ def identify(
         "method": answers.matcher.method,
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
-        "more": [answers.for_page(answer) for answer in found] if for_page else [],
+        "more": [_for_page(answers, answer) for answer in found] if for_page else [],
     }
+
+
+def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
+    """Return what a page keeps of a frame beside its answer, to link to it and to save it."""
+    from starcat.images.image_file import wcs_header
+
+    mag, wcs = answer.frame.mag, None
+    if answer.result.ok:
+        header = wcs_header(answer.result, answers.path, flip=answers.options.flip)
+        wcs = header.decode("ascii")
+    brightness = None
+    if mag is not None:
+        brightness = [value if math.isfinite(value) else None for value in mag.tolist()]
+    return {"mag": brightness, "wcs": wcs, "is_image": answers.is_image}
 
 
 @lru_cache(maxsize=MATCHERS)
@@ -77,9 +92,18 @@ def convert(source: str, target: str, form: str) -> int:
         return write_batches(stream, Path(target), form)
 
 
+def flight_image(artifact: str, target: str, method: str, endian: str) -> int:
+    """Write the image of a database for flight software; return its size, bytes."""
+    from starcat.exchange.onboard import export_image
+
+    made = export_image(Path(artifact), "onboard", Path(target), method=method, endian=endian)
+    return len(made.made.data)
+
+
 TASKS: dict[str, Callable[..., Any]] = {
     "identify": identify,
     "convert": convert,
+    "flight_image": flight_image,
     "upload": upload_facts,
 }
 

@@ -19,6 +19,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
@@ -27,8 +28,9 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from starcat.service.problems import Problem, as_json
+from starcat.service.sandbox.places import asker
 from starcat.service.security.metrics import Metrics
-from starcat.service.security.request_limits import BodyLimits, address_of
+from starcat.service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, address_of
 from starcat.service.settings import Settings
 
 ID_HEADER = "X-Request-ID"
@@ -200,17 +202,20 @@ class Refusals(_HttpMiddleware):
         super().__init__(app)
         self._checks = checks
         self._limits = limits
+        self._shares = Shares(OWN_CONNECTIONS)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        try:
-            for check in self._checks:
-                check(scope)
-            limited = self._limits.limited(scope, receive)
-        except Problem as problem:
-            await as_json(problem)(scope, receive, send)
-            return
-        await self._app(scope, limited, send)
+        with ExitStack() as counted:
+            try:
+                for check in self._checks:
+                    check(scope)
+                counted.enter_context(self._shares.one(asker.get()))
+                limited = self._limits.limited(scope, receive)
+            except Problem as problem:
+                await as_json(problem)(scope, receive, send)
+                return
+            await self._app(scope, limited, send)
 
 
 class Defects(_HttpMiddleware):

@@ -7,8 +7,9 @@ import math
 import re
 import shutil
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
@@ -35,6 +36,12 @@ MIB, GIB = 2**20, 2**30
 FILLING = ("/tap/async",)
 """Where a POST makes something that stays on the disk; jobs see to their room themselves."""
 
+CONNECTIONS = 1_000
+"""Connections at the same time; of more, the server says that it is busy."""
+
+OWN_CONNECTIONS = CONNECTIONS // 5
+"""Connections of one address, and requests of one user, at the same time."""
+
 MOST_BUCKETS = 10_000
 """Keys that are remembered; of more, those that were quiet for longest are forgotten."""
 
@@ -58,6 +65,31 @@ class Buckets:
         if len(self._left) > MOST_BUCKETS:
             self._left.popitem(last=False)
         return wait_s
+
+
+class Shares:
+    """How many requests of each user are answered at the same time, and how many may be."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._running: Counter[str] = Counter()
+
+    @contextmanager
+    def one(self, who: str) -> Iterator[None]:
+        """Count a request while it is answered; a `Problem` where there are too many."""
+        if self._running[who] >= self._most:
+            raise Problem(
+                429,
+                f"{self._most} of your requests are being answered; ask again when some are",
+                headers=later(1.0),
+            )
+        self._running[who] += 1
+        try:
+            yield
+        finally:
+            self._running[who] -= 1
+            if not self._running[who]:
+                del self._running[who]
 
 
 def later(wait_s: float) -> Mapping[str, str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+import time
 from collections.abc import AsyncIterator, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -26,6 +27,7 @@ from starlette.types import Receive, Scope, Send
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
+from starcat.service.sandbox.places import SHORT_S, Lease, Overdue, lease
 from starcat.service.service import Service, TheService, service_of
 from starcat.service.transfers import body_type, scratch_folder
 from starcat.vo.documents import (
@@ -50,6 +52,9 @@ READ_BYTES = 1 << 18
 
 LOOK_S = 1.0
 """How often a reader that waits looks whether the answer has ended."""
+
+TICK_S = 0.02
+"""How often it is looked whether an answer has got a place where it may take long."""
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
 """Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
@@ -224,6 +229,20 @@ class Spool:
             at += len(part)
             yield part
 
+    def settle(self, place: Lease) -> None:
+        """Wait until the answer is whole, or has a place where it may take long.
+
+        Until then it can still be begun again, for which `Overdue` is raised: nothing was sent.
+        """
+        until_s = time.monotonic() + SHORT_S
+        with self._changed:
+            while not (self._is_done or place.is_long or time.monotonic() > until_s):
+                self._changed.wait(TICK_S)
+        if isinstance(self._error, Overdue):
+            raise self._error
+        if not (self._is_done or place.prolong()):
+            raise Overdue
+
     def close(self) -> None:
         """End the making, and forget what was made."""
         self._gone.set()
@@ -293,7 +312,15 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")
-    return first, Spool(parts, service.paths.scratch, gone)
+    rest = Spool(parts, service.paths.scratch, gone)
+    place = lease.get()
+    if place is not None:
+        try:
+            rest.settle(place)
+        except Overdue:
+            rest.close()
+            raise
+    return first, rest
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing
-from starcat.service.jobs.job import QUERY, Attempt, Outcome
+from starcat.service.jobs.job import ASKER, QUERY, Attempt, Outcome
 from starcat.service.paths import JOB_ID, ServicePaths, checked
 from starcat.service.problems import Problem, problem_of
 from starcat.service.records import Records
+from starcat.service.sandbox.places import asker
 from starcat.service.vo.tap_queries import Tap
 from starcat.storage.atomic import make_folder, whole_file
 from starcat.vo.parameters import Parameters, Upload, question
@@ -28,7 +29,7 @@ RESULT = "result"
 """Name of the file with the answer, in the folder of a job."""
 
 MAX_WAITING = 100
-"""Jobs of one user that may be pending, queued or executing."""
+"""Jobs of one user, or of one address, that may be pending, queued or executing."""
 
 RETRY_S = 0.5
 """How long to wait before asking again for a session while all are in use."""
@@ -65,18 +66,25 @@ class QueryJobs:
         """Make a job without parameters, which is not run yet."""
         self.sweep()
         job_id, now_s = secrets.token_hex(16), time.time()
-        request = {"parameters": [], "files": {}, "run_id": "", "limit_s": self._tap.limits.run_s}
-        make_folder(self.folder(job_id))
+        request = {
+            "parameters": [],
+            "files": {},
+            "run_id": "",
+            "limit_s": self._tap.limits.run_s,
+            ASKER: asker.get(),
+        }
         with self._records.writing() as connection:
             [waiting] = connection.execute(
-                "SELECT count(*) FROM jobs WHERE kind = ? AND owner = ? AND state IN (?, ?, ?)",
-                (QUERY, owner, *ACTIVE),
+                "SELECT count(*) FROM jobs WHERE kind = ? AND owner = ? AND state IN (?, ?, ?) "
+                f"AND json_extract(request, '$.{ASKER}') = ?",
+                (QUERY, owner, *ACTIVE, asker.get()),
             ).fetchone()
             if waiting >= MAX_WAITING:
                 raise ConfigError(
-                    f"{waiting} jobs of {owner} are not at their end, and so many are allowed; "
-                    "run, abort or delete some"
+                    f"{waiting} of your jobs are not at their end, and so many are allowed; run, "
+                    "abort or delete some"
                 )
+            make_folder(self.folder(job_id))
             connection.execute(
                 "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, "
                 "destroyed_s) VALUES (?, ?, '', ?, '', 'pending', ?, ?, ?)",
@@ -170,6 +178,7 @@ class QueryJobs:
                 raise _Unwanted
 
         job_id = attempt.job.id
+        asker.set(attempt.job.request.get(ASKER, attempt.job.owner))
         try:
             while True:
                 try:

@@ -1,6 +1,8 @@
 // The SQL console: the answer comes without the page being loaded again; Ctrl and Enter run.
 
+import { startSky } from "./skyview.js";
 import { announce } from "./starcat.js";
+import { startTables } from "./tables.js";
 
 const form = document.getElementById("console");
 const query = document.getElementById("query");
@@ -35,6 +37,8 @@ form.addEventListener("submit", async (event) => {
     if (found.headers.get("Content-Type")?.startsWith("text/html")) answer.innerHTML = text;
     else answer.textContent = JSON.parse(text).detail;
     history.replaceState(null, "", `?${wanted}`);
+    startTables(answer);
+    for (const root of answer.querySelectorAll(".skyview[data-sky]")) startSky(root);
     announce(document.getElementById("answer-count")?.textContent ?? "The query failed");
   } catch (error) {
     if (error.name === "AbortError") return;

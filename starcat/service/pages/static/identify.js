@@ -40,7 +40,7 @@ if (form) {
     answer.setAttribute("aria-busy", "true");
     announce("Identifying");
   });
-  if (answer.dataset.link) goTo(answer.dataset.link.replace("/identify", ""));
+  if (answer.dataset.link && !location.search) goTo(answer.dataset.link.replace("/identify", ""));
 
   // Browsers save no address of more than 2 MB as a file: it is made one first.
   answer.addEventListener("click", (event) => {

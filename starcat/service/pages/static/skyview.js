@@ -11,6 +11,7 @@ const LEAST_DEG = 0.05;
 const REST_MS = 220; // how long the view has been still before stars are asked for
 const REACH_PX = 14; // how near a star the pointer is that means it
 const NAMED = 18; // stars whose names are written
+const MOST_LABELS = 60; // of marks
 const STEPS_DEG = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30];
 const POLE = direction(192.85948, 27.12825); // of the Milky Way: ESA SP-1200, equation 1.5.11
 const COLOURS = {
@@ -158,7 +159,7 @@ class Sky {
       this.stars = found.stars.map((one) => ({ ...one, u: direction(one.ra_deg, one.dec_deg) }));
       this.root.dataset.state = "stars";
       this.root.dataset.count = this.stars.length;
-      this.paint();
+      this.draw(); // at once: a star is found where it was drawn
     } catch (error) {
       if (error.name !== "AbortError") this.tell(`The stars cannot be loaded: ${error.message}`);
     }
@@ -322,7 +323,7 @@ class Sky {
     pen.strokeStyle = "rgb(0 0 0 / 70%)";
     pen.lineWidth = 3;
     pen.lineJoin = "round";
-    for (const one of named.slice(0, NAMED + this.marks.length)) {
+    for (const one of named.slice(0, NAMED + Math.min(this.marks.length, MOST_LABELS))) {
       const [text, x, y] = [one.name || one.label, one.x + 9, one.y + 4];
       pen.strokeText(text, x, y);
       pen.fillText(text, x, y);

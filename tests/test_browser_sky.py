@@ -1,0 +1,297 @@
+"""Tasks of people in a real browser, from a fresh root with one database, each with its clicks.
+
+The view of the sky, identifying, downloads and publishing. A click is a click on something, a key
+that stands for one, or a file that is chosen; what is typed is not counted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from browsing import NEEDS_BROWSER, launched, look, opened
+from served import Served, serve
+from services import DATABASE, add_database
+
+from starcat.geometry.camera import Camera
+from starcat.images.render import write_simulated
+from starcat.matcher.database import open_database
+from starcat.simulation.simulate import Noise, simulate_frames
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+
+
+@pytest.fixture(scope="module")
+def small_artifact(picky_artifact: Path) -> Path:
+    return picky_artifact
+
+
+@pytest.fixture(scope="module")
+def served(small_artifact: Path, tmp_path_factory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("tasks")
+    add_database(folder / "service", small_artifact)
+    with serve(folder / "service", folder / "log", anonymous="publisher") as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def page(served: Served) -> Iterator[Page]:
+    with launched() as browser, opened(browser, served.address) as page:
+        page.clicks = 0
+        yield page
+        assert page.complaints == []
+
+
+def click(page: Page, role: str, name: str | re.Pattern[str], **more: object) -> None:
+    """Click on something, and count it."""
+    page.get_by_role(role, name=name, **more).first.click()
+    page.clicks += 1
+
+
+def begin(page: Page) -> None:
+    look(page, "light", 1280)
+    page.goto("/")
+    page.clicks = 0
+
+
+def sky_of(page: Page, state: str = "stars") -> None:
+    page.locator(f".skyview[data-state={state}]").wait_for()
+
+
+@pytest.fixture(scope="module")
+def picture(small_artifact: Path, tmp_path_factory) -> Path:
+    """A picture by the camera of the database."""
+    return picture_by(open_database(small_artifact).camera, small_artifact, tmp_path_factory)
+
+
+def picture_by(camera: Camera, artifact: Path, tmp_path_factory) -> Path:
+    stars = open_database(artifact)
+    path = tmp_path_factory.mktemp("frame") / "frame.png"
+    frame = next(simulate_frames(stars.directions, camera, 1, Noise(0.2), 7, mag=stars.mag))
+    write_simulated(path, frame, camera, 7)
+    return path
+
+
+def test_task_the_weakest_sky(page, small_artifact):
+    begin(page)
+    click(page, "link", "small 1.0.0")
+    click(page, "link", "Coverage")
+    sky_of(page, "stars")
+    click(page, "button", "Emptiest field, next")
+    page.locator(".skyview[data-field]").wait_for()
+    assert page.clicks <= 3
+    rows = (small_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
+    counts = [int(row.split(",")[3]) for row in rows]
+    least = min(counts)
+    chosen = page.locator(".chosen .what").inner_text()
+    assert chosen.startswith(f"Field {counts.index(least)}: {least} guide star")
+    page.wait_for_url(re.compile(rf"field={counts.index(least)}"))
+    kept = page.url
+    click(page, "button", "Emptiest field, next")
+    assert page.locator(".chosen .what").inner_text() != chosen
+    page.goto(kept)
+    page.locator(".chosen .what", has_text=chosen).wait_for()  # the address keeps the view
+    page.locator(".chosen a", has_text="Its stars as rows").click()
+    page.locator("#answer-count", has_text=f"{least} row").wait_for()
+
+
+def test_the_sky_zooms_pans_and_names_its_stars(page):
+    page.goto(f"/databases/{DATABASE}/coverage")
+    sky_of(page)
+    canvas = page.locator(".skyview canvas")
+    size = "document.querySelector('.skyview').sky.at.size"
+    click(page, "button", "Zoom in")
+    assert page.evaluate(size) == 90
+    canvas.focus()
+    before = page.evaluate("document.querySelector('.skyview').sky.at.ra")
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("document.querySelector('.skyview').sky.at.ra") != before
+    page.keyboard.press("+")
+    assert page.evaluate(size) < 90
+    page.wait_for_url(re.compile(r"[?&]at=[0-9.]+%2C"))
+    click(page, "button", "Whole sky")
+    assert page.evaluate(size) == 360
+    box = canvas.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.wheel(0, -300)
+    assert page.evaluate(size) < 180
+    middle = "document.querySelector('.skyview').sky.at.dec"
+    dec = page.evaluate(middle)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2 + 60, steps=4)
+    page.mouse.up()
+    assert page.evaluate(middle) > dec + 1
+    page.goto(f"/databases/{DATABASE}/coverage")
+    sky_of(page)
+    page.evaluate("window.all = document.querySelector('.skyview').sky.stars")
+    for kind, told in (("guide", "guide star"), ("rejected", "rejected: ")):
+        where = page.evaluate(
+            """kind => { const sky = document.querySelector('.skyview').sky;
+            const one = window.all.find((star) => star.kind === kind);
+            sky.stars = window.all; sky.go(one.ra_deg, one.dec_deg, 12); sky.draw();
+            const box = sky.canvas.getBoundingClientRect();
+            return [box.left + one.x, box.top + one.y, one.label]; }""",
+            kind,
+        )
+        page.mouse.move(where[0], where[1])
+        page.locator(".skyview .readout", has_text=told).wait_for()
+        assert where[2] in page.locator(".skyview .readout").inner_text()
+        page.mouse.click(where[0], where[1])
+        row = page.locator(".chosen a", has_text="Its row").get_attribute("href")
+        assert f"/databases/{DATABASE}/sql?query=SELECT" in row
+        assert "simbad" in page.locator(".chosen a", has_text="SIMBAD").get_attribute("href")
+        assert "I%2F131A" in page.locator(".chosen a", has_text="VizieR").get_attribute("href")
+    page.goto(row)
+    page.locator("#answer-count", has_text="1 row").wait_for()
+
+
+def test_the_outline_of_a_field_turns_with_the_roll(page):
+    page.goto(f"/databases/{DATABASE}/coverage?field=3&at=10,20,60,0")
+    page.locator(".skyview[data-field='3']").wait_for()
+    outline = """roll => { const sky = document.querySelector('.skyview').sky; sky.setRoll(roll);
+        const u = sky.outline(sky.fields.ra[3], sky.fields.dec[3], sky.at.roll); return u[0]; }"""
+    first, turned, whole = (page.evaluate(outline, roll) for roll in (0, 30, 360))
+    assert first == pytest.approx(whole, abs=1e-9)
+    assert first != pytest.approx(turned, abs=0.01)
+    assert sum(one * one for one in turned) == pytest.approx(1.0)
+
+
+def test_task_identify_a_picture(page, picture):
+    begin(page)
+    click(page, "link", "Identify")
+    page.get_by_label("Images or files of centroids").set_input_files(picture)
+    page.clicks += 1
+    click(page, "button", re.compile("^Identify$"))
+    page.locator("#attitude .badge", has_text="identified").wait_for()
+    assert page.clicks <= 3
+    sky_of(page)
+    assert page.evaluate("document.querySelector('.skyview').sky.marks.length") >= 4
+    page.wait_for_url(re.compile(r"centroids="))  # the address has become the answer's
+    quaternion = page.locator("#answer dl.facts dd code").first.inner_text()
+    page.reload()
+    again = page.locator("#answer dl.facts dd code").first.inner_text()
+    assert again[:8] == quaternion[:8]
+
+
+def test_task_identify_one_of_another_camera(page, small_artifact, tmp_path_factory):
+    camera = Camera(800, 600, fov_x_deg=44.0)
+    taken = picture_by(camera, small_artifact, tmp_path_factory)
+    begin(page)
+    click(page, "link", "Identify")
+    page.get_by_label("Images or files of centroids").set_input_files(taken)
+    page.clicks += 1
+    page.get_by_text("Another camera").click()
+    page.clicks += 1
+    for label, value in (
+        ("Width px", "800"),
+        ("Height px", "600"),
+        ("Field across the width deg", "44"),
+    ):
+        page.get_by_label(label, exact=True).fill(value)
+    click(page, "button", re.compile("^Identify$"))
+    page.locator("#attitude .badge", has_text="identified").wait_for()
+    assert page.clicks <= 4
+    field = page.locator("#answer dl.facts").inner_text()
+    assert re.search(r"4[34]\.\d{4}°", field)
+
+
+def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
+    page.goto(f"/identify?database={DATABASE}&seed=7")
+    table = page.locator("#star-table")
+    assert table.evaluate("t => t.scrollWidth <= t.parentElement.clientWidth")
+    click(page, "button", "Magnitude")
+    cells = table.locator("tbody tr td:nth-child(2)").all_inner_texts()
+    assert [float(one) for one in cells] == sorted(float(one) for one in cells)
+    click(page, "button", "Magnitude")
+    assert table.locator("tbody tr td:nth-child(2)").all_inner_texts() == cells[::-1]
+    first = table.locator(".star-name").first.inner_text()
+    page.get_by_label("Filter").first.fill(first)
+    assert table.locator("tbody tr:visible .star-name").first.inner_text() == first
+    assert table.locator("tbody tr:visible").count() < len(cells)
+    page.reload()
+    assert table.locator("tbody tr:visible").count() < len(cells)
+    assert "sort.star-table=-Magnitude" in page.url
+
+
+def test_task_the_flight_image_is_that_of_export(page, small_artifact, tmp_path):
+    begin(page)
+    click(page, "link", "small 1.0.0")
+    with page.expect_download() as download:
+        click(page, "button", "Download the flight image")
+    assert page.clicks <= 2
+    download.value.save_as(tmp_path / "browser.img")
+    assert download.value.suggested_filename == "small-1.0.0.img"
+    export = [sys.executable, "-m", "starcat", "export", small_artifact, "--to", "onboard"]
+    command = [*export, "-o", tmp_path / "own.img"]
+    subprocess.run(command, check=True, capture_output=True, timeout=50)
+    digests = {hashlib.sha256((tmp_path / name).read_bytes()).digest()
+               for name in ("browser.img", "own.img")}  # fmt: skip
+    assert len(digests) == 1
+
+
+def test_task_publish_and_pull(page, tmp_path):
+    begin(page)
+    click(page, "link", "small 1.0.0")
+    click(page, "link", "Publish")
+    click(page, "button", "Publish")
+    page.get_by_text("Publish small 1.0.0 for good?").wait_for()
+    click(page, "button", "Publish for good")
+    page.get_by_text("small-1.0.0 is published.").wait_for()
+    assert page.clicks <= 4
+    pull = page.locator("#small-1\\.0\\.0 pre code").inner_text()
+    command = [sys.executable, "-m", *pull.split(), "--output", tmp_path / "pulled"]
+    lock = ["--lock", tmp_path / "starcat.lock"]
+    subprocess.run([*command, *lock], check=True, capture_output=True, timeout=50)
+    assert (tmp_path / "pulled" / "small-1.0.0" / "database.h5").is_file()
+
+
+def test_an_answer_of_sql_is_in_the_sky_and_in_its_address(page):
+    page.goto(f"/databases/{DATABASE}/sql")
+    page.get_by_label("Query").fill("SELECT star_id, mag, ra_deg, dec_deg FROM stars LIMIT 8")
+    page.keyboard.press("Control+Enter")
+    page.locator("#answer-count", has_text="8 rows").wait_for()
+    assert "query=SELECT+star_id" in page.url
+    page.get_by_text("In the sky").click()
+    sky_of(page)
+    assert page.evaluate("document.querySelector('#answer .skyview').sky.marks.length") == 8
+
+
+ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",
+             "/sql?query=SELECT+designation,ra_deg,dec_deg+FROM+stars+LIMIT+9",
+             "/identify?seed=7", "/identify", "/releases")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "looks",
+    [
+        (("light", 360), ("dark", 1280)),
+        pytest.param((("dark", 360), ("light", 1280)), marks=pytest.mark.slow),
+    ],
+    ids=["light and narrow, dark and wide", "dark and narrow, light and wide"],
+)
+def test_pages_of_the_sky_pass_axe_and_fit_their_window(page, looks):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    found = []
+    for one in ADDRESSES:
+        is_own = one.startswith(("/databases", "/identify", "/releases"))
+        address = one if is_own else f"/databases/{DATABASE}{one}"
+        page.goto(address.replace("?seed", f"?database={DATABASE}&seed"))
+        for details in page.locator("main details").all():
+            details.evaluate("one => { one.open = true; }")
+        for theme, width in looks:
+            look(page, theme, width)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, address
+            for one in axe.run(page).response["violations"]:
+                nodes = [node["html"][:160] for node in one["nodes"][:3]]
+                found.append((address, theme, width, one["id"], nodes))
+    look(page, "light", 1280)
+    assert found == []
