@@ -271,7 +271,7 @@ def test_a_file_is_dropped(identified, page):
     assert page.locator("#file").evaluate("input => input.files[0].name") == "dropped.csv"
     with page.expect_navigation():
         page.get_by_role("button", name="Identify", exact=True).click()
-    assert "fewer than 4 spots" in page.locator("#answer").inner_text()
+    assert "fewer than 4 centroids" in page.locator("#answer").inner_text()
 
 
 # What a page owes everybody

@@ -15,7 +15,7 @@ from starcat.images.centroiding import find_spots
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
 from starcat.images.solve_files import (
-    FOV_ERROR_OF_IMAGES,
+    FOV_ERROR,
     IdentifyOptions,
     LocalInputs,
     identify_file,
@@ -228,9 +228,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     write_image(path, render_image(places, mag, size, optics, 5))
     measured = measure(path)
     [frame] = measured.frames
-    first = matcher.identify(
-        frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR_OF_IMAGES
-    )
+    first = matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
     [answer] = identify_file(path, matcher)
     assert answer.result.ok

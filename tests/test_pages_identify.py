@@ -225,8 +225,8 @@ def test_the_table_has_the_names_of_the_picture():
 def test_a_refusal_has_the_words_of_the_matcher(client):
     few = asked(client, centroids="10 10\n200 300\n30 400")
     assert few.status_code == 200
-    assert "fewer than 4 spots of the frame are usable" in few.text
-    assert "find more spots" in few.text
+    assert "fewer than 4 centroids of the frame are usable" in few.text
+    assert "find more stars" in few.text
     none = asked(client, centroids="10 10\n200 300\n30 400\n17 90\n400 22\n350 351")
     assert "not identified" in none.text
 

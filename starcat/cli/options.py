@@ -61,8 +61,7 @@ FrameSize = Annotated[
     typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
 ]
 FovError = Annotated[
-    str | None,
-    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5% for images."),
+    str | None, typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5%.")
 ]
 MinShare = Annotated[
     float | None,
