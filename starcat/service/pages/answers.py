@@ -36,6 +36,11 @@ class ShownFrame:
     is_loose: bool = False  # a picture, whose field may be off where nothing is said
 
     @property
+    def is_identified(self) -> bool:
+        """Whether it has an attitude."""
+        return bool(self.content["status"] == "identified")
+
+    @property
     def stars(self) -> list[dict[str, Any]]:
         """The spots that are stars."""
         return [one for one in self.content["stars"] if one["star"] is not None]
@@ -48,6 +53,7 @@ class Shown:
     database: str
     method: str
     frames: Sequence[ShownFrame]
+    first: ShownFrame  # that which is shown in full
     json: str = field(init=False)
     csv: str = field(init=False)
 
@@ -57,15 +63,9 @@ class Shown:
         object.__setattr__(self, "csv", _address(csv_of(answered), "csv"))
 
     @property
-    def first(self) -> ShownFrame:
-        """The frame that is shown in full: the first that is identified, or was looked at."""
-        good = [one for one in self.frames if one.content["status"] == "identified"]
-        return (good or [one for one in self.frames if not one.unusable] or list(self.frames))[0]
-
-    @property
     def identified(self) -> int:
         """How many frames are identified."""
-        return sum(one.content["status"] == "identified" for one in self.frames)
+        return sum(one.is_identified for one in self.frames)
 
 
 def shown_frames(
