@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -90,9 +90,7 @@ class IdentifyOptions(BaseModel):
     max_steps: int | None = Field(None, ge=1, description="Steps of a search.")
     time_limit_s: float | None = Field(None, ge=0.001, description="Seconds that a frame may take.")
     flip: bool | None = Field(None, description="First row at the bottom; y upwards.")
-    time: str | None = Field(
-        None, max_length=40, description="Time of the frames, UTC: aberration and planets."
-    )
+    time: str | None = Field(None, max_length=40, description="UTC: aberration and planets.")
     psf_sigma_px: float | None = Field(
         None, ge=0.3, le=20, description="Width of a star in an image; by default measured."
     )
@@ -435,10 +433,6 @@ def answers_of(
         camera = parse_camera(options.camera, Path(CAMERA_NAME))
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
-    if options.time is not None and local.observer is None:
-        from starcat.sky.observer import Observer
-
-        local = replace(local, observer=Observer.at(options.time))
     return FileAnswers(path, matcher, measured, camera, options, local, tracker)
 
 

@@ -41,13 +41,21 @@ def identify(
 
     A page is told more of each frame: the brightness of its centroids, and its WCS.
     """
-    from starcat.images.solve_files import MATCHER_OPTIONS, IdentifyOptions, identify_file
+    from starcat.images.solve_files import (
+        MATCHER_OPTIONS,
+        IdentifyOptions,
+        LocalInputs,
+        identify_file,
+    )
+    from starcat.sky.observer import Observer
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
     # What is not about the matcher does not open another.
     own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
-    answers = identify_file(Path(file), _matcher(artifact, own), chosen)
+    observer = None if chosen.time is None else Observer.at(chosen.time)
+    matcher, local = _matcher(artifact, own), LocalInputs(observer=observer)
+    answers = identify_file(Path(file), matcher, chosen, local)
     found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
@@ -72,7 +80,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
     brightness = None
     if mag is not None:
         brightness = [value if math.isfinite(value) else None for value in mag.tolist()]
-    return {"mag": brightness, "wcs": wcs, "is_image": answers.is_image}
+    return {"mag": brightness, "wcs": wcs}
 
 
 @lru_cache(maxsize=MATCHERS)
