@@ -37,8 +37,9 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.picture import draw
-from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs, MeasuredFile
+from starcat.images.solve_files import FileAnswers, LocalInputs, MeasuredFile
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame, upside_down
-from starcat.matcher.result import MatchResult, Reason, Refusal
+from starcat.matcher.refusal import Reason, Refusal
+from starcat.matcher.result import MatchResult
 
 FOV_ERROR = 0.05
 """Error of the focal length that is allowed where none is stated. Data sheets are off by so much:

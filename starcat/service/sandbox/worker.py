@@ -21,7 +21,8 @@ from starcat.service.sandbox.child import own_output
 from starcat.vo.uploads import upload_facts
 
 if TYPE_CHECKING:
-    from starcat.images.solve_files import FileAnswers, FrameAnswer, IdentifyOptions
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.solve_files import FileAnswers, FrameAnswer
     from starcat.matcher.matcher import Matcher
 
 MATCHERS = 4
@@ -41,21 +42,14 @@ def identify(
 
     A page is told more of each frame: the brightness of its centroids, and its WCS.
     """
-    from starcat.images.solve_files import (
-        MATCHER_OPTIONS,
-        IdentifyOptions,
-        LocalInputs,
-        identify_file,
-    )
-    from starcat.sky.observer import Observer
+    from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
+    from starcat.images.solve_files import identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
     # What is not about the matcher does not open another.
     own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
-    observer = None if chosen.time is None else Observer.at(chosen.time)
-    matcher, local = _matcher(artifact, own), LocalInputs(observer=observer)
-    answers = identify_file(Path(file), matcher, chosen, local)
+    answers = identify_file(Path(file), _matcher(artifact, own), chosen)
     found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
