@@ -12,11 +12,6 @@ from typing import Any
 from urllib.parse import urlencode
 
 from starcat.images.picture import short_name
-<<<<<<< HEAD
-=======
-from starcat.images.second_look import FOV_ERROR
-from starcat.matcher.settings import SCALE_FREE
->>>>>>> main
 from starcat.service.pages.sky import names_of
 
 MOST_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
@@ -124,11 +119,6 @@ def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
             lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
         values.pop("camera.flip", None)  # of what was measured y counts down
-<<<<<<< HEAD
-=======
-        if is_loose and not (values.get("field_error") or values.get("fov_from")):
-            values["field_error"] = f"{100 * FOV_ERROR:g}"
->>>>>>> main
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MOST_LINK else ""
 
