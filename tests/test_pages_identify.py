@@ -216,7 +216,7 @@ def test_the_table_has_the_names_of_the_picture():
         ]
         + [{"x_px": 3.0, "y_px": 4.0, "star": None, "mag": None}],
     }
-    found = {"frames": [content], "more": [{"mag": None, "wcs": None, "is_image": False}],
+    found = {"frames": [content], "more": [{"mag": None, "wcs": None}],
              "notes": [], "method": "triangle"}  # fmt: skip
     [frame] = shown_frames(found, {"database": DATABASE}, 2016.0)
     assert [one["name"] for one in frame.stars] == ["Procyon", "Gaia …23456789"]
