@@ -189,17 +189,12 @@ def test_task_identify_one_of_another_camera(page, small_artifact, tmp_path_fact
     click(page, "link", "Identify")
     page.get_by_label("Images or files of centroids").set_input_files(taken)
     page.clicks += 1
-    page.get_by_text("Another camera").click()
-    page.clicks += 1
-    for label, value in (
-        ("Width px", "800"),
-        ("Height px", "600"),
-        ("Field across the width deg", "44"),
-    ):
-        page.get_by_label(label, exact=True).fill(value)
+    page.locator("#other-camera[open]").wait_for()  # its size is not that of the database's
+    assert page.get_by_label("Width px", exact=True).input_value() == "800"
+    page.get_by_label("Field across the width deg", exact=True).fill("44")
     click(page, "button", re.compile("^Identify$"))
     page.locator("#attitude .badge", has_text="identified").wait_for()
-    assert page.clicks <= 4
+    assert page.clicks <= 3
     field = page.locator("#answer dl.facts").inner_text()
     assert re.search(r"4[34]\.\d{4}°", field)
 
