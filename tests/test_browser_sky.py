@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -217,7 +215,7 @@ def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
     assert "sort.star-table=-Magnitude" in page.url
 
 
-def test_task_the_flight_image_is_that_of_export(page, small_artifact, tmp_path):
+def test_task_the_flight_image_is_that_of_export(page, small_artifact, starcat, tmp_path):
     begin(page)
     click(page, "link", "small 1.0.0")
     with page.expect_download() as download:
@@ -225,15 +223,14 @@ def test_task_the_flight_image_is_that_of_export(page, small_artifact, tmp_path)
     assert page.clicks <= 2
     download.value.save_as(tmp_path / "browser.img")
     assert download.value.suggested_filename == "small-1.0.0.img"
-    export = [sys.executable, "-m", "starcat", "export", small_artifact, "--to", "onboard"]
-    command = [*export, "-o", tmp_path / "own.img"]
-    subprocess.run(command, check=True, capture_output=True, timeout=50)
+    to = ["--to", "onboard", "-o", tmp_path / "own.img"]
+    assert starcat(["export", small_artifact, *to]).code == 0
     digests = {hashlib.sha256((tmp_path / name).read_bytes()).digest()
                for name in ("browser.img", "own.img")}  # fmt: skip
     assert len(digests) == 1
 
 
-def test_task_publish_and_pull(page, tmp_path):
+def test_task_publish_and_pull(page, starcat, tmp_path):
     begin(page)
     click(page, "link", "small 1.0.0")
     click(page, "link", "Publish")
@@ -243,9 +240,9 @@ def test_task_publish_and_pull(page, tmp_path):
     page.get_by_text("small-1.0.0 is published.").wait_for()
     assert page.clicks <= 4
     pull = page.locator("#small-1\\.0\\.0 pre code").inner_text()
-    command = [sys.executable, "-m", *pull.split(), "--output", tmp_path / "pulled"]
     lock = ["--lock", tmp_path / "starcat.lock"]
-    subprocess.run([*command, *lock], check=True, capture_output=True, timeout=50)
+    pulled = starcat([*pull.split()[1:], "--output", tmp_path / "pulled", *lock])
+    assert pulled.code == 0, pulled.err
     assert (tmp_path / "pulled" / "small-1.0.0" / "database.h5").is_file()
 
 
