@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from starcat.images.picture import short_name
+from starcat.images.second_look import WIDE_FOV_ERROR
 from starcat.service.pages.sky import names_of
 
 MOST_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
@@ -19,6 +20,9 @@ COLUMNS = (
     *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
     *("dx_px", "dy_px", "separation_arcsec", "dropped"),
 )  # of a CSV of answers
+
+REMEDIES = {"mirrored": "camera.flip=on", "scale": f"field_error={100 * WIDE_FOV_ERROR:g}"}
+"""What is to be changed in an address where a second look has found why there is no answer."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,12 @@ class ShownFrame:
     def is_identified(self) -> bool:
         """Whether it has an attitude."""
         return bool(self.content["status"] == "identified")
+
+    @property
+    def remedy(self) -> str:
+        """The address that does what a refusal advises; empty where no field of the page does."""
+        change = REMEDIES.get(self.content.get("refusal", {}).get("reason", ""), "")
+        return f"{self.link}&{change}" if self.link and change else ""
 
     @property
     def stars(self) -> list[dict[str, Any]]:
