@@ -21,7 +21,6 @@ from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry.camera import Camera
 from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
-from starcat.images.second_look import FOV_ERROR
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -135,7 +134,7 @@ async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dic
         "errors_arcsec": _errors(first.content),
         "field_deg": _field_deg(first.content, asked.camera),
         "view": _view(first, asked.database, asked.camera),
-        "options": _options_told(asked.options, first),
+        "options": _options_told(asked.options),
     }
 
 
@@ -151,12 +150,9 @@ def _frames(
     return shown_frames(found, given, epoch_jyear), drawn, str(found["method"])
 
 
-def _options_told(options: IdentifyOptions, frame: ShownFrame) -> dict[str, Any]:
-    """Return the options of a frame as a program states them."""
-    told = options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
-    if frame.is_loose and not {"fov_error", "fov_deg"} & set(told):
-        told["fov_error"] = FOV_ERROR
-    return told
+def _options_told(options: IdentifyOptions) -> dict[str, Any]:
+    """Return options as a program states them for centroids whose y counts down."""
+    return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
 
 
 def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:

@@ -74,7 +74,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
     brightness = None
     if mag is not None:
         brightness = [value if math.isfinite(value) else None for value in mag.tolist()]
-    return {"mag": brightness, "wcs": wcs, "is_image": answers.is_image}
+    return {"mag": brightness, "wcs": wcs}
 
 
 @lru_cache(maxsize=MATCHERS)
