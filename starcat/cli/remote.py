@@ -12,7 +12,6 @@ import typer
 
 from starcat.cli.console import say
 from starcat.errors import ConfigError, FileMissing, QueryError
-from starcat.matcher.centroids import NO_SUCH_FRAME
 
 if TYPE_CHECKING:
     from starcat.cli.queries import Question
@@ -91,7 +90,7 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
         if not frames.is_file():
-            raise FileMissing(f"{frames}: {NO_SUCH_FRAME}")
+            raise FileMissing(f"{frames}: no such file; give centroids (CSV, JSON) or an image")
         found = client.identify(database, frames, options)
         if picture is not None:
             drawn = client.picture(database, frames, options, picture.suffix.lower()[1:])

@@ -46,8 +46,6 @@ class MeasuredFrame:
 HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a CSV file whose first line is numbers."""
 
-NO_SUCH_FRAME = "no such file; give centroids (CSV, JSON) or an image"
-
 
 def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
@@ -56,7 +54,8 @@ def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
         # Spreadsheets put a mark of the byte order before the header.
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise FileMissing(f"{path}: {NO_SUCH_FRAME}") from error
+        text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
+        raise FileMissing(text) from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
     except UnicodeDecodeError as error:
