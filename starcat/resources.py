@@ -1,4 +1,4 @@
-"""Where the files that ship with starcat are: schemas, data sources and presets."""
+"""Where the files that ship with starcat are: schemas, data sources, presets, documentation."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def resource_folder(name: str) -> Path:
-    """Return the folder ``schemas``, ``data_sources`` or ``presets``.
+    """Return the folder ``schemas``, ``data_sources``, ``docs`` or ``presets``.
 
-    A wheel carries the folders inside the package; a checkout has the first two beside it.
+    A wheel carries the folders inside the package; a checkout has the first three beside it.
 
     Examples
     --------

@@ -25,7 +25,8 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
+from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
+from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
@@ -321,7 +322,7 @@ def test_every_reason_has_a_message_and_a_hint():
             assert "\n" not in repr(told)
             assert len(repr(told)) < 200
     assert (
-        "5 of 9 spots, chance 3.0e-04, 25% of the frame"
+        "5 of 9 centroids, chance 3.0e-04, 25% of the frame"
         in Refusal("chance", 5, 3e-4, 0.25, 9).message
     )
 
@@ -330,8 +331,8 @@ def test_every_reason_has_a_message_and_a_hint():
 def test_too_few_spots_are_the_reason(sky, engine):
     found = Matcher(sky, engine=engine).identify([[1.0, 2.0], [30.0, 40.0], [np.nan, 1.0]])
     assert found.refusal == Refusal("too_few_stars")
-    assert repr(found) == "<MatchResult too_few_stars: 3 spots>"
-    assert "fewer than 4 spots" in found._repr_html_()
+    assert repr(found) == "<MatchResult too_few_stars: 3 centroids (1 dropped)>"
+    assert "fewer than 4 centroids" in found._repr_html_()
 
 
 @needs_c
@@ -339,7 +340,7 @@ def test_the_library_says_why_it_has_no_answer(sky):
     px = np.random.default_rng(3).random((8, 2)) * 1024.0
     found = Matcher(sky, engine="c").identify(px)
     assert found.refusal == Matcher(sky, engine="numpy").identify(px).refusal
-    assert repr(found) == f"<MatchResult no_match: 8 spots, {found.refusal.reason}>"
+    assert repr(found) == f"<MatchResult no_match: 8 centroids, {found.refusal.reason}>"
     assert found.refusal.hint.split(",")[0] in found._repr_html_()
 
 

@@ -507,7 +507,7 @@ IDENTIFY_OPTIONS: Cases = {
     "velocity beside an orbit": identify(
         f"--time {NOON} --velocity 0,7.5,0 --orbit 7000,0,0,0,7.5,0"
     ),
-    "velocity above that of light": identify(f"--time {NOON} --velocity 299900,0,0"),
+    "velocity of no spacecraft": identify(f"--time {NOON} --velocity 299900,0,0"),
     "position that is no three numbers": lambda place: (
         lambda: Observer.at(NOON, position_km=[7000.0])
     ),

@@ -319,7 +319,7 @@ def test_frames_that_are_not_identified_are_named_with_the_reason(skies):
     said = str(caught.value)
     assert said.startswith("2 of 4 frames are identified with fields of 50 to 50 deg")
     assert "clouds (12 centroids: " in said
-    assert "night (2 centroids: fewer than 4 spots of the frame are usable)" in said
+    assert "night (2 centroids: fewer than 4 centroids of the frame are usable)" in said
     with pytest.raises(CalibrationError, match=r"^0 of 2 frames are identified"):
         calibrate_frames(Matcher(database), [*bad, *few], database.camera, focal_px)
 

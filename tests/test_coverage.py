@@ -319,8 +319,14 @@ def test_a_build_says_that_its_tiling_has_holes(make, caplog):
 
 def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
     narrow = {"camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 20.0}}
-    with pytest.raises(BuildError, match="of 200 simulated pointings, .* at least 4 stars") as told:
-        make(**narrow, boresights={"count": 2000}, self_test={"frames": 200, "noise_px": 0.1})
+    with pytest.raises(
+        BuildError, match=r"of 200 simulated pointings, .* at least 4 stars"
+    ) as told:
+        make(
+            **narrow,
+            boresights={"count": 2000},
+            self_test={"frames": 200, "noise_px": 0.1, "min_identified": 0.9},
+        )
     clean = told.value.built.rates[0]
     assert clean.share_of_identifiable > 0.9 > clean.identified_share
     assert "pointings show fewer than 4 stars: a fainter selection.faint" in str(told.value)

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,8 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, w
     subprocess.run(wheel, check=True, env=environment)
     (built,) = (tmp_path / "wheel").glob("*.whl")
     assert built.name.count("-abi3-") == with_c
+    docs = {f"starcat/docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
+    assert docs <= set(zipfile.ZipFile(built).namelist())
     site, empty = tmp_path / "site", tmp_path / "empty"
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--target", site, built], check=True)
     empty.mkdir()

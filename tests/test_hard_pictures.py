@@ -12,15 +12,10 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import random_attitudes
 from starcat.images.background import subtract_background
 from starcat.images.centroiding import find_spots
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import (
-    FOV_ERROR_OF_IMAGES,
-    IdentifyOptions,
-    LocalInputs,
-    identify_file,
-    measure,
-)
+from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure
 from starcat.images.spot_width import best_widths
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
@@ -228,9 +223,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     write_image(path, render_image(places, mag, size, optics, 5))
     measured = measure(path)
     [frame] = measured.frames
-    first = matcher.identify(
-        frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR_OF_IMAGES
-    )
+    first = matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
     [answer] = identify_file(path, matcher)
     assert answer.result.ok

@@ -15,6 +15,8 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits as fits_file
 from astropy.wcs import WCS
 
+from starcat.matcher.matcher import Matcher
+
 Run = Callable[[list[Any]], Any]
 
 
@@ -90,9 +92,66 @@ def test_the_reason_and_what_to_try_are_printed(starcat, small_artifact, tmp_pat
     few = tmp_path / "few.csv"
     few.write_text("x_px,y_px\n1,2\n")
     run = starcat(["identify", small_artifact, few])
-    assert re.search(r"because +fewer than 4 spots", run.out)
-    assert re.search(r"try +find more spots", run.out)
+    assert re.search(r"because +fewer than 4 centroids", run.out)
+    assert re.search(r"try +find more stars", run.out)
     assert all(len(line) <= 100 for line in run.out.splitlines())
+
+
+def changed(frame: Path, places: Callable[[Any], Any]) -> Path:
+    """Return a copy of a frame with other places of its centroids."""
+    rows = np.loadtxt(frame, delimiter=",", skiprows=1)
+    rows[:, :2] = places(rows[:, :2])
+    path = frame.with_name("changed.csv")
+    np.savetxt(path, rows, delimiter=",", header="x_px,y_px,mag", comments="")
+    return path
+
+
+def test_a_lens_a_little_off_its_data_sheet_is_identified_from_centroids_and_pictures(
+    starcat, frame, small_artifact
+):
+    longer = changed(frame, lambda px: 256.0 + 1.02 * (px - 256.0))
+    [found] = json.loads(starcat(["identify", small_artifact, longer, "--json"]).out)
+    [plain] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    assert found["status"] == "identified"
+    assert found["focal_length_px"] == pytest.approx(1.02 * plain["focal_length_px"], rel=1e-3)
+    strict = ["identify", small_artifact, longer, "--fov-error", "0", "--json"]
+    [refused] = json.loads(starcat(strict).out)
+    assert re.match(r"the focal length is \d\.\d% longer than", refused["refusal"]["words"])
+
+
+@pytest.mark.parametrize(
+    ("places", "reason", "words", "advice"),
+    [
+        (lambda px: px * [1, -1] + [0, 512], "mirrored", "matches only mirrored", "(--flip)"),
+        (lambda px: px * [-1, 1] + [512, 0], "mirrored", "matches only mirrored", "(--flip)"),
+        (lambda px: 256.0 + 0.92 * (px - 256.0), "scale", "% shorter than stated", "(--fov-error)"),
+    ],
+    ids=["y upwards", "x to the left", "another lens"],
+)
+def test_a_second_look_says_what_is_wrong_and_gives_no_answer(
+    starcat, frame, small_artifact, places, reason, words, advice
+):
+    other = changed(frame, places)
+    [found] = json.loads(starcat(["identify", small_artifact, other, "--json"]).out)
+    assert (found["status"], found["refusal"]["reason"]) == ("no_match", reason)
+    assert words in found["refusal"]["words"]
+    assert all(star["star"] is None for star in found["stars"])
+    printed = " ".join(starcat(["identify", small_artifact, other]).out.split())
+    assert words in printed
+    assert advice in printed
+
+
+def test_pixels_counted_from_the_centre_are_told(starcat, frame, small_artifact):
+    centred = changed(frame, lambda px: px - 256.0)
+    [found] = json.loads(starcat(["identify", small_artifact, centred, "--json"]).out)
+    outside = sum(star.get("dropped") == "out_of_frame" for star in found["stars"])
+    assert outside > len(found["stars"]) / 3
+    assert found["remarks"][0].startswith(f"{outside} of {len(found['stars'])} centroids lie out")
+    matcher = Matcher.open(small_artifact)
+    rows = np.loadtxt(centred, delimiter=",", skiprows=1)
+    answer = matcher.identify(rows[:, :2])
+    assert f"centroids ({outside} dropped)" in repr(answer)
+    assert "not from the centre" in answer.remarks[0]
 
 
 def worst_arcsec(

@@ -174,7 +174,7 @@ def test_every_number_of_stars_has_one_colour(stars):
 def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_artifact):
     answer = client.get(f"{PAGE}/report")
     before, body, after = answer.text.partition("<body>")
-    way_back, line, report = after.partition("</p>")
+    way_back, _, report = after.partition("</p>")
     assert f'href="{PAGE}"' in way_back
     assert before + body + report == (small_artifact / "report" / "index.html").read_text("utf-8")
     policy = answer.headers["content-security-policy"]

@@ -25,7 +25,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_frames
 from starcat.matcher.database import open_database
-from starcat.service.pages.answers import shown_frames
+from starcat.service.pages.answers import link_of, shown_frames
 from starcat.service.pages.identify import NOISE_PX, centroid_file
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -115,7 +115,11 @@ def test_a_frame_of_another_camera_is_identified(client, simulated):
 
 def test_a_mirrored_frame_is_identified_where_that_is_said(client, simulated):
     up = {"centroids": pasted(simulated, is_up=True), "brightness": "mag"}
-    assert ">identified<" not in asked(client, **up).text
+    refused = asked(client, **up).text
+    assert ">identified<" not in refused
+    [remedy] = re.findall(r'href="([^"]+)">Identify it so', refused)
+    answer = client.get(html.unescape(remedy))
+    assert error_rad(answer.text, simulated.matrix) < 2e-3
     answer = asked(client, **up, **{"camera.flip": "on"})
     assert error_rad(answer.text, simulated.matrix) < 2e-3
 
@@ -127,6 +131,10 @@ def test_a_scale_that_is_off_is_found_within_what_is_stated(client, simulated):
     by_range = asked(client, **wide, fov_from="30", fov_to="50")
     assert by_range.status_code == 422  # of a database that serves one field
     assert "no product &#39;levels&#39;" in by_range.text
+    off = {**wide, "camera.fov_x_deg": "44"}  # by more than is allowed where nothing is said
+    refused = asked(client, **off).text
+    [remedy] = re.findall(r'href="([^"]+)">Identify it so', refused)
+    assert error_rad(client.get(html.unescape(remedy)).text, simulated.matrix) < 2e-3
     half = asked(client, **wide, fov_from="30")
     assert half.status_code == 422
     assert "both ends" in half.text
@@ -184,6 +192,8 @@ def test_a_link_keeps_an_answer(client, simulated):
     assert 'name="tolerance_px" type="text" value="3"' in again.text
     [seeded] = re.findall(r'href="(/identify[?][^"]+)">Link', asked(client, seed=SEED).text)
     assert f"seed={SEED}" in seeded
+    many = {"centroids_px": [[123.456, 234.567]] * 900}
+    assert link_of(many, {"database": DATABASE}) == ""  # an address has its limits
     assert "centroids" not in seeded
 
 
@@ -195,7 +205,7 @@ def test_many_pictures_are_identified_at_once(client):
     page = client.post(
         "/identify",
         data={"database": DATABASE},
-        files=[*frames[:1], ("file", ("broken.png", b"no picture")), *frames[1:]],
+        files=[("file", ("broken.png", b"no picture")), *frames],
     ).text
     assert "2 of 3 frames identified" in page
     assert re.search(r">broken.png</th><td>[^<]{20}", page)
@@ -216,7 +226,7 @@ def test_the_table_has_the_names_of_the_picture():
         ]
         + [{"x_px": 3.0, "y_px": 4.0, "star": None, "mag": None}],
     }
-    found = {"frames": [content], "more": [{"mag": None, "wcs": None, "is_image": False}],
+    found = {"frames": [content], "more": [{"mag": None, "wcs": None}],
              "notes": [], "method": "triangle"}  # fmt: skip
     [frame] = shown_frames(found, {"database": DATABASE}, 2016.0)
     assert [one["name"] for one in frame.stars] == ["Procyon", "Gaia …23456789"]
@@ -225,8 +235,8 @@ def test_the_table_has_the_names_of_the_picture():
 def test_a_refusal_has_the_words_of_the_matcher(client):
     few = asked(client, centroids="10 10\n200 300\n30 400")
     assert few.status_code == 200
-    assert "fewer than 4 spots of the frame are usable" in few.text
-    assert "find more spots" in few.text
+    assert "fewer than 4 centroids of the frame are usable" in few.text
+    assert "find more stars" in few.text
     none = asked(client, centroids="10 10\n200 300\n30 400\n17 90\n400 22\n350 351")
     assert "not identified" in none.text
 

@@ -130,6 +130,14 @@ def test_name_and_description_of_a_preset_follow_the_camera():
     assert "G <= 7, for a 7.25 x 7.25 deg" in again.values["description"]
 
 
+def test_an_address_is_short_where_the_name_follows():
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
+    assert query_of(draft, "") == "?camera.fov_x_deg=20.0"
+    assert draft_of_query({"camera.fov_x_deg": "20.0"}).content == draft.content
+    stale = draft_of_text(draft.text.replace("gaia-20deg", "gaia-12deg"))
+    assert pinned_draft(query_of(stale, "")).values["name"] == "gaia-12deg"
+
+
 def test_what_somebody_has_called_a_design_stays():
     mine = {"name": "polaris", "description": "For the second flight."}
     draft = draft_with(draft_with(draft_of_query({}), mine), {"camera.fov_x_deg": 20.0})
@@ -257,7 +265,7 @@ def test_a_pinned_design_is_compared_with_the_present_one(client):
     assert "pinned=" in state["address"]
     page = client.get(state["address"]).text
     assert "faint_limit_mag = 5.5" in page
-    assert 'id="pinned" value="name=mine' in page
+    assert re.search('id="pinned" value="[^"]*name=mine', page)
     gone = _sent(client, "/new/preview", text, pinned=query, do="unpin").json()
     assert gone["result"].count("data:image/png") == 1
     assert "pinned" not in gone["address"]

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 import requests
 from served import Served, serve
-from services import DATABASE
+from services import DATABASE, add_database, client_of
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -29,8 +29,11 @@ PAGE = f"/databases/{DATABASE}"
 
 
 @pytest.fixture(scope="module")
-def small_artifact(picky_artifact: Path) -> Path:
-    return picky_artifact
+def root(tmp_path_factory: pytest.TempPathFactory, picky_artifact: Path) -> Path:
+    """The folder of a service whose database has stars that were rejected for two reasons."""
+    folder = tmp_path_factory.mktemp("sky") / "service"
+    add_database(folder, picky_artifact)
+    return folder
 
 
 def stars_of(client, **where) -> list[dict]:
@@ -40,11 +43,11 @@ def stars_of(client, **where) -> list[dict]:
 
 
 def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
-    client, small_artifact
+    client, picky_artifact
 ):
     stars = stars_of(client)
     guide = [one for one in stars if one["kind"] == "guide"]
-    table = pq.read_table(small_artifact / "stars.parquet").sort_by("mag").to_pylist()
+    table = pq.read_table(picky_artifact / "stars.parquet").sort_by("mag").to_pylist()
     assert [one["mag"] for one in guide] == pytest.approx(
         [row["mag"] for row in table[:MOST]], abs=1e-4
     )
@@ -53,7 +56,7 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
     rejected = [one for one in stars if one["kind"] == "rejected"]
     known = {
         row["designation"]: row["reason"]
-        for row in pq.read_table(small_artifact / "rejected.parquet").to_pylist()
+        for row in pq.read_table(picky_artifact / "rejected.parquet").to_pylist()
         if row["reason"] != "too_faint" and row["mag"] is not None
     }
     assert {one["label"]: one["reason"].replace(" ", "_") for one in rejected} == known
@@ -61,13 +64,13 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
     assert not [one for one in stars if one["kind"] == "faint"]
 
 
-def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, small_artifact):
+def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_artifact):
     ra, dec, radius = 10.0, 40.0, 25.0
     found = {one["label"] for one in stars_of(client, ra=ra, dec=dec, radius=radius, faint=True)}
     middle = directions_from_radec(ra, dec)
     expected = set()
     for name in ("stars", "rejected"):
-        table = pq.read_table(small_artifact / f"{name}.parquet").to_pylist()
+        table = pq.read_table(picky_artifact / f"{name}.parquet").to_pylist()
         rows = [row for row in table if row["ra_deg"] is not None and row["mag"] is not None]
         u = directions_from_radec(
             np.array([row["ra_deg"] for row in rows]), np.array([row["dec_deg"] for row in rows])
@@ -113,8 +116,8 @@ def test_a_view_holds_the_places_that_it_is_of():
     assert around(everywhere)["size"] == 360.0
 
 
-def test_fields_are_ordered_and_filtered_by_their_stars(client, small_artifact):
-    rows = (small_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
+def test_fields_are_ordered_and_filtered_by_their_stars(client, picky_artifact):
+    rows = (picky_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
     stars = [int(row.split(",")[3]) for row in rows]
     few = sorted(stars)[30]
 
@@ -142,16 +145,33 @@ def test_places_in_an_answer_are_shown_in_the_sky(client):
     assert "data-sky" not in without
 
 
+def test_what_differs_between_two_databases_is_shown_in_the_sky(
+    tmp_path, small_artifact, picky_artifact
+):
+    add_database(tmp_path / "service", small_artifact)
+    add_database(tmp_path / "service", picky_artifact, "fedcba9876543210")
+    with client_of(tmp_path / "service", anonymous="reader") as client:
+        page = client.get(f"{PAGE}/compare?other=fedcba9876543210").text
+        [link] = re.findall(r'href="([^"]+)">Added and removed stars in the sky', page)
+        shown = client.get(html.unescape(link)).text
+    [view] = re.findall(r'data-sky="([^"]+)"', shown)
+    marks = json.loads(html.unescape(view))["marks"]
+    bright = pq.read_table(small_artifact / "stars.parquet").to_pylist()
+    expected = sorted(row["designation"] for row in bright if row["mag"] < 2.2)
+    assert sorted(one["label"] for one in marks) == expected
+    assert {one["reason"] for one in marks} == {"removed"}
+
+
 # Downloads
 
 
 @pytest.mark.parametrize("endian", ["little", "big"])
-def test_a_flight_image_has_the_bytes_of_export(client, starcat, small_artifact, tmp_path, endian):
+def test_a_flight_image_has_the_bytes_of_export(client, starcat, picky_artifact, tmp_path, endian):
     answer = client.get(f"{PAGE}/image", params={"method": "triangle", "endian": endian})
     assert answer.status_code == 200
     assert 'filename="small-1.0.0.img"' in answer.headers["content-disposition"]
     to = ["--to", "onboard", "--endian", endian, "-o", tmp_path / "made.img"]
-    assert starcat(["export", small_artifact, *to]).code == 0
+    assert starcat(["export", picky_artifact, *to]).code == 0
     assert answer.content == (tmp_path / "made.img").read_bytes()
 
 
@@ -165,15 +185,15 @@ def test_an_image_that_cannot_be_made_is_refused_on_a_page(client):
         assert client.get(f"{PAGE}/image?method={method}").status_code == 422
 
 
-def test_the_whole_database_and_its_spec_are_downloaded(client, small_artifact):
+def test_the_whole_database_and_its_spec_are_downloaded(client, picky_artifact):
     page = client.get(PAGE).text
     archive = client.get(re.findall(r'href="([^"]+/archive)"', page)[0]).content
     with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
         stars = packed.extractfile("small-1.0.0/stars.parquet")
-        assert stars.read() == (small_artifact / "stars.parquet").read_bytes()
+        assert stars.read() == (picky_artifact / "stars.parquet").read_bytes()
     text = client.get(re.findall(r'href="([^"]+/spec.toml)"', page)[0]).text
     spec = spec_from_dict(content_of_toml(text, "spec.toml"), "spec.toml")
-    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    manifest = json.loads((picky_artifact / "manifest.json").read_bytes())
     assert spec == spec_from_dict(manifest["spec"], "manifest")
 
 
@@ -211,8 +231,6 @@ def test_publishing_asks_before_it_is_final(client):
 @pytest.fixture(scope="module")
 def served(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Served:
     """The same service in a process of its own, which a program can ask."""
-    from services import add_database
-
     folder = tmp_path_factory.mktemp("served")
     [artifact] = (root / "databases" / DATABASE).iterdir()
     add_database(folder / "service", artifact)

@@ -37,8 +37,9 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.picture import draw
-from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs, MeasuredFile
+from starcat.images.solve_files import FileAnswers, LocalInputs, MeasuredFile
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -164,7 +165,8 @@ def test_a_time_without_a_zone_is_utc_and_a_zone_is_heeded():
         ({"velocity_km_s": [1.0, 2.0]}, "three finite numbers"),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
         ({"position_km": "here"}, "three finite numbers"),
-        ({"velocity_km_s": [3e5, 0.0, 0.0]}, "less than that of light"),
+        ({"velocity_km_s": [3e5, 0.0, 0.0]}, "at most 100 km/s relative to the earth"),
+        ({"velocity_km_s": [0.0, 7614.0, 0.0]}, "divide a velocity in m/s by 1000"),
         ({"origin": "barycentre"}, "both needed"),
         ({"origin": "moon"}, "'earth' or 'barycentre'"),
     ],

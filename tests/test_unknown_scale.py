@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from frames import observe
+from skies import database
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
@@ -14,6 +15,7 @@ from starcat.matcher.chance import false_match_probability
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle import scale_free
 from starcat.matcher.pose import fit, focal_length_error_px, pose_at
+from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
@@ -60,6 +62,25 @@ def test_a_focal_length_beyond_what_is_allowed_gives_no_answer(sky):
     for n, frame in enumerate(simulate_frames(sky.directions, sky.camera, 12, Noise(0.3), 5)):
         wrong = told(1.06 if n % 2 else 0.94, sky.camera)
         assert matcher.identify(frame.centroids_px, wrong, fov_error=0.02).status == "no_match"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_part_of_a_dense_frame_of_another_scale_is_no_answer(seed):
+    # Around any point near the middle some 80 of 400 stars fit, with a chance of 1e-15 to 1e-27.
+    camera, generator = Camera(1024, 1024, fov_x_deg=24.0), np.random.default_rng(seed)
+    stars = generator.normal(size=(36_000, 3))
+    stars /= np.linalg.norm(stars, axis=1)[:, None]
+    [truth] = random_attitudes(1, generator)
+    body, lens = stars @ truth.T, told(1.018, camera)
+    px = lens.pixels_from_directions(body)
+    px = generator.permutation(px[(body[:, 2] > 0.0) & lens.contains(px)])[:400]
+    seen = observe(px + generator.normal(size=px.shape), camera, 3.0)
+    sky = database(stars, camera, {})
+    for _ in range(20):
+        turn = np.append(3.0 * generator.normal(size=3) / camera.focal_length_px, 1.0)
+        off = matrix_from_quaternion(turn / np.linalg.norm(turn)) @ truth
+        found = agree(pose_at(off, 1.0, seen), seen, sky)
+        assert found.false_match_probability == 1.0
 
 
 def test_the_fit_finds_attitude_and_focal_length_exactly():

@@ -19,7 +19,8 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.images.figure_file import check_kind, own_style, write_figure
-from starcat.images.solve_files import IdentifyOptions, measure
+from starcat.images.identify_options import IdentifyOptions
+from starcat.images.solve_files import measure
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress

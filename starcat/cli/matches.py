@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -139,10 +140,23 @@ def _print_content(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        return [("because", value["words"]), ("try", value["advice"])]
+        return [("because", value["words"]), ("try", as_options(value["advice"]))]
     if value is None or isinstance(value, list):
         return []
     return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
+
+
+def as_options(text: str) -> str:
+    """Return a text with the names of options as the command line has them.
+
+    >>> as_options("turn the frame over (flip), or allow a larger error (fov_error)")
+    'turn the frame over (--flip), or allow a larger error (--fov-error)'
+    """
+    return re.sub(
+        r"(?<=[(, ])(flip|[a-z]+_(?:error|error_deg|share|px|mag))(?=[,)])",
+        lambda found: "--" + found.group().replace("_", "-"),
+        text,
+    )
 
 
 def _print_one(answer: FrameAnswer, database: Database) -> None:

@@ -14,7 +14,8 @@ from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
-    from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.solve_files import FileAnswers, LocalInputs
     from starcat.matcher.matcher import Matcher
 
 app = typer.Typer()
@@ -197,7 +198,8 @@ def _identify_batch(
 def _matcher_and_inputs(
     artifact: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.images.solve_files import IdentifyOptions, LocalInputs, open_matcher
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.solve_files import LocalInputs, open_matcher
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])

@@ -61,8 +61,7 @@ FrameSize = Annotated[
     typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
 ]
 FovError = Annotated[
-    str | None,
-    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5% for images."),
+    str | None, typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5%.")
 ]
 MinShare = Annotated[
     float | None,
@@ -282,7 +281,7 @@ def chosen_prior(
 
 def identify_options(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a command line says of `IdentifyOptions`, by their names; not the camera."""
-    from starcat.images.solve_files import IdentifyOptions
+    from starcat.images.identify_options import IdentifyOptions
 
     prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
     size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from starcat.errors import ConfigError
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import (
     IMAGE_SUFFIXES,
     FrameAnswer,
-    IdentifyOptions,
     LocalInputs,
     MeasuredFile,
     answers_of,

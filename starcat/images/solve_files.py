@@ -7,7 +7,6 @@ the other, each when it is asked for; an answer is JSON, a row of a table, a pic
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -15,15 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
+from starcat.images.second_look import FOV_ERROR, Search, look_again
 from starcat.images.spot_noise import weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_frames,
-    read_stream,
+    read_stdin,
     said_of_columns,
     upside_down,
 )
@@ -48,82 +48,9 @@ IMAGE_SUFFIXES = (
     ".heif",
 )  # fmt: skip
 
-# Error of the focal length that is allowed for an image where none is stated. Data sheets are off
-# by so much: an IMX219 with 48.8 deg on paper has 50.5.
-FOV_ERROR_OF_IMAGES = 0.05
-# How an image without an answer is measured once more: hot pixels masked, to this part of the
-# threshold, with at most so many spots, as noise is among them.
+# An image without an answer is measured again, hot pixels masked, by a lower threshold.
 DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
 CAMERA_NAME = "camera.toml"  # what messages call the text of a camera file
-
-# Options that a matcher is opened with; the others are about a file.
-MATCHER_OPTIONS = (
-    *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
-    *("min_share", "max_steps", "time_limit_s"),
-)
-
-
-class IdentifyOptions(BaseModel):
-    """How frames are identified; each as the option of 'starcat identify' with that name."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    method: str | None = Field(None, max_length=40, description="By default the best there is.")
-    tolerance_px: float | None = Field(
-        None, ge=0.01, le=200, description="Largest error of a centroid; by default 2."
-    )
-    noise_px: float | None = Field(
-        None, ge=0.01, le=50, description="Noise of a centroid, each axis; for tolerance_px."
-    )
-    noise_mag: float | None = Field(None, ge=0.001, le=10, description="Noise of magnitudes.")
-    max_false_match_probability: float = Field(
-        1e-9, ge=0, le=1, description="Less certain answers are withheld."
-    )
-    fov_error: float | None = Field(
-        None, ge=0, le=0.5, description="Error of the field that is allowed; 0.05 for images."
-    )
-    fov_deg: tuple[float, float] | None = Field(
-        None, description="Smallest and largest field across the width, of an unknown camera."
-    )
-    size_px: tuple[int, int] | None = Field(
-        None, description="Width and height of a frame of centroids; with fov_deg."
-    )
-    min_share: float | None = Field(
-        None, ge=0, le=1, description="Least share of the frame to be explained; a third."
-    )
-    max_steps: int | None = Field(None, ge=1, description="Steps of a search.")
-    time_limit_s: float | None = Field(None, ge=0.001, description="Seconds that a frame may take.")
-    flip: bool | None = Field(None, description="First row at the bottom; y upwards.")
-    time: str | None = Field(
-        None, max_length=40, description="Time of the frames, UTC: aberration and planets."
-    )
-    psf_sigma_px: float | None = Field(
-        None, ge=0.3, le=20, description="Width of a star in an image; by default measured."
-    )
-    threshold: float = Field(5.0, ge=1, le=1000, description="Least signal over noise of a spot.")
-    # Measured: spots beyond the brightest 200 identify no further picture, and cost time.
-    most_spots: int = Field(200, ge=4, le=10_000, description="Brightest spots that are used.")
-    plane: int | None = Field(None, ge=0, description="Plane of a FITS cube, from 0.")
-    bayer: bool = Field(False, description="The image is a raw colour mosaic.")
-    camera: str | None = Field(
-        None, max_length=20_000, description="Text of a camera file; the database's by default."
-    )
-    prior_q: tuple[float, float, float, float] | None = Field(
-        None, description="Expected attitude; with prior_error_deg."
-    )
-    prior_error_deg: float | None = Field(
-        None, gt=0, le=20, description="Largest error of prior_q."
-    )
-
-    @model_validator(mode="after")
-    def _go_together(self) -> IdentifyOptions:
-        if (self.prior_q is None) != (self.prior_error_deg is None):
-            raise ValueError("prior_q and prior_error_deg go together; give both, or neither")
-        if self.fov_deg is not None and self.fov_error is not None:
-            raise ValueError("give either fov_deg, a range of fields, or fov_error, not both")
-        if self.size_px is not None and self.fov_deg is None:
-            raise ValueError("size_px is the size of frames with fov_deg")
-        return self
 
 
 @dataclass(frozen=True)
@@ -203,7 +130,7 @@ class FrameAnswer:
 def facts(result: MatchResult) -> Content:
     """Return what an answer says of the whole frame, as JSON has it."""
     found: Content = {"status": result.status, "origin": result.origin}
-    found["n_matched"] = result.n_matched
+    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
     if result.ok:
         camera = result.camera
         found |= {
@@ -216,7 +143,6 @@ def facts(result: MatchResult) -> Content:
             ],
             "residual_arcsec": result.residual_arcsec,
             "reduced_chi_square": _or_none(result.reduced_chi_square),
-            "remarks": list(result.remarks),
             "false_match_probability": result.false_match_probability,
             "focal_length_px": None if camera is None else camera.focal_length_px,
             "focal_length_error_px": result.focal_length_error_px,
@@ -256,25 +182,38 @@ class FileAnswers:
         return self.measured.shape is not None
 
     def __iter__(self) -> Iterator[FrameAnswer]:
-        identify, observer, spots = self._identify(), self.local.observer, self.measured.spots
+        self._check_size()
+        search, error = self._search(), self._fov_error
         for given in self.measured.frames:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
-            result = identify(frame.centroids_px, magnitudes=frame.mag, sigma_px=frame.sigma_px)
-            if spots is not None:
-                result = weighed(result, spots.sigma_px)
-            answer = FrameAnswer(frame, result, observer, spots)
-            if self.is_image and not result.ok and not _is_limited(result):
-                answer = self._deeper(identify) or answer
-            yield answer
+            yield self._answer(frame, search, error)
 
-    def _deeper(self, identify: Callable[..., MatchResult]) -> FrameAnswer | None:
+    def _answer(self, frame: MeasuredFrame, search: Search, fov_error: float) -> FrameAnswer:
+        observer, spots = self.local.observer, self.measured.spots
+        result = search(frame, fov_error)
+        if not result.ok and fov_error and self.options.fov_error is None:
+            # Few stars may determine the attitude of the camera as it was described, and no more.
+            exact = search(frame, 0.0)
+            result = exact if exact.ok else result
+        if spots is not None:
+            result = weighed(result, spots.sigma_px)
+        if not result.ok and not _is_limited(result):
+            if self.is_image and (deeper := self._deeper(search, fov_error)):
+                return deeper
+            if self._is_lost_in_space and result.status == "no_match":
+                result = look_again(
+                    search, frame, self.camera, result, fov_error, is_scale_free=self._is_scale_free
+                )
+        return FrameAnswer(frame, result, observer, spots)
+
+    def _deeper(self, search: Search, fov_error: float) -> FrameAnswer | None:
         """Return the answer of an image that is measured once more; None if there is none."""
         try:
             [frame], spots = self._measured_deeper()
         except ConfigError:  # too much stands out: the first measurement has said what it could
             return None
-        result = identify(frame.centroids_px, magnitudes=frame.mag)
+        result = search(frame, fov_error)
         if not result.ok or spots is None:
             return None
         result = weighed(result, spots.sigma_px)
@@ -289,47 +228,59 @@ class FileAnswers:
         again = measure(self.path, chosen, self.local, without_hot_pixels=True)
         return again.frames, again.spots
 
-    def _identify(self) -> Callable[..., MatchResult]:
-        """Return what identifies a frame, its options filled in."""
-        matcher, camera, options = self.matcher, self.camera, self.options
-        shape, observer = self.measured.shape, self.local.observer
+    def _check_size(self) -> None:
+        camera, shape = self.camera, self.measured.shape
         if shape is not None and shape != (camera.height_px, camera.width_px):
-            height, width = shape
             raise ConfigError(
-                f"the image has {width} x {height} px, the camera {camera.width_px} x "
+                f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
-        fov_error = options.fov_error
-        if fov_error is None or options.fov_deg is not None:
-            can = matcher.method in SCALE_FREE and matcher.database.image is None
-            is_loose = options.fov_deg is None and shape is not None and can
-            fov_error = FOV_ERROR_OF_IMAGES if is_loose else 0.0
-        identify = partial(self._search(), camera=camera, fov_error=fov_error)
-        if observer is None:
-            return identify
-        if self.local.track:
+
+    @property
+    def _is_lost_in_space(self) -> bool:
+        """Whether the whole sky is searched with one camera."""
+        options = self.options
+        return not self.local.track and options.prior_q is None and options.fov_deg is None
+
+    @property
+    def _fov_error(self) -> float:
+        stated, may_be_off = self.options.fov_error, self.is_image or self._is_lost_in_space
+        if self.options.fov_deg is not None or not (self._is_scale_free or stated):
+            return 0.0
+        return (FOV_ERROR if may_be_off else 0.0) if stated is None else stated
+
+    @property
+    def _is_scale_free(self) -> bool:
+        return self.matcher.method in SCALE_FREE
+
+    def _search(self) -> Search:
+        """Return how a frame is identified with an error of the focal length."""
+        matcher, camera, observer, way = self.matcher, self.camera, self.local.observer, self._way()
+        if observer is not None and self.local.track:
             raise ConfigError(
                 "--track does not tell planets from stars; leave out --time, or --track"
             )
-        from starcat.sky.spots import identify_in_time
 
-        def identify_with_planets(
-            centroids_px: Any, magnitudes: Any, sigma_px: Any = None
-        ) -> MatchResult:
+        def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
+            identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
+            if observer is None:
+                return identify(frame.centroids_px, magnitudes=frame.mag)
+            from starcat.sky.spots import identify_in_time
+
             return identify_in_time(
-                partial(identify, sigma_px=sigma_px),
+                identify,
                 matcher.database,
-                centroids_px,
+                frame.centroids_px,
                 camera,
                 observer,
-                magnitudes=magnitudes,
+                magnitudes=frame.mag,
                 tolerance_px=matcher.tolerance_px,
                 max_false_match_probability=matcher.max_false_match_probability,
             )
 
-        return identify_with_planets
+        return search
 
-    def _search(self) -> Callable[..., MatchResult]:
+    def _way(self) -> Callable[..., MatchResult]:
         """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
         options = self.options
         if options.prior_q is None and not self.local.track:
@@ -433,7 +384,7 @@ def measure(
     chosen = options or IdentifyOptions()
     if path == STDIN:
         # Its frames are only ever gone through.
-        return MeasuredFile(cast(Sequence[MeasuredFrame], _frames_of_stdin()))
+        return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
@@ -451,13 +402,6 @@ def measure(
         raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
     frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
     return MeasuredFile([frame], image, image.shape, spots)
-
-
-def _frames_of_stdin() -> Iterator[MeasuredFrame]:
-    try:
-        yield from read_stream(sys.stdin)
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"stdin: not text ({error}); expected CSV or JSON") from error
 
 
 def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:

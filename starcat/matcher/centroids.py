@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -192,6 +193,14 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
         return
     for number, line in chain([(begin, first)], filled):
         yield from _json_frames(line, Path(f"{name} {number}"))
+
+
+def read_stdin() -> Iterator[MeasuredFrame]:
+    """Read the frames of stdin, each as soon as it is there."""
+    try:
+        yield from read_stream(sys.stdin)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"stdin: not text ({error}); expected CSV or JSON") from error
 
 
 def write_centroids(centroids_px: Array, path: Path, mag: Array | None = None) -> None:

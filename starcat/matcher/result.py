@@ -17,10 +17,10 @@ from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
-from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame
 from starcat.matcher.pose import fit_by_weights
+from starcat.matcher.refusal import Refusal
 from starcat.matcher.stars import (
     ARCSEC,
     NO_STARS,
@@ -39,99 +39,6 @@ if TYPE_CHECKING:
 Status = Literal["identified", "no_match", "too_few_stars"]
 
 Origin = Literal["lost_in_space", "tracking"]
-
-Reason = Literal[
-    "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "time", "steps"
-]
-
-MESSAGES: dict[Reason, str] = {
-    "too_few_stars": f"fewer than {MIN_STARS} spots of the frame are usable",
-    "no_candidate": "no pattern of the frame is one of the database",
-    "prior": "no attitude as near to the prior as its error says explains the frame",
-    "chance": "no attitude fits better than chance",
-    "share_of_frame": "the best agreement explains too little of the frame",
-    "scale": "the frame is of another scale than the camera",
-    "time": "the time limit ended the search",
-    "steps": "the limit of steps ended the search",
-}
-"""Each reason in words."""
-
-HINTS: dict[Reason, str] = {
-    "too_few_stars": (
-        "find more spots, with a longer exposure or a lower threshold, and look at 'dropped' for "
-        "those that were not used"
-    ),
-    "no_candidate": (
-        "check the field of view of the camera, try the image flipped, allow a wider tolerance "
-        "of centroids, or use a database of fainter stars"
-    ),
-    "prior": "state a larger error of the prior (prior_error_deg), or identify without a prior",
-    "chance": (
-        "give brightnesses of the spots, state their noise (noise_px, noise_mag) in place of a "
-        "tolerance, or find more spots; check the field of view, and try the image flipped"
-    ),
-    "share_of_frame": (
-        "leave out spots that are no stars, give the camera its distortion, use a database that "
-        "is as deep as the frame, or ask for a smaller share (min_share, --min-share)"
-    ),
-    "scale": (
-        "give the camera its true focal length, or allow an error of it (fov_error, --fov-error)"
-    ),
-    "time": "allow more time, give brightnesses of the spots, or leave out spots that are no stars",
-    "steps": (
-        "allow more steps, give brightnesses of the spots, or leave out spots that are no stars"
-    ),
-}
-"""What to try, by reason."""
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a frame was not identified.
-
-    Attributes
-    ----------
-    reason : str
-        ``too_few_stars``, ``no_candidate`` (no pattern of the frame is in the database),
-        ``prior`` (no attitude near the prior explains the frame), ``chance``,
-        ``share_of_frame`` and ``scale`` (why the best agreement was withheld), or
-        ``time`` and ``steps`` (the limit that ended the search).
-    n_matched : int
-        Centroids with a star in the best agreement; 0 where there was none.
-    false_match_probability : float
-        Bound on the probability that chance agrees as well as it; 1 where there was none.
-    share : float
-        Share of the frame that it explains, by weight; 0 where there was none.
-    n_spots : int
-        Usable centroids of the frame; 0 where that is not known.
-    """
-
-    reason: Reason
-    n_matched: int = 0
-    false_match_probability: float = 1.0
-    share: float = 0.0
-    n_spots: int = 0
-
-    @property
-    def message(self) -> str:
-        """The reason as a sentence begins, with the numbers of the best agreement."""
-        text = MESSAGES[self.reason]
-        if self.n_matched == 0:
-            return text
-        spots = f"{self.n_matched} of {self.n_spots}" if self.n_spots else str(self.n_matched)
-        best = f"best: {spots} spots"
-        if self.false_match_probability < 1.0:
-            best += f", chance {self.false_match_probability:.1e}"
-            best += f", {self.share:.0%} of the frame" if self.share else ""
-        return f"{text} ({best})"
-
-    @property
-    def hint(self) -> str:
-        """What to try."""
-        return HINTS[self.reason]
-
-    def __repr__(self) -> str:
-        return f"<Refusal {self.reason}: {self.message}>"
 
 
 @dataclass(frozen=True)
@@ -294,14 +201,21 @@ class MatchResult:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What a reader of the answer should know beside it, in sentences."""
+        told, count = [], len(self.star_index)
+        outside = sum(why == "out_of_frame" for _, why in self.dropped)
+        if outside >= NOTABLE_OUTSIDE * count > 0:
+            told.append(
+                f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
+                "count from the outer corner of the top-left pixel, not from the centre"
+            )
         chi_square = self.reduced_chi_square
-        if not chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
-            return ()
-        return (
-            f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
-            f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
-            "length and distortion; the covariance is too small",
-        )
+        if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
+            told.append(
+                f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
+                f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
+                "length and distortion; the covariance is too small"
+            )
+        return tuple(told)
 
     def with_noise(self, sigma_px: Array) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
@@ -404,13 +318,18 @@ class MatchResult:
                 content["reduced_chi_square"] = self.reduced_chi_square
         return content
 
+    @property
+    def _counted(self) -> str:
+        dropped = f" ({len(self.dropped)} dropped)" if self.dropped else ""
+        return f"{len(self.star_index)} centroids{dropped}"
+
     def __repr__(self) -> str:
         if not self.ok:
             because = f", {self.refusal.reason}" if self.refusal else ""
             because = "" if because == f", {self.status}" else because
-            return f"<MatchResult {self.status}: {len(self.star_ids)} spots{because}>"
+            return f"<MatchResult {self.status}: {self._counted}{because}>"
         return (
-            f"<MatchResult identified: {self.n_matched} of {len(self.star_ids)} spots, "
+            f"<MatchResult identified: {self.n_matched} of {self._counted}, "
             f"RA {self.boresight_ra_deg:.4f}, Dec {self.boresight_dec_deg:+.4f}, "
             f"roll {self.roll_deg:.4f} deg, residual {self.residual_arcsec:.1f} arcsec, "
             f"chance {self.false_match_probability:.1e}>"
@@ -448,6 +367,9 @@ for _name in _DEFAULTS:
 
 NOTABLE_CHI_SQUARE = 2.0
 """Reduced chi-square above which an answer has a remark, if chance is unlikely to exceed it."""
+
+NOTABLE_OUTSIDE = 1.0 / 3.0
+"""Share of the centroids outside of the frame from which an answer has a remark."""
 
 
 def _chi_square_of_chance(free: int) -> float:

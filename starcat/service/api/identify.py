@@ -16,7 +16,8 @@ from pydantic import BaseModel, Field, ValidationError
 from starlette.datastructures import UploadFile
 
 from starcat.failures import validation_message
-from starcat.images.solve_files import IMAGE_SUFFIXES, IdentifyOptions
+from starcat.images.identify_options import IdentifyOptions
+from starcat.images.solve_files import IMAGE_SUFFIXES
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, refusals
 from starcat.service.service import Service, TheService

@@ -7,6 +7,7 @@ from fastapi import APIRouter
 from starcat.service.pages import (
     console,
     databases,
+    documentation,
     downloads,
     home,
     identify,
@@ -26,6 +27,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     console.router,
     identify.router,
     releases.router,
+    documentation.router,
     sky.router,
     downloads.router,
 )

@@ -12,8 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from starcat.images.picture import short_name
-from starcat.images.solve_files import FOV_ERROR_OF_IMAGES
-from starcat.matcher.settings import SCALE_FREE
+from starcat.images.second_look import WIDE_FOV_ERROR
 from starcat.service.pages.sky import names_of
 
 MOST_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
@@ -21,6 +20,9 @@ COLUMNS = (
     *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
     *("dx_px", "dy_px", "separation_arcsec", "dropped"),
 )  # of a CSV of answers
+
+REMEDIES = {"mirrored": "camera.flip=on", "scale": f"field_error={100 * WIDE_FOV_ERROR:g}"}
+"""What is to be changed in an address where a second look has found why there is no answer."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,17 @@ class ShownFrame:
     unusable: str = ""  # why the file has no answer
     notes: tuple[str, ...] = ()
     measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag where known
-    is_loose: bool = False  # a picture, whose field may be off where nothing is said
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether it has an attitude."""
+        return bool(self.content["status"] == "identified")
+
+    @property
+    def remedy(self) -> str:
+        """The address that does what a refusal advises; empty where no field of the page does."""
+        change = REMEDIES.get(self.content.get("refusal", {}).get("reason", ""), "")
+        return f"{self.link}&{change}" if self.link and change else ""
 
     @property
     def stars(self) -> list[dict[str, Any]]:
@@ -48,6 +60,7 @@ class Shown:
     database: str
     method: str
     frames: Sequence[ShownFrame]
+    first: ShownFrame  # that which is shown in full
     json: str = field(init=False)
     csv: str = field(init=False)
 
@@ -57,15 +70,9 @@ class Shown:
         object.__setattr__(self, "csv", _address(csv_of(answered), "csv"))
 
     @property
-    def first(self) -> ShownFrame:
-        """The frame that is shown in full: the first that is identified, or was looked at."""
-        good = [one for one in self.frames if one.content["status"] == "identified"]
-        return (good or [one for one in self.frames if not one.unusable] or list(self.frames))[0]
-
-    @property
     def identified(self) -> int:
         """How many frames are identified."""
-        return sum(one.content["status"] == "identified" for one in self.frames)
+        return sum(one.is_identified for one in self.frames)
 
 
 def shown_frames(
@@ -76,15 +83,13 @@ def shown_frames(
     for content, more in zip(found["frames"], found["more"], strict=True):
         _name_stars(content, epoch_jyear)
         measured = _measured(content["stars"], more["mag"])
-        is_loose = bool(more["is_image"]) and found["method"] in SCALE_FREE
         shown.append(
             ShownFrame(
                 content,
-                link_of(measured, given, is_loose=is_loose),
+                link_of(measured, given),
                 _address(more["wcs"], "fits") if more["wcs"] else "",
                 notes=tuple(found["notes"]) if not shown else (),
                 measured=measured,
-                is_loose=is_loose,
             )
         )
     return shown
@@ -115,7 +120,7 @@ def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None
     return measured
 
 
-def link_of(measured: Mapping[str, Any], given: Mapping[str, str], *, is_loose: bool) -> str:
+def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
     """Return the address that repeats an answer: the centroids that were found are in it."""
     values = {name: text for name, text in given.items() if text}
     if not values.get("seed"):
@@ -124,8 +129,6 @@ def link_of(measured: Mapping[str, Any], given: Mapping[str, str], *, is_loose: 
             lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
         values.pop("camera.flip", None)  # of what was measured y counts down
-        if is_loose and not (values.get("field_error") or values.get("fov_from")):
-            values["field_error"] = f"{100 * FOV_ERROR_OF_IMAGES:g}"
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MOST_LINK else ""
 

@@ -45,6 +45,15 @@ RASTER_WIDTH = 960
 FIELDS_SHOWN = 25  # fields of the tiling on a page
 DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
 
+CHANGED = """\
+SELECT 'added' AS reason, designation, mag, ra_deg, dec_deg
+FROM b.stars WHERE star_id NOT IN (SELECT star_id FROM a.stars)
+UNION ALL
+SELECT 'removed', designation, mag, ra_deg, dec_deg
+FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
+ORDER BY mag"""
+"""Stars of one database that are none of the other, with their places."""
+
 Order = Literal["fewest", "most", "number", "ra", "dec"]
 
 
@@ -229,6 +238,7 @@ def _comparison(
         suggested=other or (versions[-1] if versions else ""),
         later=service.library.database(other) if other else None,
         difference=difference,
+        changed=CHANGED,
         most=DIFFERENCES_SHOWN,
     )
 

@@ -8,6 +8,7 @@ import math
 import re
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,8 +19,8 @@ from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry.camera import Camera
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
-from starcat.images.solve_files import FOV_ERROR_OF_IMAGES, IdentifyOptions
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -82,61 +83,82 @@ async def _answered(
     request: Request, service: Service, form: FormData, given: dict[str, str]
 ) -> Response:
     try:
-        answer = await service.sandbox.run(_answer, service, form, given)
+        asked = await service.sandbox.run(_asked, service, form, given)
+        answer = await _answer(service, asked, given)
     except (StarcatError, Problem) as error:
         answer = {"problem": page_problem(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
 
 
-def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Asked:
+    database: Database
+    uploads: list[FrameUpload]
+    options: IdentifyOptions
+    camera: Camera
+
+
+def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
     database = service.library.database(given["database"])
     uploads = frames_of(form, given, database, service)
-    options = options_of(given, service, database)
-    epoch_jyear = float(database.manifest["epoch_jyear"])
+    camera = camera_of(given, database) or database.camera
+    return _Asked(database, uploads, options_of(given, service, database), camera)
+
+
+async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dict[str, Any]:
+    """Return what is shown of all files; others have their turn between them."""
     until_s = time.monotonic() + service.settings.query_time_s
     frames: list[ShownFrame] = []
-    method, picture = "", b""
-    for upload in uploads:
+    first, method, picture = None, "", b""
+    for upload in asked.uploads:
         if time.monotonic() > until_s:
             frames.append(unusable_frame(upload.name, "not looked at, the others took the time"))
             continue
-        kind: Literal["png"] | None = None if picture else "png"
+        is_wanted = first is None or not first.is_identified
         try:
-            found, drawn = identify_upload(
-                service, database.id, upload, options, kind, for_page=True
+            found, drawn, method = await service.sandbox.run(
+                _frames, service, asked, upload, given, draw=is_wanted
             )
         except (StarcatError, Problem) as error:
-            if len(uploads) == 1:
+            if len(asked.uploads) == 1:
                 raise
             frames.append(unusable_frame(upload.name, page_problem(error).detail))
             continue
-        method, picture = found["method"], picture or drawn
-        frames += shown_frames(found, given, epoch_jyear)
-    shown = Shown(database.title, method, frames)
-    camera = camera_of(given, database) or database.camera
-    first = shown.first.content
+        if found and (first is None or (is_wanted and found[0].is_identified)):
+            first, picture = found[0], drawn
+        frames += found
+    first = first or frames[0]
     return {
-        "shown": shown,
+        "shown": Shown(asked.database.title, method, frames, first),
         "picture": _address(picture),
-        "errors_arcsec": _errors(first),
-        "field_deg": _field_deg(first, camera),
-        "view": _view(shown.first, database, camera),
-        "options": _options_told(options, shown.first),
+        "errors_arcsec": _errors(first.content),
+        "field_deg": _field_deg(first.content, asked.camera),
+        "view": _view(first, asked.database, asked.camera),
+        "options": _options_told(asked.options),
     }
 
 
-def _options_told(options: IdentifyOptions, frame: ShownFrame) -> dict[str, Any]:
-    """Return the options of a frame as a program states them."""
-    told = options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
-    if frame.is_loose and not {"fov_error", "fov_deg"} & set(told):
-        told["fov_error"] = FOV_ERROR_OF_IMAGES
-    return told
+def _frames(
+    service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
+) -> tuple[list[ShownFrame], bytes, str]:
+    """Identify the frames of one file; return them, the picture of the first, and the method."""
+    kind: Literal["png"] | None = "png" if draw else None
+    found, drawn = identify_upload(
+        service, asked.database.id, upload, asked.options, kind, for_page=True
+    )
+    epoch_jyear = float(asked.database.manifest["epoch_jyear"])
+    return shown_frames(found, given, epoch_jyear), drawn, str(found["method"])
+
+
+def _options_told(options: IdentifyOptions) -> dict[str, Any]:
+    """Return options as a program states them for centroids whose y counts down."""
+    return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
 
 
 def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:
     """Return what the view of the sky is told of an answer."""
     content = frame.content
-    if content["status"] != "identified":
+    if not frame.is_identified:
         return None
     found = camera.with_focal_length(float(content["focal_length_px"]))
     ra, dec, roll = (content[f"{name}_deg"] for name in ("boresight_ra", "boresight_dec", "roll"))

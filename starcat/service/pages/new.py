@@ -283,7 +283,7 @@ def _page(
     if refused is not None and refused.key in draft.values:
         found["errors"][refused.key] = refused.detail
         refused = None
-    status = refused.status if refused else 422 if found["errors"] else 200
+    status = refused.status if refused else 422 if found["errors"] and not is_first else 200
     return render(
         request,
         "new.html",

@@ -28,6 +28,7 @@ NAVIGATION = (
     ("/databases", "Databases"),
     ("/identify", "Identify"),
     ("/releases", "Releases"),
+    ("/docs", "Help"),
 )
 """Address and name of what the head of every page leads to."""
 

@@ -32,9 +32,15 @@ SIMBAD = "https://simbad.cds.unistra.fr/simbad/sim-id"
 VIZIER = "https://vizier.cds.unistra.fr/viz-bin/VizieR"
 _CDS = re.compile(r"CDS ([IVXB]+/\w+)")
 
-_COLUMNS = "star_id, designation, mag, ra_deg, dec_deg"
-_STARS = """SELECT {columns}, {reason} AS reason FROM {rows}
-WHERE mag IS NOT NULL AND ra_deg IS NOT NULL AND {wanted} ORDER BY mag, star_id"""
+_PART = """(SELECT '{kind}' AS kind, {reason} AS reason, star_id, designation, mag, ra_deg, dec_deg
+FROM {rows} WHERE mag IS NOT NULL AND ra_deg IS NOT NULL AND {wanted}
+ORDER BY mag, star_id LIMIT {most})"""
+_KINDS = (
+    ("guide", "stars", "NULL", "true"),
+    ("rejected", "rejected", "reason", "reason <> 'too_faint'"),
+    ("faint", "rejected", "reason", "reason = 'too_faint'"),
+)
+"""Kind of a star, its product, where its reason is, and which of the rows it is."""
 
 
 @router.get("/databases/{database_id}/sky.json")
@@ -57,30 +63,35 @@ async def stars_of_view(
 def _stars(
     service: Service, database: Database, where: tuple[float, float, float], faint: bool
 ) -> list[dict[str, Any]]:
-    kinds = [("guide", "stars", "NULL", "true")]
-    if "rejected" in database.products:
-        kinds.append(("rejected", "rejected", "reason", "reason <> 'too_faint'"))
-        if faint:
-            kinds.append(("faint", "rejected", "reason", "reason = 'too_faint'"))
-    found: list[dict[str, Any]] = []
-    for kind, table, reason, wanted in kinds:
-        text = _STARS.format(
-            columns=_COLUMNS,
+    is_all = where[2] >= 90.0
+    parts = [
+        _PART.format(
+            kind=kind,
             reason=reason,
+            rows=table if is_all else f"cone($ra, $dec, $radius, of := '{table}')",
             wanted=wanted,
-            rows=table if where[2] >= 90.0 else f"cone($ra, $dec, $radius, of := '{table}')",
+            most=MOST,
         )
-        values = {} if where[2] >= 90.0 else dict(zip(("ra", "dec", "radius"), where, strict=True))
-        query = SqlQuery([database.id], text, values, MOST, service.settings.query_time_s)
-        answer = result_table(service, query).with_json_values()
-        names = [column.name for column in answer.columns]
-        found += [_star(kind, dict(zip(names, row, strict=True))) for row in answer.rows]
-    return _named(found, float(database.manifest["epoch_jyear"]))
+        for kind, table, reason, wanted in _KINDS
+        if table in database.products and (faint or kind != "faint")
+    ]
+    values = {} if is_all else dict(zip(("ra", "dec", "radius"), where, strict=True))
+    query = SqlQuery(
+        [database.id],
+        "\nUNION ALL\n".join(parts) + "\nORDER BY kind, mag, star_id",
+        values,
+        len(_KINDS) * MOST,
+        service.settings.query_time_s,
+    )
+    answer = result_table(service, query).with_json_values()
+    names = [column.name for column in answer.columns]
+    stars = [_star(dict(zip(names, row, strict=True))) for row in answer.rows]
+    return _named(stars, float(database.manifest["epoch_jyear"]))
 
 
-def _star(kind: str, row: Mapping[str, Any]) -> dict[str, Any]:
+def _star(row: Mapping[str, Any]) -> dict[str, Any]:
     star = {
-        "kind": kind,
+        "kind": row["kind"],
         "id": str(row["star_id"]),
         "label": row["designation"] or f"star {row['star_id']}",
         "mag": round(row["mag"], 4),

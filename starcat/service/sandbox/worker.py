@@ -21,7 +21,8 @@ from starcat.service.sandbox.child import own_output
 from starcat.vo.uploads import upload_facts
 
 if TYPE_CHECKING:
-    from starcat.images.solve_files import FileAnswers, FrameAnswer, IdentifyOptions
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.solve_files import FileAnswers, FrameAnswer
     from starcat.matcher.matcher import Matcher
 
 MATCHERS = 4
@@ -41,7 +42,8 @@ def identify(
 
     A page is told more of each frame: the brightness of its centroids, and its WCS.
     """
-    from starcat.images.solve_files import MATCHER_OPTIONS, IdentifyOptions, identify_file
+    from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
+    from starcat.images.solve_files import identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
@@ -72,7 +74,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
     brightness = None
     if mag is not None:
         brightness = [value if math.isfinite(value) else None for value in mag.tolist()]
-    return {"mag": brightness, "wcs": wcs, "is_image": answers.is_image}
+    return {"mag": brightness, "wcs": wcs}
 
 
 @lru_cache(maxsize=MATCHERS)

@@ -36,6 +36,21 @@ if (form) {
   centroids.addEventListener("input", () => { if (centroids.value) file.value = ""; });
   file.addEventListener("change", () => { if (file.files.length) centroids.value = ""; });
 
+  // A picture of another size is one of another camera.
+  const compareSize = async () => {
+    if (!file.files.length) return;
+    const size = await createImageBitmap(file.files[0]).catch(() => null); // FITS is not one
+    const fields = [form.elements["camera.width_px"], form.elements["camera.height_px"]];
+    if (!size || fields.some((one) => one.value)) return;
+    const own = [size.width, size.height];
+    if (own.every((one, k) => one === Number(fields[k].placeholder))) return;
+    fields.forEach((one, k) => { one.value = own[k]; });
+    document.getElementById("other-camera").open = true;
+    announce(`The picture has ${own.join(" x ")} px: say which field its camera has`);
+  };
+  file.addEventListener("change", compareSize);
+  compareSize(); // it may have been chosen before this script came
+
   form.addEventListener("submit", () => {
     answer.setAttribute("aria-busy", "true");
     announce("Identifying");

@@ -317,8 +317,9 @@ class Sky {
       if (!one.isSeen) continue;
       const r = Math.max(1.1, Math.min(8, 1.3 + 0.75 * (faintest - (one.mag ?? faintest))));
       this.drawStar(one, x, y, this.at.size >= 180 ? 0.6 * r : r);
-      if (one.name || (one.kind === "mark" && one.label)) named.push(one);
+      if (one.kind !== "faint" && (one.name || (one.kind === "mark" && one.label))) named.push(one);
     }
+    named.sort((a, b) => (a.mag ?? 99) - (b.mag ?? 99));
     pen.fillStyle = COLOURS.guide;
     pen.strokeStyle = "rgb(0 0 0 / 70%)";
     pen.lineWidth = 3;

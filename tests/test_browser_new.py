@@ -1,0 +1,192 @@
+"""Tasks of people in a real browser, from a fresh root, each with its clicks: designing a database.
+
+A click is a click on something; what is typed is not counted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from browsing import BUILD_MS, NEEDS_BROWSER, launched, look, opened, settled
+from served import Served, serve
+from services import add_database
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page
+
+pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("new")
+    with serve(folder / "service", folder / "log", anonymous="builder") as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with launched() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    with opened(browser, served.address) as page:
+        yield page
+        assert page.complaints == []
+
+
+def begin(page: Page) -> None:
+    look(page, "light", 1280)
+    page.goto("/")
+    page.clicks = 0
+
+
+def click(page: Page, target: Locator) -> None:
+    """Click on something, and count it."""
+    target.click()
+    page.clicks += 1
+
+
+def fill(page: Page, label: str, text: str) -> None:
+    """Click into a field, type over what is there, and wait for the estimate."""
+    field = page.get_by_label(label, exact=True)
+    click(page, field)
+    changed = "() => document.getElementById('design').dataset.state"
+    before = page.evaluate(changed)
+    field.fill(text)
+    assert before != "changed"
+    settled(page)
+
+
+def design(page: Page) -> None:
+    begin(page)
+    click(page, page.get_by_role("link", name="New database").first)
+    page.wait_for_url("**/new")
+    settled(page)
+
+
+def test_task_two_limits_are_compared(page):
+    design(page)
+    click(page, page.get_by_role("button", name="Pin to compare"))
+    page.locator(".pinned").wait_for()
+    settled(page)
+    fill(page, "Faint limit mag", "4.5")
+    assert page.clicks <= 3
+    row = page.locator(".pinned tr", has_text="selection.faint_limit_mag")
+    assert [row.locator("td").nth(k).inner_text() for k in range(2)] == ["4.5", "6.0"]
+    verdicts = page.locator(".verdict").all_inner_texts()
+    assert "of the sky is blind" in verdicts[0]
+    assert verdicts[1].startswith("Good")
+    colours = page.locator("#body .legend").evaluate_all("all => all.map((one) => one.innerText)")
+    assert len(colours) == 2
+    assert colours[0] == colours[1]
+    stars = page.locator("dl.figures .figure", has_text="guide stars").first
+    now, pinned = (
+        int(re.sub(r"\D", "", stars.locator(one).inner_text())) for one in (".value", ".was")
+    )
+    assert 0 < now < pinned
+    page.get_by_role("button", name="Unpin").click()
+    page.locator(".pinned").wait_for(state="detached")
+
+
+def test_task_a_design_is_shared_by_its_link(page, browser, served):
+    design(page)
+    fill(page, "Field across the width deg", "17.5")
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    click(page, page.get_by_role("link", name="Link to this design"))
+    page.get_by_role("link", name="Copied").wait_for()
+    assert page.clicks <= 3
+    link = page.evaluate("navigator.clipboard.readText()")
+    assert link == page.url
+    with opened(browser, served.address) as other:
+        other.goto(link)
+        settled(other)
+        assert other.locator("#toml").input_value() == page.locator("#toml").input_value()
+        assert other.get_by_label("Name", exact=True).input_value() == "gaia-17-5deg"
+        other.reload()
+        settled(other)
+        assert other.get_by_label("Field across the width deg", exact=True).input_value() == "17.5"
+
+
+def test_a_design_outlasts_another_page_and_the_way_back(page):
+    design(page)
+    fill(page, "Faint limit mag", "5.25")
+    page.get_by_role("link", name="Databases").first.click()
+    page.wait_for_url("**/databases")
+    page.go_back()
+    settled(page)
+    assert page.get_by_label("Faint limit mag", exact=True).input_value() == "5.25"
+
+
+def test_nothing_wrong_can_be_built(page):
+    design(page)
+    build = page.get_by_role("button", name="Build")
+    assert build.is_enabled()
+    fill(page, "Faint limit mag", "99")
+    assert build.is_disabled()
+    assert "less than or equal to 40" in page.locator("#summary").inner_text()
+    fill(page, "Faint limit mag", "-29")  # no star is that bright: what the build would say
+    assert build.is_disabled()
+    fill(page, "Faint limit mag", "5")
+    assert build.is_enabled()
+
+
+def test_the_map_is_in_sight_while_the_sliders_move_on_a_phone(page):
+    design(page)
+    look(page, "light", 360)
+    for label in ("Field across the width, slider", "Faint limit, slider", "Boresights, slider"):
+        slider = page.get_by_label(label)
+        slider.scroll_into_view_if_needed()
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        settled(page)
+        seen = page.locator("#body .hero svg").first.bounding_box()
+        moved, height = slider.bounding_box(), page.viewport_size["height"]
+        assert 0 <= seen["y"] < seen["y"] + seen["height"] < moved["y"], label
+        assert moved["y"] + moved["height"] < height - 60, label
+        assert page.locator("#verdict").is_visible()
+    look(page, "light", 1280)
+
+
+@pytest.mark.slow
+def test_task_a_database_of_20_degrees_is_designed_and_built(page):
+    design(page)
+    fill(page, "Field across the width deg", "20")
+    click(page, page.get_by_role("button", name="Suggest for this camera"))
+    page.locator("#wrong", has_text="For 20 x 20 deg: faint limit 5.2").wait_for()
+    settled(page)
+    click(page, page.get_by_role("button", name="Build"))
+    page.wait_for_url(re.compile(r"/jobs/[0-9a-f]{32}$"))
+    assert page.clicks <= 4
+    page.locator(".badge:is(.done, .failed)").wait_for(timeout=BUILD_MS)
+    assert page.locator(".badge.done").count() == 1, page.locator("main").inner_text()
+    page.goto("/new?camera.fov_x_deg=20.0&name=gaia-20deg")
+    settled(page)
+    assert "is there already" in page.locator("[id='version-error']").inner_text()
+    assert page.get_by_role("button", name="Build").is_disabled()
+
+
+@pytest.mark.slow
+def test_task_how_good_is_it(page, served, picky_artifact: Path):
+    add_database(served.root, picky_artifact)
+    begin(page)
+    click(page, page.get_by_role("link", name=f"{picky_artifact.name}".replace("-1.0.0", " 1.0.0")))
+    click(page, page.get_by_role("button", name="Evaluate"))
+    page.wait_for_url(re.compile(r"/jobs/[0-9a-f]{32}$"))
+    page.locator("#headline").wait_for(timeout=BUILD_MS)
+    assert page.clicks <= 2
+    words = page.locator("#found").inner_text()
+    assert "of all pointings, clean frames" in words
+    assert re.search(r"interval of 95 %\n\d+\.\d to \d+\.\d %", words)
+    assert page.locator(".chart").count() == 3
+    assert "100" in page.locator(".chart svg").first.get_attribute("aria-label")
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    for theme, width in (("light", 360), ("dark", 1280)):
+        look(page, theme, width)
+        assert axe.run(page).response["violations"] == []
