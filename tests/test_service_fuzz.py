@@ -36,8 +36,8 @@ SQL = (
     "END", "AS", "x", "LIMIT 3", "UNION", "WITH", "a", "JOIN", "ON", "range(5)", "-", "/", "0",
     "CAST", "AS INTEGER", "BOX(1, 2, 3, 4)", "POINT('ICRS', ra_deg, dec_deg)", "TOP 3", "CONTAINS(",
     "CIRCLE(1, 2, 3)", "tap_schema.tables", "unnest([1, 2])", "lambda", "::", "[", "]", "{", "}",
-    ";", "repeat('x', 10)", "DISTANCE(", "SUM(mag)", "OVER (ORDER BY mag)", "OFFSET", "9" * 30, "IN",
-    "$a",
+    ";", "repeat('x', 10)", "DISTANCE(", "SUM(mag)", "OVER (ORDER BY mag)", "OFFSET", "9" * 30,
+    "IN", "$a",
 )  # fmt: skip
 
 

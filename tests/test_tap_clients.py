@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from astropy.table import Table
 from pyvo.dal import DALQueryError, TAPService
+from requests import HTTPError
 from served import serve
 from services import add_database
 
@@ -163,7 +164,7 @@ def test_astroquery_asks_at_once_and_later(tap_plus, rows, launch, form):
 
 
 def test_astroquery_is_told_why_a_job_failed(tap_plus):
-    with pytest.raises(HTTPError, match="no column 'nothing'; .*there are"):
+    with pytest.raises(HTTPError, match=r"no column 'nothing'; .*there are"):
         tap_plus.launch_job_async("SELECT nothing FROM small.stars")
     with pytest.raises(HTTPError, match="no column 'nothing'"):
         tap_plus.launch_job("SELECT nothing FROM small.stars")
