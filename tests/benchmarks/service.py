@@ -9,7 +9,7 @@ that is sent to the last that has arrived, with a new connection only where the 
 last.
 
     python tests/benchmarks/service.py --seconds 60 --clients 50 --builds 4
-    python tests/benchmarks/service.py --seconds 60 --clients 48 --greedy 2
+    python tests/benchmarks/service.py --seconds 60 --clients 48 --greedy 2 --pause-s 2
 """
 
 from __future__ import annotations
