@@ -12,6 +12,7 @@ LACKING = 77
 
 BENCHMARKS = [
     "campaign", "engines", "false_matches", "fields", "hostile", "ingest", "instructions",
+    "interrupts",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
     "matcher --of ruststartracker", "pictures", "products", "scale", "service", "sql", "tracking",
     "votable",

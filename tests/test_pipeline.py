@@ -277,7 +277,7 @@ def test_a_stopped_build_leaves_no_half_artifact(number, attempts, slower, tmp_p
 
 
 def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> None:
-    from starcat.cli.main import _stop
+    from starcat.cli.interrupts import stop as end_on
 
     seen: list[list[str]] = []
 
@@ -287,7 +287,7 @@ def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> 
             os.kill(os.getpid(), signal.SIGTERM)
 
     spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
-    before = signal.signal(signal.SIGTERM, _stop)
+    before = signal.signal(signal.SIGTERM, end_on)
     try:
         with pytest.raises(SystemExit) as stop:
             build(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)

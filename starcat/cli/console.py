@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from string import Formatter
 from typing import TYPE_CHECKING, Any
 
+from starcat.cli import interrupts
 from starcat.failures import AT_STAGE
 from starcat.progress import Progress
 
@@ -119,6 +120,7 @@ def progress_bars() -> Iterator[Progress]:
             bars = stack.enter_context(StageBars(console))
 
         def draw(stage: str, done: int, total: int | None) -> None:
+            interrupts.check()
             reached[0] = stage
             if bars is not None:
                 bars.show(stage, done, total)

@@ -24,6 +24,7 @@ from starcat.cli import (
     catalogs,
     evaluation,
     exchange,
+    interrupts,
     matching,
     releases,
     serving,
@@ -34,7 +35,8 @@ from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__
 
-INTERRUPTED = 128 + signal.SIGINT  # exit code after Ctrl-C, as the shells have it
+# Exit codes after a signal, as the shells have them.
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 
 
 class WholeSummaries(TyperGroup):
@@ -99,31 +101,36 @@ def _options(
         context.obj = open_remote(server, token, context.invoked_subcommand or "")
 
 
-def _stop(number: int, frame: Any) -> None:
-    """Turn a termination signal into an exit that cleans up."""
-    sys.exit(128 + number)
-
-
 def main() -> None:
     """Run the command line, and turn every exception into a message and an exit code.
 
     ``--debug`` shows the traceback before the message, wherever on the line it stands; the exit
     code stays the same.
     """
-    signal.signal(signal.SIGTERM, _stop)
+    interrupts.catch_signals()
     logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
     arguments, behind = _parted(sys.argv[1:])
     is_debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
         code = _run([*arguments, *behind])
+        interrupts.check()
     except Exception as error:
         if is_debug:
             traceback.print_exc()
         code = _tell(error, arguments)
     except KeyboardInterrupt:
+        sys.stderr.write(interrupts.left_by(_command_of(arguments)))
         code = INTERRUPTED
+    except SystemExit as ended:
+        if ended.code == TERMINATED:
+            sys.stderr.write(interrupts.left_by(_command_of(arguments)))
+        raise
     sys.exit(code)
+
+
+def _command_of(arguments: Sequence[str]) -> str:
+    return next((argument for argument in arguments if not argument.startswith("-")), "")
 
 
 def _parted(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -147,8 +154,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _tell(error: Exception, arguments: Sequence[str]) -> int:
     """Say what went wrong on stderr and return the exit code."""
-    named = [argument for argument in arguments if not argument.startswith("-")]
-    failure = failure_of(error, " ".join(["starcat", *named[:1]]))
+    failure = failure_of(error, f"starcat {_command_of(arguments)}".strip())
     if "--json" in arguments or "--ndjson" in arguments:
         sys.stderr.write(failure.as_json())
     elif hasattr(error, "show"):  # a usage error, with the usage above the message

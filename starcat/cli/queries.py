@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcat.cli import interrupts
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 from starcat.errors import QueryError, StarcatError
 from starcat.query.gallery import gallery, guessed, macros, named_query
@@ -238,6 +239,7 @@ def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> N
         except EOFError:
             break
         except KeyboardInterrupt:
+            interrupts.forget()
             say("")
             continue
         if text.split()[:1] in ([".quit"], [".exit"]):
@@ -247,6 +249,7 @@ def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> N
         except StarcatError as error:
             say(f"error: {error}")
         except KeyboardInterrupt:
+            interrupts.forget()
             say("stopped")
     _keep_history()
 

@@ -8,6 +8,10 @@ from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import chord_from_separation, separation
+from starcat.threads import map_in_order
+
+AT_ONCE = 50_000
+"""Points whose neighbours a thread looks for at once."""
 
 
 def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
@@ -35,15 +39,13 @@ def nearest_chords(
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = cKDTree(stars, leafsize=16, balanced_tree=False)
-    near = tree.query(points, k=3, workers=workers)
-    chord, found = np.asarray(near[0]), np.asarray(near[1], dtype=np.int64)
+    chord, found = _nearest(tree, points, 3, workers)
     # Nearly always a point finds itself, one star and, farther away, another.
     best, index = chord[:, 1].copy(), found[:, 1].copy()
     rows = np.flatnonzero((found[:, 0] != itself) | ~(chord[:, 2] > chord[:, 1]))
     count = 3
     while len(rows):
-        near = tree.query(points[rows], k=count, workers=workers)
-        chord, found = np.asarray(near[0]), np.asarray(near[1], dtype=np.int64)
+        chord, found = _nearest(tree, points[rows], count, workers)
         furthest = chord[:, -1].copy()
         chord[found == itself[rows, None]] = np.inf
         least = chord.min(axis=1)
@@ -55,6 +57,21 @@ def nearest_chords(
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
     return best, index
+
+
+def _nearest(
+    tree: cKDTree, points: Directions, count: int, workers: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return chords and rows of the nearest stars of each point.
+
+    scipy's own threads would go on with freed memory after an interrupt; these are waited for.
+    """
+    parts = (points[first : first + AT_ONCE] for first in range(0, len(points), AT_ONCE))
+    near = list(map_in_order(lambda part: tree.query(part, k=count), parts, workers))
+    if not near:
+        return np.empty((0, count)), np.empty((0, count), dtype=np.int64)
+    chords, rows = zip(*near, strict=True)
+    return np.concatenate(chords), np.concatenate(rows).astype(np.int64, copy=False)
 
 
 def separation_from_chord(chord: Array) -> Array:

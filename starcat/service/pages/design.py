@@ -20,6 +20,7 @@ from starcat.service.pages.draft import (
     draft_of_text,
     without_defaults,
 )
+from starcat.service.pages.naming import FOLLOWING, followed
 from starcat.specs.reading import changed, preset, preset_names
 
 PRESET, PINNED = "preset", "pinned"
@@ -49,9 +50,8 @@ def draft_of_query(query: Mapping[str, str]) -> Draft:
     if TEXT in query:
         return draft_of_text(query[TEXT])
     changes = {key: text for key, text in query.items() if key not in OTHERS}
-    base = _base(query.get(PRESET) or preset_names()[0])
     try:
-        return draft_of_content(changed(base, changes))
+        return draft_of_content(_content(query.get(PRESET) or preset_names()[0], changes))
     except (ConfigError, ValueError, TypeError) as error:
         raise ConfigError(f"the address is of no design: {error}", key="address") from None
 
@@ -74,11 +74,21 @@ def _changes(draft: Draft, base: str) -> dict[str, str] | None:
     changes |= {key: "" for key in before if key not in after}
     if any(key in OTHERS for key in changes):
         return None
+    own = {key: changes.pop(key, _typed(after.get(key, ""))) for key in FOLLOWING}
     try:
-        same = changed(_base(base), changes)
+        followed_by = _content(base, changes)
+        changes |= {k: v for k, v in own.items() if followed_by.get(k) != draft.content.get(k)}
+        same = _content(base, changes)
     except (ConfigError, ValueError, TypeError):
         return None
     return changes if same == draft.content else None
+
+
+def _content(base: str, changes: dict[str, str]) -> dict[str, Any]:
+    """Return a preset as it is changed; name and description follow where they are not given."""
+    content = changed(_base(base), changes)
+    own = followed(content) if changes else {}
+    return content | {key: text for key, text in own.items() if key not in changes}
 
 
 def _leaves(content: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

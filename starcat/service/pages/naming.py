@@ -20,6 +20,9 @@ _OWN = {
 }
 """What `names_of` gives."""
 
+FOLLOWING = tuple(_OWN)
+"""Keys that follow the design."""
+
 
 def followed(content: Mapping[str, Any]) -> dict[str, str]:
     """Return the name and the description that a changed spec should have, where it has given none.

@@ -195,7 +195,7 @@ def _shown(
         problem = found
     if draft.spec is not None:
         errors |= _taken(service, draft)
-    is_refused = seen is not None and bool(seen.estimate.refusals)
+    is_refused = seen is not None and bool(seen.estimate.refusals or seen.verdict.will_fail)
     is_busy = problem is not None and problem.status == 503
     return {
         "preview": seen,
@@ -310,6 +310,8 @@ def _summary(seen: Preview | None, errors: dict[str, str], problem: ProblemDetai
     found = seen.estimate
     if found.refusals:
         return f"Cannot be built: {found.refusals[0]}"
+    if seen.verdict.will_fail:
+        return f"Not to be built: {seen.verdict.words}"
     stars = found.coverage.stars
     return (
         f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "

@@ -16,6 +16,8 @@ _PHRASES = (
     (r"give its value with --set \w+=VALUE", "give its value in the field of that name"),
     (r"'starcat sql --macros' lists", "the list beside the query tells"),
     (r"'starcat sql --list' shows", "the list beside the query shows"),
+    (r"(?<!\w)-o writes", "“Download all rows” writes"),
+    (r"'starcat crossmatch'", "The command crossmatch"),
     (r"with --scheduler\b", "by the operator"),
     (r" \(--[a-z][^)]*\)", ""),
     (r"--fov-error\b", "“Error of the field”"),
@@ -29,7 +31,7 @@ _PHRASES = (
 )
 """Phrases of the command line, and what they are on a page."""
 
-_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 _ENDS = re.compile(r"(; |\. (?=[A-Z]))")
 
 
