@@ -241,10 +241,11 @@ def test_presets_of_catalogs_that_are_not_here_are_grey(client, monkeypatch):
         ("", []),
         ("faint_limit_mag = 99", ["selection.faint_limit_mag"]),
         ("faint_limit_mag = 99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
-        ("faint_limit_mag = -28", [None]),
+        ("faint_limit_mag = -28", ["selection.faint_limit_mag"]),
+        ("faint_limit_mag = 7.5", ["selection.max_stars_per_field"]),
         ("faint_limit_mag = 5", []),
     ],
-    ids=["as it is", "one", "two", "no star is left", "another"],
+    ids=["as it is", "one", "two", "no star is left", "too much memory", "another"],
 )
 def test_nothing_is_built_while_anything_is_wrong(client, wrong, keys):
     text = SPEC.replace("mine", "checked").replace(
