@@ -26,6 +26,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
+from starcat.query.engine import CLOCK_TIMES
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
 from starcat.service.sandbox.places import SHORT_S, Lease, Overdue, lease
@@ -240,7 +241,7 @@ class Spool:
 
         Until then it can still be begun again, for which `Overdue` is raised: nothing was sent.
         """
-        until_s = time.monotonic() + SHORT_S
+        until_s = time.monotonic() + CLOCK_TIMES * SHORT_S
         with self._changed:
             while not (self._is_done or place.is_long or time.monotonic() > until_s):
                 self._changed.wait(TICK_S)
