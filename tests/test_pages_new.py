@@ -6,6 +6,7 @@ import re
 
 import pytest
 from fastapi.testclient import TestClient
+from services import client_of, token_of
 
 from starcat.errors import ConfigError
 from starcat.service.pages.design import differences, draft_of_query, pinned_draft, query_of
@@ -104,14 +105,21 @@ def test_a_reader_signs_in_and_comes_back_to_the_design(reader):
     page = reader.get("/new?camera.fov_x_deg=16").text
     [address] = re.findall(r'class="button" href="(/sign-in[^"]*)">Sign in to build', page)
     form = reader.get(address.replace("&amp;", "&")).text
-    assert 'name="next" value="/new?camera.fov_x_deg=16"' in form
+    [kept] = re.findall(r'name="next" value="([^"]*)"', form)
+    assert kept == "/new?camera.fov_x_deg=16"
+    sent = {"token": reader.token, "next": kept}
+    reader.headers["Origin"] = str(reader.base_url)
+    answer = reader.post("/sign-in", data=sent)
+    assert answer.url.path == "/new"
+    assert "fov_x_deg = 16" in answer.text
+    assert re.search(r'<button [^>]*id="build"', answer.text)
 
 
 @pytest.fixture
-def reader(root):
-    from services import client_of
-
-    with client_of(root, anonymous="reader") as client:
+def reader(tmp_path):
+    token = token_of(tmp_path, "anna")
+    with client_of(tmp_path, anonymous="reader") as client:
+        client.token = token
         yield client
 
 
@@ -193,19 +201,22 @@ def test_no_limits_are_suggested_for_a_wrong_camera(client):
 @pytest.mark.parametrize(
     ("limit", "level", "words"),
     [
-        ("3.5", "bad", r"\d\d % of the sky is blind: .* Go to G 5\.2\."),
+        ("3.5", "bad", r"\d\d % of the sky is blind: .* a build fails .*90 % .* Go to G 5\.2\."),
+        ("4.3", "bad", r"^\d(\.\d)? % of the sky is blind: [^,]*guide stars\. Go to G 5\.2\."),
         ("4.9", "warn", r"Thin: 1 % of the fields have 7 .* Go to G 5\.2\."),
         ("5.5", "good", r"Good: 99 % of the fields have \d\d guide stars"),
-        ("7.5", "good", r"more than are needed: G 5\.2, or a limit of stars per field"),
+        ("6.7", "good", r"more than are needed: G 5\.2, or a limit of stars per field"),
     ],
 )
 def test_an_estimate_has_a_verdict_in_words(client, limit, level, words):
-    text = SPEC.replace("4.5", limit).replace('source = "gaia"', 'source = "gaia"\nband = "G"')
+    text = SPEC.replace("4.5", limit).replace("mine", "judged")
+    text = text.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
     state = _sent(client, "/new/preview", text).json()
     told = re.search(r'<p class="verdict (\w+)" id="verdict">([^<]*)<', state["result"])
     assert told is not None
     assert told[1] == level
     assert re.search(words, told[2]), told[2]
+    assert state["can_build"] == ("a build fails" not in told[2]), state["summary"]
 
 
 def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
@@ -230,10 +241,11 @@ def test_presets_of_catalogs_that_are_not_here_are_grey(client, monkeypatch):
         ("", []),
         ("faint_limit_mag = 99", ["selection.faint_limit_mag"]),
         ("faint_limit_mag = 99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
-        ("faint_limit_mag = -28", [None]),
+        ("faint_limit_mag = -28", ["selection.faint_limit_mag"]),
+        ("faint_limit_mag = 7.5", ["selection.max_stars_per_field"]),
         ("faint_limit_mag = 5", []),
     ],
-    ids=["as it is", "one", "two", "no star is left", "another"],
+    ids=["as it is", "one", "two", "no star is left", "too much memory", "another"],
 )
 def test_nothing_is_built_while_anything_is_wrong(client, wrong, keys):
     text = SPEC.replace("mine", "checked").replace(

@@ -116,7 +116,8 @@ def test_without_rows_there_are_columns(ask):
 
 WRONG = [
     ({"QUERY": "SELECT nothing FROM small.stars"}, 400, "no column 'nothing'"),
-    ({"QUERY": "SELECT star_id FROM stars LIMIT 3"}, 400, "LIMIT is not ADQL"),
+    ({"QUERY": "SELECT TOP 2 star_id FROM stars LIMIT 3"}, 400, "LIMIT"),
+    ({"QUERY": f"SELECT TOP {'9' * 23} star_id FROM stars"}, 400, "TOP has 23 digits"),
     ({"QUERY": "DROP TABLE stars"}, 400, "only reads"),
     ({"QUERY": "SELECT * FROM '/etc/passwd'"}, 400, "no table"),
     ({"QUERY": "SELECT CAST(designation AS INTEGER) FROM stars"}, 400, "Could not convert"),

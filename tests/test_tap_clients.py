@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from astropy.table import Table
 from pyvo.dal import DALQueryError, TAPService
+from requests import HTTPError
 from served import serve
 from services import add_database
 
@@ -128,8 +129,9 @@ def test_pyvo_follows_a_job(service, rows):
 
 
 def test_pyvo_is_told_what_is_wrong(service):
-    with pytest.raises(DALQueryError, match="LIMIT is not ADQL"):
-        service.run_sync("SELECT star_id FROM small.stars LIMIT 3")
+    for run in (service.run_sync, service.run_async):
+        with pytest.raises(DALQueryError, match="no column 'nothing'"):
+            run("SELECT nothing FROM small.stars")
     found = service.run_sync(CONE, maxrec=2)
     assert (len(found), found.query_status) == (2, "OVERFLOW")
 
@@ -159,6 +161,13 @@ def test_astroquery_asks_at_once_and_later(tap_plus, rows, launch, form):
     found = rows_of(job.get_results())
     assert [row[0] for row in found] == [row[0] for row in rows]
     assert [row[2:] for row in found] == [row[2:] for row in rows]
+
+
+def test_astroquery_is_told_why_a_job_failed(tap_plus):
+    with pytest.raises(HTTPError, match=r"no column 'nothing'; .*there are"):
+        tap_plus.launch_job_async("SELECT nothing FROM small.stars")
+    with pytest.raises(HTTPError, match="no column 'nothing'"):
+        tap_plus.launch_job("SELECT nothing FROM small.stars")
 
 
 def test_astroquery_uploads(tap_plus, rows, tmp_path):

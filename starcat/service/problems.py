@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import re
+import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -134,6 +137,39 @@ def without_folders(message: str) -> str:
     return _FOLDERS.sub("", message)
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def outage_of(error: BaseException, root: Path) -> Problem | None:
+    """Return what to say of an error that is none of starcat: of the disk, or of the records."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if (isinstance(cause, OSError) and cause.errno in FULL) or "disk is full" in str(cause):
+            return Problem(
+                507,
+                "the disk of the service is full; remove unused databases or results, or ask the "
+                "operator",
+            )
+        if not root.is_dir() and isinstance(cause, (OSError, sqlite3.Error)):
+            return Problem(
+                503,
+                "the folder of the service is gone; the operator has to put it back, from the "
+                "backup if need be",
+            )
+        if isinstance(cause, sqlite3.DatabaseError):
+            return Problem(503, damaged_records("records.sqlite", cause))
+        cause = cause.__cause__
+    return None
+
+
+def damaged_records(name: str, error: sqlite3.Error) -> str:
+    """Return what to say where the records cannot be read."""
+    return (
+        f"{name} cannot be used ({error}); stop the service and put {Path(name).name} of the last "
+        "backup in its place ('Backup and restore' of docs/howto-serve.md)"
+    )
+
+
 class RenderingRoute(APIRoute, ABC):
     """A route that answers its errors in a form of its own: pages, or the documents of TAP."""
 
@@ -163,12 +199,26 @@ def add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     @app.exception_handler(HTTPException)
     def refuse(request: Request, error: Exception) -> Response:
-        return problem_response(error, request)
+        told = isinstance(error, StarcatError) and outage_of(
+            error, request.app.state.service.settings.root
+        )
+        return problem_response(told or error, request)
+
+    @app.exception_handler(OSError)
+    @app.exception_handler(sqlite3.Error)
+    def tell_outage(request: Request, error: Exception) -> Response:
+        outage = outage_of(error, request.app.state.service.settings.root)
+        if outage is None:
+            raise error
+        _logger.error("%s", error)
+        return problem_response(outage, request)
 
     @app.exception_handler(Exception)
     def tell_defect(request: Request, error: Exception) -> Response:
-        _logger.exception("a defect", exc_info=error)
-        return problem_response(error, request)
+        outage = outage_of(error, request.app.state.service.settings.root)
+        told = "a defect" if outage is None else "the service cannot go on"
+        _logger.exception(told, exc_info=error)
+        return problem_response(outage or error, request)
 
 
 def refusals(texts: Mapping[int, str]) -> dict[int | str, dict[str, Any]]:

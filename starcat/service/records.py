@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from starcat.errors import SchemaVersionError
+from starcat.errors import ProductError, SchemaVersionError
+from starcat.service.problems import damaged_records
 
 PUBLICATIONS = """
     CREATE TABLE publications (
@@ -177,7 +178,20 @@ class Records:
             self._of_thread.connection = connection
         return connection
 
+    def check(self) -> None:
+        """Look whether the file is whole and can be written; `sqlite3.Error` where it is not."""
+        with self.writing() as connection:
+            [found] = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if found != "ok":
+            raise sqlite3.DatabaseError(found)
+
     def _migrate(self) -> None:
+        try:
+            self._migrated()
+        except sqlite3.DatabaseError as error:
+            raise ProductError(damaged_records(str(self.path), error), path=self.path) from error
+
+    def _migrated(self) -> None:
         with self.writing() as connection:
             [found] = connection.execute("PRAGMA user_version").fetchone()
             if found > len(MIGRATIONS):

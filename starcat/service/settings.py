@@ -66,7 +66,9 @@ class Settings(BaseModel):
     worker_silence_s: float = Field(
         60.0, gt=0, description="Seconds until a worker of the cluster that is silent is lost."
     )
-    queries: int = Field(2, ge=1, le=64, description="Queries that run at the same time.")
+    queries: int = Field(
+        2, ge=1, le=64, description="Queries that take long and run at the same time."
+    )
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
     upload_mib: float = Field(64.0, gt=0, description="Size of an upload at most, MiB.")
     upload_time_s: float = Field(60.0, gt=0, description="Seconds that an upload may take.")

@@ -18,6 +18,7 @@ from starcat.progress import Progress, no_progress
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.vo.adql_columns import Columns, Names
+from starcat.vo.adql_geometry import within
 from starcat.vo.adql_grammar import Refusal, parse_adql, refusals_of
 from starcat.vo.adql_shapes import (
     GEOMETRY,
@@ -26,6 +27,7 @@ from starcat.vo.adql_shapes import (
     condition_of,
     is_text,
     number_sql,
+    places_of,
     raw,
     shape_of,
     sql_text,
@@ -46,6 +48,7 @@ class Function:
     # SQL of DuckDB with {0}, {1} for the arguments, 0 where one is left out; {all} for all of them.
     written: str
     is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
+    is_windowed: bool = False  # whether it needs OVER
 
     def sql(self, arguments: list[str]) -> str:
         """Return the call as DuckDB writes it."""
@@ -57,6 +60,12 @@ def _same(name: str, count: int = 1) -> Function:
     places = ", ".join(f"{{{k}}}" for k in range(count))
     return Function(count, count, f"{name}({places})")
 
+
+WINDOWED = (
+    ("ROW_NUMBER", 0, 0), ("RANK", 0, 0), ("DENSE_RANK", 0, 0), ("NTILE", 1, 1), ("LAG", 1, 3),
+    ("LEAD", 1, 3), ("FIRST_VALUE", 1, 1), ("LAST_VALUE", 1, 1),
+)  # fmt: skip
+"""Functions that look at other rows of a window: their names and how many arguments they take."""
 
 _SAME = "ABS DEGREES EXP FLOOR LOG10 RADIANS SQRT ACOS ASIN ATAN COS COT SIN TAN LOWER UPPER"
 
@@ -77,11 +86,33 @@ FUNCTIONS: dict[str, Function] = {
     "TIMESTAMP": Function(1, 1, "CAST({0} AS TIMESTAMP)"),
     **{
         name: Function(1, 1, f"{name.lower()}({{0}})", is_set=True)
-        for name in ("COUNT", "SUM", "AVG", "MIN", "MAX")
+        for name in ("COUNT", "SUM", "AVG", "MIN", "MAX", "STDDEV", "VARIANCE")
+    },
+    "SIGN": _same("sign"),
+    "SUBSTRING": Function(2, 3, "substring({all})"),
+    "LENGTH": _same("length"),
+    **{
+        name: Function(least, most, f"{name.lower()}({{all}})", is_windowed=True)
+        for name, least, most in WINDOWED
     },
     "IVO_HEALPIX_INDEX": Function(3, 3, "healpix({0}, {1}, {2})"),
 }
 """Functions by their names in ADQL. Logarithms are natural where the name does not say 10."""
+
+EXTENSIONS = (
+    ("CASE", "CASE WHEN condition THEN value ELSE value END, and CASE value WHEN ..."),
+    ("COALESCE", "The first value that is there (ADQL 2.1 has it as optional)."),
+    ("LIMIT", "LIMIT n at the end of a query, as TOP n."),
+    ("SELECT without FROM", "One row of constants."),
+    ("OVER", f"Windows with PARTITION BY and ORDER BY for {', '.join(n for n, *_ in WINDOWED)} and "
+     "functions of sets."),
+    ("SIGN", "-1, 0 or 1."), ("SUBSTRING", "SUBSTRING(text, first[, length]), from 1 on."),
+    ("LENGTH", "Characters of a text."), ("STDDEV", "Standard deviation of a sample."),
+    ("VARIANCE", "Variance of a sample."),
+    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; what is "
+     "given back is ICRS."),
+)  # fmt: skip
+"""What is read beyond ADQL, as other archives read it, with what it does."""
 
 USER_FUNCTIONS = (
     (
@@ -190,6 +221,8 @@ class _Translator:
             part.replace(raw(f"left(CAST({sql_text(part.this)} AS VARCHAR), {size})"))
         elif isinstance(part, (exp.EQ, exp.NEQ)):
             self._compare(part)
+        elif isinstance(part, (exp.LT, exp.LTE, exp.GT, exp.GTE)):
+            self._compare_distance(part)
         elif isinstance(part, exp.Anonymous):
             self._call(part)
         elif isinstance(part, exp.SetOperation):
@@ -208,6 +241,20 @@ class _Translator:
                 part.replace(raw(asked if is_asked else f"NOT {asked}"))
                 return
 
+    def _compare_distance(self, part: exp.LT | exp.LTE | exp.GT | exp.GTE) -> None:
+        """Write ``DISTANCE(...) < r`` with the declinations that are possible, as CONTAINS has it.
+
+        Only where rows are chosen by it, and of places that are not there none is.
+        """
+        near, far = part.this, part.expression
+        if isinstance(part, (exp.GT, exp.GTE)):
+            near, far = far, near
+        places = places_of(near)
+        if places is None or not _chooses(part):
+            return
+        sign = "<=" if isinstance(part, (exp.LTE, exp.GTE)) else "<"
+        part.replace(raw(within(*places, sign, f"({sql_text(far)})")))
+
     def _call(self, part: exp.Anonymous) -> None:
         name = part.this.upper() if isinstance(part.this, str) else ""
         if self._geometry.read(part):
@@ -223,6 +270,8 @@ class _Translator:
                 part,
             )
         function = FUNCTIONS[name]
+        if function.is_windowed and not isinstance(part.parent, exp.Window):
+            raise Refusal(f"{name} needs a window, as OVER (ORDER BY mag) behind it", part)
         check_count(part, function.least, function.most)
         arguments = part.expressions
         inner = arguments[0] if arguments else None
@@ -255,3 +304,10 @@ class _Translator:
                 part,
             ) from error
         part.replace(raw(f"({sql_text(value)} * {float(factor)!r}::DOUBLE)"))
+
+
+def _chooses(part: exp.Expr) -> bool:
+    """Return whether a condition is one that all rows have to fulfil."""
+    while isinstance(part.parent, (exp.And, exp.Paren)):
+        part = part.parent
+    return isinstance(part.parent, (exp.Where, exp.Join))

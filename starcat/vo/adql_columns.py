@@ -117,7 +117,8 @@ class Names:
     def sources(self, select: exp.Select) -> list[Source]:
         """Return what stands after FROM in a query."""
         if id(select) not in self._sources_of:
-            parts = [select.args["from_"], *select.args.get("joins", ())]
+            first = select.args.get("from_")
+            parts = [*([first] if first else ()), *(select.args.get("joins") or ())]
             found = [source for part in parts for source in self._sources(part.this)]
             self._sources_of[id(select)] = found
         return self._sources_of[id(select)]

@@ -104,13 +104,41 @@ class Polygon:
         return _added(*parts)
 
 
-Shape = Point | Circle | Polygon
+@dataclass(frozen=True)
+class Zone:
+    """All places between two parallels and, where it is narrower than a turn, two meridians."""
+
+    centre: Point
+    width: float  # degrees of right ascension
+    # Declinations, degrees.
+    low: float
+    high: float
+
+    @property
+    def value(self) -> str:
+        """SQL of its corners as DALI writes a polygon."""
+        half = f"{self.width / 2.0!r}"
+        west, east = f"{self.centre.lon} - {half}", f"{self.centre.lon} + {half}"
+        low, high = repr(self.low), repr(self.high)
+        return _list(west, low, east, low, east, high, west, high)
+
+
+Shape = Point | Circle | Polygon | Zone
+
+_GALACTIC = (
+    (-0.0548755604162154, -0.8734370902348850, -0.4838350155487132),
+    (+0.4941094278755837, -0.4448296299600112, +0.7469822444972189),
+    (-0.8676661490190047, -0.1980763734312015, +0.4559837761750669),
+)
+"""Directions of the galactic axes in ICRS (The Hipparcos Catalogue, SP-1200, equation 1.5.11)."""
 
 
 def contains(inner: Shape, outer: Shape) -> str:
     """Return SQL of whether a shape is within another."""
     if isinstance(outer, Point):
         return _compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
+    if isinstance(outer, Zone) or isinstance(inner, Zone):
+        return _in_zone(inner, outer)
     if isinstance(outer, Circle):
         if isinstance(inner, Point):
             return _in_circle(inner, outer)
@@ -161,6 +189,9 @@ def area(shape: Shape) -> str:
         # 1 - cos r with all its digits for small circles.
         half = f"sind(least({shape.radius}, 180) / 2e0)"
         return f"({4.0 * math.pi * SQUARE_DEGREES!r} * {half} * {half})"
+    if isinstance(shape, Zone):
+        low, high = math.sin(math.radians(shape.low)), math.sin(math.radians(shape.high))
+        return repr(SQUARE_DEGREES * math.radians(min(shape.width, 360.0)) * (high - low))
     return f"({SQUARE_DEGREES!r} * abs({_sql_of(shape.turn)}))"
 
 
@@ -180,12 +211,37 @@ def centroid(shape: Shape) -> Point:
         total = (x, y, z)
     sign = _sign_of(shape.turn)
     x, y, z = (_times(sign, part) for part in total)
-    level = _root(_added(_times(x, x), _times(y, y)))
-    lon = f"degrees({_sql_of(_arctan(y, x))})"
+    return _place_at(x, y, z)
+
+
+def _place_at(x: Term, y: Term, z: Term) -> Point:
+    lon = _arctan(y, x)
+    lat = _arctan(z, _root(_added(_times(x, x), _times(y, y))))
+    if isinstance(lon, float) and isinstance(lat, float):
+        return Point(repr(math.degrees(lon) % 360.0), repr(math.degrees(lat)))
+    degrees = f"degrees({_sql_of(lon)})"
     return Point(
-        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)",
-        f"degrees({_sql_of(_arctan(z, level))})",
+        f"({degrees} + CASE WHEN {degrees} < 0 THEN 360 ELSE 0 END)", f"degrees({_sql_of(lat)})"
     )
+
+
+def from_galactic(shape: Shape) -> Shape:
+    """Return a shape in ICRS that was given in galactic coordinates; of boxes those with sides."""
+    if isinstance(shape, Circle):
+        return Circle(_from_galactic(shape.centre), shape.radius)
+    if isinstance(shape, Polygon):
+        centre = None if shape.centre is None else _from_galactic(shape.centre)
+        return Polygon(tuple(map(_from_galactic, shape.corners)), centre)
+    return shape if isinstance(shape, Zone) else _from_galactic(shape)
+
+
+def _from_galactic(place: Point) -> Point:
+    along = place.vector
+    x, y, z = (
+        _added(*(_times(axis[k], part) for axis, part in zip(_GALACTIC, along, strict=True)))
+        for k in range(3)
+    )
+    return _place_at(x, y, z)
 
 
 def characters(shapes: Sequence[Shape]) -> int:
@@ -204,11 +260,23 @@ def _parts(shape: Shape) -> tuple[str, ...]:
         return shape.lon, shape.lat
     if isinstance(shape, Circle):
         return (*_parts(shape.centre), shape.radius)
+    if isinstance(shape, Zone):
+        return _parts(shape.centre)
     return tuple(text for corner in shape.corners for text in _parts(corner))
 
 
-def box(centre: Point, width: str, height: str) -> Polygon:
-    """Return the polygon with the corners of a box around a place."""
+def box(centre: Point, width: str, height: str) -> Shape:
+    """Return the polygon with the corners of a box around a place.
+
+    One of half a turn or more, or beyond a pole, is no polygon: it ends at meridians and parallels.
+    """
+    sizes = _number_in(width), _number_in(height)
+    if centre.known is not None and sizes[0] is not None and sizes[1] is not None:
+        lat, half = centre.known[1], sizes[1] / 2.0
+        if sizes[0] >= 180.0 or abs(lat) + half > 90.0:
+            low, high = max(-90.0, lat - half), min(90.0, lat + half)
+            is_all = sizes[0] >= 360.0 and (low, high) == (-90.0, 90.0)
+            return Circle(centre, "180") if is_all else Zone(centre, sizes[0], low, high)
     corners = tuple(
         Point(_folded(centre.lon, right, width), _folded(centre.lat, up, height))
         for right, up in (("-", "-"), ("+", "-"), ("+", "+"), ("-", "+"))
@@ -220,19 +288,36 @@ def _folded(middle: str, sign: str, width: str) -> str:
     known = _number_in(middle), _number_in(width)
     if known[0] is not None and known[1] is not None:
         half = known[1] / 2.0
-        return _sql_of(known[0] + half if sign == "+" else known[0] - half)
+        return repr(known[0] + half if sign == "+" else known[0] - half)
     return f"({middle} {sign} ({width}) / 2e0)"
 
 
 def _in_circle(place: Point, circle: Circle) -> str:
-    near = _compared(_apart(place, circle.centre), "<=", _term_of(circle.radius))
+    return within(place, circle.centre, "<=", circle.radius)
+
+
+def within(one: Point, other: Point, sign: str, radius: str) -> str:
+    """Return SQL of whether the separation of two places is less than a radius, degrees."""
+    place, middle = (other, one) if one.known else (one, other)
+    near = _compared(_apart(place, middle), sign, _term_of(radius))
     if place.known:
         return near
-    lat, radius = _term_of(circle.centre.lat), _term_of(circle.radius)
-    reach = _plus(radius, MARGIN_DEG)
+    lat = _term_of(middle.lat)
+    reach = _plus(_term_of(radius), MARGIN_DEG)
     low, high = _sql_of(_plus(lat, _times(-1.0, reach))), _sql_of(_plus(lat, reach))
     # Declinations are looked at first: files tell which they have.
     return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
+
+
+def _in_zone(inner: Shape, outer: Shape) -> str:
+    if not (isinstance(inner, Point) and isinstance(outer, Zone)):
+        raise ValueError("a box of half a turn or more, or beyond a pole, holds places only")
+    band = f"{inner.lat} BETWEEN {outer.low!r} AND {outer.high!r}"
+    if outer.width >= 360.0:
+        return f"({band} AND {inner.lon} IS NOT NULL)"
+    beside = f"({inner.lon} - ({outer.centre.lon}))"
+    turned = f"abs({beside} - 360e0 * round({beside} / 360e0))"
+    return f"({band} AND {turned} <= {outer.width / 2.0!r})"
 
 
 def _in_polygon(place: Point, polygon: Polygon) -> str:

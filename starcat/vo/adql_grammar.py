@@ -23,11 +23,12 @@ from sqlglot.tokenizer_core import TokenType
 from starcat.errors import QueryError, quoted
 
 MAX_CHARACTERS = 50_000  # length of the longest query that is read
+MAX_DIGITS = 18  # of a number of rows
 POINTED_CHARACTERS = 160  # how much of a line with an error is shown
 _SAME = """
-ALL AND ASC BETWEEN CROSS DESC DISTINCT ELSE END ESCAPE EXCEPT EXISTS FALSE FROM FULL GROUP_BY
+ALL AND ASC BETWEEN CASE CROSS DESC DISTINCT ELSE END ESCAPE EXCEPT EXISTS FALSE FROM FULL GROUP_BY
 HAVING ILIKE IN INNER INTERSECT INTO IS JOIN LEFT LIKE LIMIT NATURAL NOT NULL OFFSET ON OR
-ORDER_BY OUTER OVER RECURSIVE RIGHT SELECT THEN TOP TRUE UNION USING WHEN WHERE WITH
+ORDER_BY OUTER OVER PARTITION_BY RECURSIVE RIGHT SELECT THEN TOP TRUE UNION USING WHEN WHERE WITH
 """
 _WORDS = {
     **{word.replace("_", " "): TokenType[word] for word in _SAME.split()},
@@ -44,9 +45,9 @@ _ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
             exp.Select,
             "expressions distinct limit from_ joins where group having order offset with_",
         ),
-        (exp.Union, "this expression distinct order offset with_"),
-        (exp.Except, "this expression distinct order offset with_"),
-        (exp.Intersect, "this expression distinct order offset with_"),
+        (exp.Union, "this expression distinct order limit offset with_"),
+        (exp.Except, "this expression distinct order limit offset with_"),
+        (exp.Intersect, "this expression distinct order limit offset with_"),
         (exp.From, "this"), (exp.Where, "this"), (exp.Having, "this"),
         (exp.Group, "expressions"), (exp.Order, "expressions"),
         (exp.Ordered, "this desc nulls_first"), (exp.Limit, "expression"),
@@ -67,16 +68,16 @@ _ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
         (exp.Sub, "this expression"), (exp.Mul, "this expression"),
         (exp.Div, "this expression typed safe"), (exp.Neg, "this"),
         (exp.DPipe, "this expression safe"), (exp.Anonymous, "this expressions"),
-        (exp.Cast, "this to"), (exp.DataType, "this expressions nested"),
+        (exp.Case, "this ifs default"), (exp.If, "this true"),
+        (exp.Window, "this partition_by order over"), (exp.Cast, "this to"),
+        (exp.DataType, "this expressions nested"),
         (exp.DataTypeParam, "this"),
     )
 }  # fmt: skip
 """Kinds of parts that a query may have, and what each of them may hold."""
 
 _ADVICE = {
-    "limit": "LIMIT is not ADQL; write SELECT TOP n",
-    "case": "CASE is not ADQL 2.1; COALESCE is, and UNION of queries with WHERE",
-    "window": "window functions are not ADQL",
+    "spec": "a window has PARTITION BY and ORDER BY, and no frame of rows",
     "recursive": "RECURSIVE is not ADQL 2.1",
     "into": "a query only reads: INTO is refused",
     "escape": "LIKE ... ESCAPE is not ADQL",
@@ -101,7 +102,7 @@ class _Parser(parser.Parser):
     FUNCTIONS = {}  # noqa: RUF012
     NO_PAREN_FUNCTIONS = {}  # noqa: RUF012
     SET_OP_MODIFIERS = {"order", "offset"}  # noqa: RUF012 - TOP stays with its SELECT
-    NO_PAREN_FUNCTION_PARSERS = {}  # noqa: RUF012
+    NO_PAREN_FUNCTION_PARSERS = {"CASE": lambda self: self._parse_case()}  # noqa: RUF012
     STATEMENT_PARSERS = {}  # noqa: RUF012
     FUNCTION_PARSERS = {"CAST": lambda self: self.parse_adql_cast()}  # noqa: RUF012
 
@@ -177,8 +178,10 @@ def parse_adql(text: str) -> exp.Expr:
         tree = found[0]
         if not isinstance(tree, (exp.Select, exp.SetOperation, exp.Subquery)):
             raise QueryError("no ADQL: a query begins with SELECT or WITH")
-        for part in tree.walk():
+        for part in list(tree.walk()):
             _check_part(part)
+            if isinstance(part, exp.SetOperation):
+                _take_limit(part)
         return tree
 
 
@@ -227,12 +230,8 @@ def _check_part(part: exp.Expr) -> None:
             name = name.rstrip("_")
             told = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
             raise Refusal(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part)
-    if isinstance(part, exp.Limit) and not part.meta.get("top"):
-        raise Refusal(f"no ADQL: {_ADVICE['limit']}", part)
-    if isinstance(part, (exp.Limit, exp.Offset)) and not _is_whole(part.expression):
-        raise Refusal(f"{part.key.upper()} needs a whole number", part)
-    if isinstance(part, exp.Select) and not part.args.get("from_"):
-        raise Refusal("no ADQL: SELECT needs FROM and a table", part)
+    if isinstance(part, (exp.Limit, exp.Offset)):
+        _check_rows(part)
     if isinstance(part, exp.Table) and not isinstance(part.this, exp.Identifier):
         raise Refusal("no ADQL: FROM takes tables and queries in parentheses", part)
     if isinstance(part, exp.Distinct) and len(part.expressions) > 1:
@@ -243,6 +242,26 @@ def _check_part(part: exp.Expr) -> None:
         "", "INNER", "OUTER", "CROSS",
     ):  # fmt: skip
         raise Refusal(f"no ADQL: {part.args['kind']} JOIN", part)
+
+
+def _check_rows(part: exp.Limit | exp.Offset) -> None:
+    name = "TOP" if part.meta.get("top") else part.key.upper()
+    if not _is_whole(part.expression):
+        raise Refusal(f"{name} needs a whole number", part)
+    if len(part.expression.name) > MAX_DIGITS:
+        raise Refusal(
+            f"{name} has {len(part.expression.name)} digits; no table has so many rows, and at "
+            f"most {MAX_DIGITS} are read",
+            part,
+        )
+
+
+def _take_limit(part: exp.SetOperation) -> None:
+    """Give a LIMIT behind the last of several queries to all of them; TOP stays with its SELECT."""
+    last = part.expression
+    limit = last.args.get("limit") if isinstance(last, exp.Select) else None
+    if limit is not None and not limit.meta.get("top"):
+        part.set("limit", limit.pop())
 
 
 def _is_whole(node: exp.Expr) -> bool:
@@ -273,5 +292,4 @@ def _refusal(error: ParseError, text: str) -> QueryError:
             told = "something is missing here"
         if "Unexpected token" in told:
             told = f"{quoted(word)} is not expected"
-            told = _ADVICE["case"] if word.upper() in ("CASE", "WHEN") else told
     return QueryError(f"no ADQL: {told}{pointer(text, place)}")

@@ -11,19 +11,19 @@ from sqlglot import exp
 
 from starcat.errors import quoted
 from starcat.vo import adql_geometry as geometry
-from starcat.vo.adql_geometry import Circle, Point, Polygon, Shape
+from starcat.vo.adql_geometry import Circle, Point, Polygon, Shape, Zone
 from starcat.vo.adql_grammar import Refusal
 
 MAX_CORNERS = 400  # corners of a polygon at most
 MAX_CHARACTERS = 1_000_000
 """Length of the arithmetic that the geometry of a query may become, roughly."""
 
-FRAMES = ("", "ICRS", "UNKNOWNFRAME")
+FRAMES = ("", "ICRS", "UNKNOWNFRAME", "GALACTIC")
 """Frames of coordinates; those behind a space, as in ``ICRS GEOCENTER``, make no difference."""
 
 _MAX_INTEGER = 2**63 - 1
-_SHAPE, _CONDITION = "shape", "condition"
-_FRAME_WORDS = {"ICRS", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
+_SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
+_FRAME_WORDS = {"ICRS", "GALACTIC", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
@@ -35,6 +35,12 @@ def shape_of(part: exp.Expr) -> Shape | None:
 def condition_of(part: exp.Expr) -> str | None:
     """Return what CONTAINS or INTERSECTS asked, where a part is their answer as a number."""
     found: str | None = part.meta.get(_CONDITION)
+    return found
+
+
+def places_of(part: exp.Expr) -> tuple[Point, Point] | None:
+    """Return the places whose separation a part is, if it is one that DISTANCE gave."""
+    found: tuple[Point, Point] | None = part.meta.get(_PLACES)
     return found
 
 
@@ -83,18 +89,24 @@ class GeometryCalls:
         elif name == "CENTROID":
             part.meta[_SHAPE] = geometry.centroid(*self._shapes_of(part, 1))
         elif name in _CONDITIONS:
-            asked = _CONDITIONS[name](*self._shapes_of(part, 2))
+            try:
+                asked = _CONDITIONS[name](*self._shapes_of(part, 2))
+            except ValueError as error:
+                raise Refusal(f"{name}: {error}", part) from None
             number = raw(f"CAST({asked} AS INTEGER)")
             number.meta[_CONDITION] = asked
             part.replace(number)
         elif name == "DISTANCE" and len(part.expressions) == 4:
             numbers = _numbers(part, 4)
-            part.replace(raw(geometry.distance(Point(*numbers[:2]), Point(*numbers[2:]))))
+            _replace_distance(part, Point(*numbers[:2]), Point(*numbers[2:]))
         elif name in _MEASURES:
             shapes = self._shapes_of(part, 2 if name == "DISTANCE" else 1)
             if name in _OF_POINTS and not all(isinstance(shape, Point) for shape in shapes):
                 raise Refusal(f"{name} takes a POINT", part)
-            part.replace(raw(_MEASURES[name](*shapes)))
+            if name == "DISTANCE":
+                _replace_distance(part, *shapes)
+            else:
+                part.replace(raw(_MEASURES[name](*shapes)))
         return name in GEOMETRY
 
     def _shapes_of(self, part: exp.Anonymous, count: int) -> list[Shape]:
@@ -118,8 +130,24 @@ class GeometryCalls:
         return shapes
 
 
-def _point(part: exp.Anonymous) -> Point:
-    return Point(*_numbers(part, 2))
+def _replace_distance(part: exp.Expr, *places: Shape) -> None:
+    found = raw(geometry.distance(*places))  # type: ignore[arg-type]
+    found.meta[_PLACES] = places
+    part.replace(found)
+
+
+def _point(part: exp.Anonymous) -> Shape:
+    return _in_icrs(part, Point(*_numbers(part, 2)))
+
+
+def _in_icrs(part: exp.Anonymous, shape: Shape) -> Shape:
+    """Return a shape whose coordinates are of the frame that stands before them."""
+    first = part.expressions[0]
+    if not is_text(first) or first.name.upper().split(" ")[0] != "GALACTIC":
+        return shape
+    if isinstance(shape, Zone):
+        raise Refusal("a galactic BOX is less than half a turn wide, and not beyond a pole", part)
+    return geometry.from_galactic(shape)
 
 
 def _centred(part: exp.Anonymous) -> Shape:
@@ -127,10 +155,11 @@ def _centred(part: exp.Anonymous) -> Shape:
     first, *others = _without_frame(part) or [part]
     name = part.name.upper()
     made = _made(name, [*_place_or_number(first), *map(_operand, others)])
-    if made is None or isinstance(shape_of(first), (Circle, Polygon)):
+    if made is None or not isinstance(shape_of(first), (Point, type(None))):
         many = "1 more number" if name == "CIRCLE" else "2 more numbers"
         raise Refusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
-    return made
+    # A place that is given as POINT is in ICRS already.
+    return made if shape_of(first) is not None else _in_icrs(part, made)
 
 
 def _polygon(part: exp.Anonymous) -> Shape:
@@ -144,7 +173,7 @@ def _polygon(part: exp.Anonymous) -> Shape:
     made = _made("POLYGON", numbers)
     if made is None:
         raise Refusal(f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part)
-    return made
+    return made if any(shapes) else _in_icrs(part, made)
 
 
 def _region(part: exp.Anonymous) -> Shape:
@@ -161,7 +190,7 @@ def _region(part: exp.Anonymous) -> Shape:
             "POLYGON",
             part,
         )
-    return made
+    return geometry.from_galactic(made) if "GALACTIC" in frame else made
 
 
 def _made(name: str, numbers: list[str]) -> Shape | None:
@@ -192,7 +221,9 @@ def _without_frame(part: exp.Anonymous) -> list[exp.Expr]:
     if arguments and is_text(arguments[0]):
         frame = arguments.pop(0).name.upper()
         if frame.split(" ")[0] not in FRAMES:
-            raise Refusal(f"the frame {quoted(frame)} is not known here; all places are ICRS", part)
+            raise Refusal(
+                f"the frame {quoted(frame)} is not known here; use ICRS or GALACTIC", part
+            )
     if any(is_text(argument) for argument in arguments):
         raise Refusal(f"{part.name.upper()} takes numbers, degrees", part)
     return arguments

@@ -38,7 +38,7 @@ from vo_models.vosi.tables.models import VOSITable, VOSITableSet
 
 from starcat.exchange.formats import TAP_FORMATS
 from starcat.query.targets import POSITION
-from starcat.vo.adql import USER_FUNCTIONS
+from starcat.vo.adql import EXTENSIONS, USER_FUNCTIONS
 from starcat.vo.adql_shapes import GEOMETRY
 from starcat.vo.tables import NAME, Column, Schema, Table, Tables, adql_name, full_name
 from starcat.vo.uws import document, xml_text
@@ -49,6 +49,7 @@ VOTABLE_TYPE = "application/x-votable+xml"
 Element = TypeVar("Element", VOSITable, TableElement, TableSchema)
 
 _FEATURES = "ivo://ivoa.net/std/TAPRegExt#features-"
+_EXTENSIONS = "urn:starcat:adql-extensions"
 _VOSI = "ivo://ivoa.net/std/VOSI#"
 
 LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
@@ -60,9 +61,9 @@ LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("adql-type", (("CAST", ""),)),
     ("adql-unit", (("IN_UNIT", ""),)),
     ("adql-offset", (("OFFSET", ""),)),
+    (_EXTENSIONS, EXTENSIONS),
 )
-"""What ADQL leaves to services, and is there. COALESCE is there too, but clients that check what
-they read know no name for it yet."""
+"""What ADQL leaves to services, and is there; at the end what is read beyond it."""
 
 
 _EXAMPLES = (
@@ -142,7 +143,7 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
         description="ADQL 2.1. All places are ICRS, degrees.",
         language_features=[
             LanguageFeatureList(
-                type=f"{_FEATURES}{kind}",
+                type=kind if ":" in kind else f"{_FEATURES}{kind}",
                 feature=[
                     LanguageFeature(form=form, description=told or None) for form, told in forms
                 ],

@@ -250,6 +250,14 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
     """Return the folder of a database as a tar archive, the same bytes each time."""
     found = service.library.database(database)
     contents = found.files
+    for name, blob in contents.items():
+        size = _path_in(found, name).stat().st_size
+        if size != blob.bytes:
+            raise ProductError(
+                f"{found.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}; "
+                "build the database again",
+                path=found.folder / name,
+            )
     return StreamingResponse(
         archive_chunks(found.folder, contents),
         media_type="application/x-tar",
@@ -281,8 +289,15 @@ def _file(
 ) -> Response:
     found = service.library.database(database)
     blob = _listed(found, name)
-    path = found.folder / name
-    if path.is_symlink() or not path.resolve().is_relative_to(found.folder.resolve()):
-        raise Problem(404, f"{found.title} has no file {name[:80]!r}")
+    path = _path_in(found, name)
     options = {} if cache is None else {"cache": cache}
     return file_answer(request, path, blob.sha256, file_name=path.name, **options)
+
+
+def _path_in(found: Database, name: str) -> Path:
+    """Return where a file of a database is, which no link leads out of."""
+    path = found.folder / name
+    is_own = path.resolve().is_relative_to(found.folder.resolve())
+    if path.is_symlink() or not is_own or not path.is_file():
+        raise Problem(404, f"{found.title} has no file {name[:80]!r}")
+    return path

@@ -41,7 +41,7 @@ from starcat.service.pages.rendering import (
     render,
     size_text,
 )
-from starcat.service.pages.wording import page_problem
+from starcat.service.pages.wording import in_page_words, page_problem
 from starcat.service.problems import Problem, ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
@@ -189,26 +189,44 @@ def _shown(
     """Return what page and script are told of a design and of what it would give."""
     errors, problem = dict(draft.errors), None
     seen, found = _preview(service, draft)
-    if found is not None and found.key in draft.values:
-        errors[found.key] = found.detail
-    else:
-        problem = found
+    if found is not None:
+        key = found.key if found.key in draft.values else _key_in(found.detail, draft)
+        if key is None or found.status == 503:
+            problem = found
+        else:
+            errors[key] = found.detail
     if draft.spec is not None:
         errors |= _taken(service, draft)
-    is_refused = seen is not None and bool(seen.estimate.refusals)
+    refusals = []
+    for text in seen.estimate.refusals if seen else ():
+        key = _key_in(text, draft)
+        if key is None:
+            refusals.append(text)
+        else:
+            errors.setdefault(key, in_page_words(text))
+    is_refused = seen is not None and bool(refusals or seen.verdict.will_fail)
     is_busy = problem is not None and problem.status == 503
     return {
         "preview": seen,
         "problem": problem and problem.detail,
         "errors": errors,
+        "refusals": refusals,
         "told": told or [],
-        "summary": _summary(seen, errors, problem),
+        "summary": _summary(seen, [*errors.values(), *refusals], problem),
         "is_busy": is_busy,
         "can_build": not errors and not is_refused and (problem is None or is_busy),
         "address": _address(draft, form),
         "pinned_query": form.get(PINNED, ""),
         **_pinned(service, draft, form),
     }
+
+
+def _key_in(message: str, draft: Draft) -> str | None:
+    """Return the first key of a message that the form has a field for."""
+    places = {key: message.find(key) for key in draft.values if "." in key and key in message}
+    if not places and "[selection]" in message:
+        return "selection.faint_limit_mag"
+    return min(places, key=places.__getitem__) if places else None
 
 
 def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
@@ -301,15 +319,15 @@ def _page(
     )
 
 
-def _summary(seen: Preview | None, errors: dict[str, str], problem: ProblemDetails | None) -> str:
+def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | None) -> str:
     if seen is None:
-        why = next(iter(errors.values()), problem.detail if problem else "")
+        why = next(iter(wrong), problem.detail if problem else "")
         return f"No estimate: {why}" if why else ""
-    if errors:
-        return f"Cannot be built: {next(iter(errors.values()))}"
+    if wrong:
+        return f"Cannot be built: {wrong[0]}"
+    if seen.verdict.will_fail:
+        return f"Not to be built: {seen.verdict.words}"
     found = seen.estimate
-    if found.refusals:
-        return f"Cannot be built: {found.refusals[0]}"
     stars = found.coverage.stars
     return (
         f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "

@@ -23,6 +23,7 @@ from starcat.report.coverage_map import (
 )
 from starcat.service.catalogs import Catalogs
 from starcat.service.pages.rendering import count_text
+from starcat.simulation.selftest import wilson_interval
 from starcat.specs.build_spec import BuildSpec
 
 MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
@@ -50,6 +51,7 @@ class Verdict:
 
     level: str  # "good", "warn" or "bad"
     words: str
+    will_fail: bool = False  # whether the self-test of the build asks for more than there is
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,13 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
     spec = found.spec
     if blind > MOST_BLIND:
         words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
-        return Verdict("bad", f"{words}. {_advice(spec, catalogs)}")
+        advice, test = _advice(spec, catalogs), spec.self_test
+        hits = round(found.enough_share * test.frames)
+        if wilson_interval(hits, test.frames)[1] >= test.min_identified:
+            return Verdict("bad", f"{words}. {advice}")
+        asked = f"{_percent(test.min_identified)} of all pointings (self_test.min_identified)"
+        words += f", and a build fails that does not identify {asked}"
+        return Verdict("bad", f"{words}. {advice}", will_fail=True)
     if stars.one_percent < ENOUGH_STARS - 2:
         words = (
             f"Thin: 1 % of the fields have {stars.one_percent} guide stars or fewer, and a frame "

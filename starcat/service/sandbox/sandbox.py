@@ -64,6 +64,8 @@ class Sandbox:
                 )
         if "kind" not in answer:
             return answer["found"]
+        if answer["errno"] is not None:
+            raise OSError(answer["errno"], answer["message"])
         error = error_of_kind(answer["kind"], answer["message"], key=answer["key"])
         raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
 

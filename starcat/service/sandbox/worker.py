@@ -142,4 +142,5 @@ def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, An
             "kind": kind,
             "message": str(error)[:4000],
             "key": None if key is None else str(key),
+            "errno": getattr(error, "errno", None),
         }

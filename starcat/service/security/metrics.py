@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
+from tempfile import TemporaryFile
 from typing import get_args
 
 from fastapi import APIRouter, Request
@@ -21,9 +22,11 @@ from prometheus_client.registry import Collector
 from pydantic import BaseModel, Field
 from starlette.types import Scope
 
+from starcat.errors import reason
 from starcat.service.access import Reader
 from starcat.service.jobs.job import State
 from starcat.service.jobs.slots import JobSlots
+from starcat.service.problems import damaged_records, outage_of
 from starcat.service.security.request_limits import GIB, disk_shortage, free_gib
 from starcat.service.security.tokens import SessionStore
 from starcat.service.service import Service, TheService
@@ -32,6 +35,9 @@ from starcat.version import __version__
 router = APIRouter(tags=["operations"])
 
 BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
+
+PROBE_BYTES = 1 << 16
+"""Bytes that are written to see whether the disk takes them."""
 
 UNMATCHED = "unmatched"
 """Route of a request to no address that there is: what people make up is no label."""
@@ -149,11 +155,18 @@ def ready(request: Request, service: TheService, who: Reader) -> Response:
     """Look at the records, the disk and the slots of jobs."""
     reasons = []
     try:
-        with service.records.writing() as connection:
-            connection.execute("SELECT 1")
-    except sqlite3.Error as error:
+        service.records.check()
+    except sqlite3.OperationalError as error:
         reasons.append(f"the records cannot be written: {error}")
-    short = disk_shortage(service.settings)
+    except sqlite3.DatabaseError as error:
+        reasons.append(damaged_records("records.sqlite", error))
+    try:
+        short = disk_shortage(service.settings)
+        with TemporaryFile(dir=service.paths.scratch) as probe:
+            probe.write(bytes(PROBE_BYTES))
+    except OSError as error:
+        outage = outage_of(error, service.settings.root)
+        short = outage.detail if outage else f"the disk cannot be written: {reason(error)}"
     if short is not None:
         reasons.append(short)
     slots: JobSlots = request.app.state.slots

@@ -15,6 +15,7 @@ import json
 import logging
 import re
 import secrets
+import sqlite3
 import sys
 import time
 from abc import ABC, abstractmethod
@@ -25,9 +26,10 @@ from datetime import UTC, datetime
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from starcat.service.problems import Problem, as_json
+from starcat.service.problems import Problem, as_json, outage_of
 from starcat.service.sandbox.places import asker
 from starcat.service.security.metrics import Metrics
 from starcat.service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, address_of
@@ -202,6 +204,7 @@ class Refusals(_HttpMiddleware):
         super().__init__(app)
         self._checks = checks
         self._limits = limits
+        self._root = limits.settings.root
         self._shares = Shares(OWN_CONNECTIONS)
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -214,6 +217,13 @@ class Refusals(_HttpMiddleware):
                 limited = self._limits.limited(scope, receive)
             except Problem as problem:
                 await as_json(problem)(scope, receive, send)
+                return
+            except (OSError, sqlite3.Error) as error:
+                outage = outage_of(error, self._root)
+                if outage is None:
+                    raise
+                _logger.error("%s", error)
+                await as_json(outage)(scope, receive, send)
                 return
             await self._app(scope, limited, send)
 
@@ -232,6 +242,8 @@ class Defects(_HttpMiddleware):
 
         try:
             await self._app(scope, receive, send_noted)
+        except ClientDisconnect:
+            return  # nobody is there to be answered
         except Exception as error:
             _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:

@@ -33,6 +33,9 @@ TEXT_MIB = 1.0
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
 
+LEAST_FREE_GIB = 0.01
+"""Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
+
 FILLING = ("/tap/async",)
 """Where a POST makes something that stays on the disk; jobs see to their room themselves."""
 
@@ -141,7 +144,7 @@ class BodyLimits:
     """How large a body may be, in what time it has to come, and that the disk has room for it."""
 
     def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+        self.settings = settings
 
     def limited(self, scope: Scope, receive: Receive) -> Receive:
         """Return a function that receives a body as far as it may go."""
@@ -149,7 +152,7 @@ class BodyLimits:
             return receive
         headers = Headers(scope=scope)
         kind = headers.get("content-type", "").strip().lower()
-        most_mib = self._settings.upload_mib
+        most_mib = self.settings.upload_mib
         most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
         length = headers.get("content-length")
         if length is not None and not (length.isascii() and length.isdigit()):
@@ -158,8 +161,8 @@ class BodyLimits:
             raise Problem(413, too_large(most))
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
         if fills and scope["method"] != "DELETE":
-            check_disk(self._settings)
-        return _limited(receive, most, self._settings.upload_time_s)
+            check_disk(self.settings)
+        return _limited(receive, most, self.settings.upload_time_s)
 
 
 def check_disk(settings: Settings) -> None:
@@ -171,12 +174,12 @@ def check_disk(settings: Settings) -> None:
 
 def disk_shortage(settings: Settings) -> str | None:
     """Return what to say where the disk is nearly full."""
-    free = free_gib(settings.root)
-    if free >= settings.free_gib:
+    free, least = free_gib(settings.root), max(settings.free_gib, LEAST_FREE_GIB)
+    if free >= least:
         return None
     return (
-        f"the disk of the service has {free:.2f} GiB free, and {settings.free_gib:g} have to be "
-        "left (free_gib); remove unused databases or results, or ask the operator"
+        f"the disk of the service has {free:.2f} GiB free, and {least:g} have to be left "
+        "(free_gib); remove unused databases or results, or ask the operator"
     )
 
 

@@ -216,6 +216,8 @@ def get_results(job: TheJob, request: Request) -> Response:
 def get_result(job: TheJob, service: TheService) -> Response:
     """Return the answer in the format that was asked for."""
     path = service.query_jobs.folder(job.job_id) / RESULT
+    if job.phase == "ERROR":  # some clients ask here for the reason, and not at the error
+        raise TargetMissing(f"the job has no answer: {job.error}")
     if job.phase != "COMPLETED" or not path.is_file():
         raise TargetMissing(
             f"the job is {job.phase} and has no answer; its phase tells when it has"
