@@ -19,10 +19,22 @@ if TYPE_CHECKING:
 
     from starcat.api.artifact import connect
     from starcat.api.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import build, calibrate, ingest, verify
+    from starcat.api.functions import (
+        build,
+        calibrate,
+        diff,
+        export,
+        ingest,
+        init,
+        publish,
+        pull,
+        read_frames,
+        simulate,
+        verify,
+    )  # fmt: skip
+    from starcat.api.matcher import Matcher
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
-    from starcat.matcher.matcher import Matcher
     from starcat.matcher.tracking import Tracker
     from starcat.sky.in_time import sky_in_time
     from starcat.sky.observer import Observer
@@ -39,29 +51,43 @@ __all__ = [
     "build",
     "calibrate",
     "connect",
+    "diff",
+    "export",
     "identify_in_time",
     "ingest",
+    "init",
     "open",
     "preset",
+    "publish",
+    "pull",
+    "read_frames",
     "read_spec",
+    "simulate",
     "sky_in_time",
     "verify",
 ]
 
 _HOMES = {
     "Camera": ("starcat.geometry.camera", "Camera"),
-    "Matcher": ("starcat.matcher.matcher", "Matcher"),
+    "Matcher": ("starcat.api.matcher", "Matcher"),
     "Observer": ("starcat.sky.observer", "Observer"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
     "build": ("starcat.api.functions", "build"),
     "calibrate": ("starcat.api.functions", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
+    "diff": ("starcat.api.functions", "diff"),
+    "export": ("starcat.api.functions", "export"),
     "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
+    "init": ("starcat.api.functions", "init"),
     "open": ("starcat.api.artifact", "open_artifact"),
     "preset": ("starcat.specs.reading", "preset"),
+    "publish": ("starcat.api.functions", "publish"),
+    "pull": ("starcat.api.functions", "pull"),
+    "read_frames": ("starcat.api.functions", "read_frames"),
     "read_spec": ("starcat.specs.reading", "read_spec"),
+    "simulate": ("starcat.api.functions", "simulate"),
     "sky_in_time": ("starcat.sky.in_time", "sky_in_time"),
     "verify": ("starcat.api.functions", "verify"),
 }

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import current_thread
 from typing import TypeVar
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-
-_THREAD_NAME = "map-in-order"
 
 
 def map_in_order(
@@ -27,7 +24,7 @@ def map_in_order(
         return
     pending: deque[Future[_Result]] = deque()
     failure = None
-    pool = ThreadPoolExecutor(workers, _THREAD_NAME)
+    pool, wait = ThreadPoolExecutor(workers), True
     try:
         while True:
             try:
@@ -42,8 +39,12 @@ def map_in_order(
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
-    finally:  # a generator that was dropped may be closed in a thread of the pool itself
-        is_own = current_thread().name.startswith(_THREAD_NAME)
-        pool.shutdown(wait=not is_own, cancel_futures=True)
+    except GeneratorExit:
+        # The collector closes a dropped generator in any thread, even in one that is just being
+        # started or is one of the pool: there to wait would be for ever.
+        wait = False
+        raise
+    finally:
+        pool.shutdown(wait=wait, cancel_futures=True)
     if failure is not None:
         raise failure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -14,6 +15,9 @@ import numpy as np
 import pytest
 
 import starcat
+from starcat.errors import ConfigError
+from starcat.images.render import write_simulated
+from starcat.matcher.matcher import Matcher as BareMatcher
 
 ROOT = Path(__file__).parents[1]
 PUBLIC = [
@@ -26,11 +30,18 @@ PUBLIC = [
     "build",
     "calibrate",
     "connect",
+    "diff",
+    "export",
     "identify_in_time",
     "ingest",
+    "init",
     "open",
     "preset",
+    "publish",
+    "pull",
+    "read_frames",
     "read_spec",
+    "simulate",
     "sky_in_time",
     "verify",
 ]
@@ -85,7 +96,49 @@ def example() -> str:
 
 
 def test_the_example_of_the_page_is_ten_lines():
-    assert len([line for line in example().splitlines() if line.strip()]) == 9
+    assert len([line for line in example().splitlines() if line.strip()]) == 10
+
+
+def test_the_matcher_takes_a_file(small_artifact, tmp_path):
+    [made] = starcat.simulate(small_artifact, seed=7)
+    picture, two = tmp_path / "frame.png", tmp_path / "two.json"
+    write_simulated(picture, made, starcat.Matcher.open(small_artifact).database.camera, 7)
+    matcher = starcat.Matcher.open(small_artifact)
+    found = matcher.identify(picture)
+    assert np.abs(found.matrix @ made.matrix.T - np.eye(3)).max() < 1e-3
+    [read] = starcat.read_frames(picture)
+    assert len(read.centroids_px) == len(found.star_index)
+    two.write_text(json.dumps({"frames": [{"centroids_px": [[1, 2]]}] * 2}))
+    with pytest.raises(
+        starcat.StarcatError, match=r"2 frames; read them with starcat\.read_frames"
+    ):
+        matcher.identify(two)
+
+
+def test_mistakes_get_sentences(small_artifact):
+    matcher = starcat.Matcher.open(small_artifact)
+    with pytest.raises(ConfigError, match="camera is of type list; expected a starcat.Camera. Giv"):
+        matcher.identify([[1.0, 2.0]], [3.0])
+    with pytest.raises(ConfigError, match="name: missing; every spec needs it"):
+        starcat.build({})
+    with pytest.raises(ConfigError, match=r"nope\.png: no such file"):
+        matcher.identify("nope.png")
+    plain = BareMatcher.open(small_artifact)
+    with pytest.raises(ConfigError, match="is a file; read its centroids first"):
+        plain.identify("frame.csv")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_page_runs_from_top_to_bottom(tmp_path):
+    page = (ROOT / "docs" / "python.md").read_text()
+    program = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    for told in ("<MatchResult identified: 17 of 17", "100 of 100", "tracking", "True"):
+        assert told in done.stdout
 
 
 @pytest.mark.slow
@@ -101,7 +154,7 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, w
     (built,) = (tmp_path / "wheel").glob("*.whl")
     assert built.name.count("-abi3-") == with_c
     docs = {f"starcat/docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
-    assert docs <= set(zipfile.ZipFile(built).namelist())
+    assert docs | {"starcat/py.typed"} <= set(zipfile.ZipFile(built).namelist())
     site, empty = tmp_path / "site", tmp_path / "empty"
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--target", site, built], check=True)
     empty.mkdir()

@@ -13,8 +13,8 @@ from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+    from starcat.api.matcher import Matcher
     from starcat.artifact.verify import Verification
-    from starcat.matcher.matcher import Matcher
     from starcat.query.result import Answer
     from starcat.query.session import Limits
     from starcat.report.report import CoverageReport
@@ -41,7 +41,7 @@ class Artifact(reader.Artifact):
         Matcher
             Ready to identify. Needs numpy and h5py only.
         """
-        from starcat.matcher.matcher import Matcher
+        from starcat.api.matcher import Matcher
 
         return Matcher.open(self.folder, method, **limits)
 

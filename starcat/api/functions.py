@@ -1,4 +1,4 @@
-"""Building, reading catalogs and verifying, from Python.
+"""What the commands do, from Python.
 
 Each function here turns strings into paths, fills in what is usual, and calls the one function
 of the rooms that the command line calls too.
@@ -9,22 +9,31 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+    from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
     from starcat.catalog.ingest import Ingested
+    from starcat.exchange.export import Exported
+    from starcat.exchange.onboard import ExportedImage
     from starcat.geometry.camera import Camera
+    from starcat.matcher.centroids import MeasuredFrame
+    from starcat.matcher.database import Database
     from starcat.pipeline.build import Built
+    from starcat.pipeline.starter import Starter
     from starcat.progress import Progress
+    from starcat.releases.publishing import Published
+    from starcat.releases.pulling import Pulled
+    from starcat.simulation.simulate import Frame
     from starcat.specs.build_spec import BuildSpec
 
 
 def build(
-    spec: BuildSpec | PathLike,
+    spec: BuildSpec | Mapping[str, Any] | PathLike,
     output: PathLike = "dist",
     *,
     inputs: Mapping[str, PathLike | Sequence[PathLike]] | None = None,
@@ -36,8 +45,8 @@ def build(
 
     Parameters
     ----------
-    spec : BuildSpec, str or path-like
-        A spec, or the TOML file of one.
+    spec : BuildSpec, mapping, str or path-like
+        A spec, its keys as a TOML file has them, or such a file.
     output : str or path-like, default "dist"
         Folder that the folder ``<name>-<version>`` is made in.
     inputs : mapping of str to path or paths, optional
@@ -62,9 +71,14 @@ def build(
     from starcat.pipeline.build import build as run
     from starcat.progress import no_progress
     from starcat.specs.build_spec import BuildSpec
-    from starcat.specs.reading import read_spec
+    from starcat.specs.reading import read_spec, spec_from_dict
 
-    chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
+    if isinstance(spec, BuildSpec):
+        chosen = spec
+    else:
+        chosen = (
+            spec_from_dict(dict(spec), "spec") if isinstance(spec, Mapping) else read_spec(spec)
+        )
     given = {source: _paths(files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
@@ -208,6 +222,194 @@ def verify(artifact: PathLike) -> Verification:
     from starcat.artifact.verify import verify_artifact
 
     return verify_artifact(Path(artifact))
+
+
+def init(
+    camera: Camera,
+    name: str = "camera",
+    *,
+    faint_limit_mag: float | None = None,
+    output: PathLike | None = None,
+    replace: bool = False,
+) -> Starter:
+    """Propose a build spec for a camera from the embedded sky, as ``starcat init``.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its size and focal length.
+    name : str, default "camera"
+        Name of the database.
+    faint_limit_mag : float, optional
+        Faintest guide star; by default the first limit with which fields have enough stars.
+    output : str or path-like, optional
+        TOML file to write, in which every key is explained.
+    replace : bool, default False
+        Whether a file of that name may be replaced.
+
+    Returns
+    -------
+    Starter
+        ``spec`` for `build`, and what other limits would give.
+
+    Raises
+    ------
+    ConfigError, BuildError, OutputError
+        As the command line says them.
+    """
+    from starcat.pipeline.starter import starter_spec, write_starter
+    from starcat.specs.build_spec import CameraSpec
+
+    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    made = starter_spec(name, CameraSpec(**size, fov_x_deg=camera.fov_x_deg), faint_limit_mag)
+    if output is not None:
+        write_starter(made, Path(output), replace=replace)
+    return made
+
+
+def simulate(
+    database: Database | PathLike,
+    count: int = 1,
+    *,
+    noise_px: float = 0.5,
+    noise_mag: float = 0.2,
+    drop_probability: float = 0.0,
+    false_stars: int = 0,
+    seed: int = 0,
+) -> list[Frame]:
+    """Simulate frames of a database's stars, at random attitudes.
+
+    Parameters
+    ----------
+    database : Database, str or path-like
+        That of a matcher, or the folder of one.
+    count : int, default 1
+        Number of frames.
+    noise_px, noise_mag : float
+        Standard deviations of centroids, on each axis, and of magnitudes.
+    drop_probability : float, default 0
+        Probability of a star to be missing.
+    false_stars : int, default 0
+        Centroids that are no stars, in each frame.
+    seed : int, default 0
+        The same seed gives the same frames.
+
+    Returns
+    -------
+    list of Frame
+        ``centroids_px`` of shape (N, 2) and ``mag`` of shape (N,) to identify; ``matrix`` (body
+        from ICRS) and ``star_index`` are the truth.
+    """
+    from starcat.matcher.database import Database, open_database
+    from starcat.simulation.simulate import Noise, simulate_frames
+
+    sky = database if isinstance(database, Database) else open_database(Path(database))
+    noise = Noise(noise_px, drop_probability, false_stars, noise_mag=noise_mag)
+    return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, mag=sky.mag))
+
+
+def read_frames(file: PathLike) -> list[MeasuredFrame]:
+    """Read the frames of a file of centroids, or find the stars of a picture.
+
+    Parameters
+    ----------
+    file : str or path-like
+        CSV, JSON, FITS, PNG, TIFF, JPEG or HEIC.
+
+    Returns
+    -------
+    list of MeasuredFrame
+        ``centroids_px`` of shape (N, 2), and ``mag`` and ``sigma_px`` of shape (N,) or None.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not there, or is neither.
+    """
+    from starcat.images.solve_files import measure
+
+    return list(measure(Path(file)).frames)
+
+
+def export(
+    database: PathLike, form: str, output: PathLike | None = None, **options: Any
+) -> Exported | ExportedImage:
+    """Write tables of a database for other tools, or its image for flight software.
+
+    Parameters
+    ----------
+    database : str or path-like
+        The folder of a database.
+    form : str
+        As ``--to`` of ``starcat export``: csv, fits, votable, ... or onboard, c.
+    output : str or path-like, optional
+        A folder for tables, by default ``export``, or the file of an image.
+    **options
+        ``products``, ``replace``, ``max_partition_rows`` for tables; ``method``, ``endian``,
+        ``max_bytes``, ``replace`` for an image.
+
+    Returns
+    -------
+    Exported or ExportedImage
+        What was written.
+
+    Raises
+    ------
+    ConfigError, ProductError, OutputError, OnboardSizeError
+        As the command line says them.
+    """
+    from starcat.exchange.export import export_tables, tables_of
+    from starcat.exchange.formats import ONBOARD_FORMATS
+    from starcat.exchange.onboard import export_image
+
+    target = None if output is None else Path(output)
+    if form in ONBOARD_FORMATS:
+        return export_image(Path(database), form, target, **options)
+    return export_tables(tables_of(Path(database)), form, target or Path("export"), **options)
+
+
+def diff(a: PathLike, b: PathLike) -> Difference:
+    """Return what differs between two databases, given by their folders."""
+    from starcat.artifact.diff import diff_artifacts
+    from starcat.artifact.reader import open_artifact
+
+    return diff_artifacts(open_artifact(Path(a)), open_artifact(Path(b)))
+
+
+def publish(database: PathLike, registry: PathLike) -> Published:
+    """Check a database and put it into a registry, a folder, where it will never change."""
+    from starcat.releases.publishing import publish_artifact
+
+    return publish_artifact(Path(database), os.fspath(registry))
+
+
+def pull(wanted: str, registry: PathLike, output: PathLike = "dist") -> Pulled:
+    """Get a published database and check every file of it.
+
+    Parameters
+    ----------
+    wanted : str
+        ``NAME@VERSION``, ``NAME@latest`` or ``NAME``.
+    registry : str or path-like
+        A folder, or an http(s) address.
+    output : str or path-like, default "dist"
+        Folder that the folder ``<name>-<version>`` is put into; the version is pinned in
+        ``starcat.lock`` there.
+
+    Returns
+    -------
+    Pulled
+        With the ``folder`` of the database.
+
+    Raises
+    ------
+    ConfigError, ProductError, SourceError, OutputError
+        As the command line says them.
+    """
+    from starcat.releases.lockfile import pull_wanted
+
+    place = Path(output)
+    return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock")
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
@@ -96,7 +96,7 @@ class Matcher(Settings, _WithDatabase):
         min_share: float = MIN_SHARE,
         max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
-    ) -> Matcher:
+    ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
         Parameters
@@ -143,7 +143,7 @@ class Matcher(Settings, _WithDatabase):
 
     def identify(
         self,
-        centroids_px: ArrayLike,
+        centroids_px: ArrayLike | os.PathLike[str],
         camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
@@ -159,7 +159,8 @@ class Matcher(Settings, _WithDatabase):
         ----------
         centroids_px : array_like of float64, shape (N, 2)
             Pixels, in any order. Those that are not finite, outside of the frame or repeat
-            another get no star and are reported.
+            another get no star and are reported. `starcat.Matcher` also takes the path of a picture
+            or a file of centroids, with all other arguments as ``starcat identify`` has them.
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
@@ -188,7 +189,9 @@ class Matcher(Settings, _WithDatabase):
         ConfigError
             If an array is of another shape, the prior no quaternion, an error missing or too large.
         """
-        camera = camera or self.database.camera
+        if isinstance(centroids_px, str | os.PathLike):
+            return self._identify_file(Path(centroids_px), camera)
+        camera = self._camera(camera)
         px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
@@ -236,11 +239,26 @@ class Matcher(Settings, _WithDatabase):
         ConfigError
             As `identify`, or if there are not as many arrays of each as frames.
         """
-        camera = camera or self.database.camera
+        camera = self._camera(camera)
         given = as_frames(frames, camera, magnitudes, sigma_px)
         in_c = self._in_c(camera)
         found = None if in_c is None else in_c.many(given, threads or os.cpu_count() or 1)
         return [self._timed(frame, solve) for frame in given] if found is None else found
+
+    def _camera(self, camera: Camera | None) -> Camera:
+        if camera is None:
+            return self.database.camera
+        if not isinstance(camera, Camera):
+            text = (
+                f"camera is of type {type(camera).__name__}; expected a starcat.Camera. Give "
+                "magnitudes by name: identify(centroids_px, magnitudes=...)"
+            )
+            raise ConfigError(text, key="camera", value=camera)
+        return camera
+
+    def _identify_file(self, path: Path, camera: Camera | None) -> MatchResult:
+        """Identify the frame of a file; `starcat.Matcher` can."""
+        raise ConfigError(f"{path} is a file; read its centroids first, or use starcat.Matcher")
 
     @cached_property
     def _settings(self) -> Settings:
