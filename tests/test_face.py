@@ -109,17 +109,15 @@ def test_the_matcher_takes_a_file(small_artifact, tmp_path):
     [read] = starcat.read_frames(picture)
     assert len(read.centroids_px) == len(found.star_index)
     two.write_text(json.dumps({"frames": [{"centroids_px": [[1, 2]]}] * 2}))
-    with pytest.raises(
-        starcat.StarcatError, match=r"2 frames; read them with starcat\.read_frames"
-    ):
+    with pytest.raises(starcat.StarcatError, match="2 frames; read them with"):
         matcher.identify(two)
 
 
 def test_mistakes_get_sentences(small_artifact):
     matcher = starcat.Matcher.open(small_artifact)
-    with pytest.raises(ConfigError, match="camera is of type list; expected a starcat.Camera. Giv"):
+    with pytest.raises(ConfigError, match="camera is of type list; expected"):
         matcher.identify([[1.0, 2.0]], [3.0])
-    with pytest.raises(ConfigError, match="name: missing; every spec needs it"):
+    with pytest.raises(ConfigError, match="name: missing"):
         starcat.build({})
     with pytest.raises(ConfigError, match=r"nope\.png: no such file"):
         matcher.identify("nope.png")

@@ -73,12 +73,9 @@ def build(
     from starcat.specs.build_spec import BuildSpec
     from starcat.specs.reading import read_spec, spec_from_dict
 
-    if isinstance(spec, BuildSpec):
-        chosen = spec
-    else:
-        chosen = (
-            spec_from_dict(dict(spec), "spec") if isinstance(spec, Mapping) else read_spec(spec)
-        )
+    if isinstance(spec, Mapping):
+        spec = spec_from_dict(dict(spec), "spec")
+    chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
     given = {source: _paths(files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
