@@ -9,27 +9,42 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
-.PHONY: help serve install check format test test-all test-changed demo bench reproduction docs pictures golden release clean
+.PHONY: help serve install lock newest check format test test-all test-changed demo bench reproduction docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-$(RUNS): pyproject.toml
+$(RUNS): pyproject.toml locks/run.txt
 	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
 	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) --editable '.[images]'
+	@$(PIP) --require-hashes --no-deps --requirement locks/run.txt
+	@$(PIP) --no-deps --no-build-isolation --editable .
 	@touch $(RUNS)
 
-$(SERVED): $(RUNS)
+$(SERVED): $(RUNS) locks/service.txt
 	@echo "installing what the service needs into $(VENV) (30 MB)"
-	@$(PIP) --editable '.[service]'
+	@$(PIP) --require-hashes --no-deps --requirement locks/service.txt
 	@touch $(SERVED)
 
-$(READY): $(RUNS)
+$(READY): $(RUNS) locks/dev.txt
 	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
-	@$(PIP) --editable '.[dev]'
+	@$(PIP) --require-hashes --no-deps --requirement locks/dev.txt
 	@touch $(READY)
+
+BUILT_WITH := $(BIN)/python -c 'import tomllib; \
+	print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"]))'
+LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate \
+	--no-emit-index-url --custom-compile-command 'make lock' --python-version 3.11 pyproject.toml -
+lock: $(READY) ## renew locks/: the newest versions within the bounds, with their hashes
+	$(BUILT_WITH) | $(LOCK) --upgrade --all-extras -o locks/dev.txt
+	$(BUILT_WITH) | $(LOCK) --extra images -c locks/dev.txt -o locks/run.txt
+	$(BUILT_WITH) | $(LOCK) --extra images --extra service -c locks/dev.txt -o locks/service.txt
+
+newest: ## test with the newest versions that the bounds allow, in an environment of its own
+	$(PYTHON) -m venv --clear .venv-newest
+	.venv-newest/bin/python -m pip install --quiet --editable '.[dev]'
+	.venv-newest/bin/python -m pytest -q -n 3 --dist loadfile -m 'not slow'
 
 install: $(READY) ## install starcat and its tools into .venv
 

@@ -697,7 +697,7 @@ def test_what_is_not_one_plane_is_refused(tmp_path):
         ("cube.fits", "HDU 0 4x4x5; expected an image of two dimensions"),
         ("table.fits", "HDU 0 no image; HDU 1 no image"),
         ("pages.tif", "holds 2 images; expected one"),
-        ("absent.fits", "No such file"),
+        ("absent.fits", "no such file"),
     ):
         with pytest.raises(ConfigError, match=word):
             read_image(tmp_path / name)

@@ -1,5 +1,5 @@
 -- Stars of the first target with those of the second near them, and the magnitude differences.
--- At the positions as the tables have them: give both the same epoch. 'starcat crossmatch' moves
+-- At the positions as the tables have them: give both the same epoch. A crossmatch of catalogs moves
 -- stars to a common one and weighs ambiguous matches.
 -- Targets: 2
 -- radius_arcsec = 5.0: greatest separation, seconds of arc
