@@ -303,7 +303,7 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
 @pytest.mark.parametrize(
     "looks",
     [
-        (("light", 360), ("dark", 1280)),
+        pytest.param((("light", 360), ("dark", 1280)), marks=pytest.mark.slow),
         pytest.param((("dark", 360), ("light", 1280)), marks=pytest.mark.slow),
     ],
     ids=["light and narrow, dark and wide", "dark and narrow, light and wide"],

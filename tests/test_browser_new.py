@@ -18,7 +18,7 @@ from services import add_database
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
 
-pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")

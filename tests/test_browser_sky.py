@@ -25,7 +25,7 @@ from starcat.simulation.simulate import Noise, simulate_frames
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import csv
 import io
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from datetime import UTC, date, datetime
 from decimal import Decimal
@@ -253,6 +254,10 @@ def test_a_reader_who_stops_leaves_nothing_running(serialization: Serialization)
     assert next(chunks).startswith(b"<?xml")
     next(chunks)
     chunks.close()  # type: ignore[attr-defined]
+    for _ in range(100):  # what a thread is at comes to its end
+        if threading.active_count() == threads:
+            break
+        time.sleep(0.05)
     assert threading.active_count() == threads
 
 

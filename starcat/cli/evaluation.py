@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,7 @@ import typer
 from starcat.cli.console import print_table, progress_bars, say, show
 from starcat.cli.options import Input, Json, inputs_by_source
 from starcat.errors import ConfigError
+from starcat.progress import Progress
 
 if TYPE_CHECKING:
     from starcat.evaluation.report.tables import Table
@@ -133,7 +135,7 @@ def evaluate(
         _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json, others)
         return
     given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
-    with progress_bars() as progress:
+    with _progress_towards(output) as progress:
         if artifact is None:
             found = evaluate_papers(
                 paper or "all", given, output, quick=quick, workers=workers, progress=progress
@@ -145,6 +147,14 @@ def evaluate(
             )  # fmt: skip
             found = evaluate_artifact(sweep, output, workers=workers, progress=progress)
     print_evaluation(found, as_json=json)
+
+
+@contextmanager
+def _progress_towards(output: Path) -> Iterator[Progress]:
+    """Say where the results will be, and draw the progress."""
+    say(f"records and report go to {output}")
+    with progress_bars() as progress:
+        yield progress
 
 
 def _evaluate_sensor(
@@ -161,7 +171,7 @@ def _evaluate_sensor(
             "--output only; what a sensor is tried with is in its file"
         )
     sensor = read_sensor(ecss)
-    with progress_bars() as progress:
+    with _progress_towards(output) as progress:
         content, page = evaluate_sensor(
             artifact, sensor, output, method=method, seed=seed, workers=workers,
             pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
@@ -182,6 +192,7 @@ def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
 
 def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
     from starcat.evaluation.report import tables as made
+    from starcat.evaluation.report.files import legend
 
     for content in contents:
         failed = made.failure_table(content)
@@ -193,6 +204,8 @@ def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
             _print(table, f"{content['name']}: ")
     if summary := made.summary_table(contents):
         _print(summary)
+    for head, meaning in legend(contents):
+        say(f"{head}: {meaning}")
 
 
 def _print(table: Table, prefix: str = "") -> None:

@@ -159,8 +159,7 @@ class Matcher(Settings, _WithDatabase):
         ----------
         centroids_px : array_like of float64, shape (N, 2)
             Pixels, in any order. Those that are not finite, outside of the frame or repeat
-            another get no star and are reported. `starcat.Matcher` also takes the path of a picture
-            or a file of centroids, with all other arguments as ``starcat identify`` has them.
+            another get no star and are reported. `starcat.Matcher` also takes the path of a file.
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
@@ -176,8 +175,7 @@ class Matcher(Settings, _WithDatabase):
             Attitude that is expected, as ``q_body_from_icrs``, and its largest error as an angle of
             rotation, at most 20. Only the stars near it are compared; the verification is the same.
         fov_deg : pair of float, optional
-            Narrowest and widest field across the frame's width where of the camera only the size is
-            known. The database needs the product ``levels``, and magnitudes help much.
+            Narrowest and widest field across the width, where no more is known; with ``levels``.
 
         Returns
         -------
@@ -195,15 +193,14 @@ class Matcher(Settings, _WithDatabase):
         px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
-            blind = partial(identify_blind, fov_deg=fov_deg)
-            return self._timed(as_frame(px, camera, mags, sigma), blind)
+            frame = as_frame(px, camera, mags, sigma)
+            return self._timed(frame, partial(identify_blind, fov_deg=fov_deg))
         error = self._checked_fov_error(fov_error)
-        # The library does not search for both at once.
-        in_c = None if error and near else self._in_c(camera, error)
+        in_c = None if error and near else self._in_c(camera, error)  # C has not both at once
         if in_c and (found := in_c.one(px, mags, near, sigma)):
             return found
-        search = partial(solve, fov_error=error, prior=near)
-        return self._timed(as_frame(px, camera, mags, sigma), search)
+        frame = as_frame(px, camera, mags, sigma)
+        return self._timed(frame, partial(solve, fov_error=error, prior=near))
 
     def identify_many(
         self,
