@@ -61,6 +61,11 @@ demo: $(RUNS) ## build a database from the embedded sky, check it, identify simu
 	$(BIN)/starcat simulate dist/gaia-12deg-1.0.0 --output dist/frame.csv --seed 7
 	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
 	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
+	@echo "made: dist/gaia-12deg-1.0.0, a database whose report is report/index.html, and dist/frame.csv"
+	@echo "go on with:"
+	@echo "  $(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv --picture dist/frame.png"
+	@echo "  $(BIN)/starcat init dist/mycam.toml --size 1280x960 --fov-x-deg 16   a database of your camera"
+	@echo "  make serve                                                       the same in a browser"
 
 serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded sky
 	$(BIN)/starcat serve --root dist/service

@@ -87,6 +87,12 @@ class ConfigError(StarcatError, ValueError):
     value: object = None
 
 
+class FileMissing(ConfigError):  # noqa: N818 - the name reads as the fact
+    """A spec, a camera file or a frame that is not there."""
+
+    exit_code = 3
+
+
 @dataclass(eq=False, repr=False, kw_only=True)
 class SourceError(StarcatError):
     """A catalog file that is missing, damaged or not what it should be."""
@@ -177,6 +183,14 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
     """No artifact, or no database, at the place that was named."""
 
     exit_code = 3
+
+
+def no_database(path: Path) -> ArtifactMissing:
+    """Return the error of a folder that is not there, or that no build has made."""
+    what = "no database is in this folder" if path.is_dir() else "no such database"
+    return ArtifactMissing(
+        f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
+    )
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

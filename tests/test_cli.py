@@ -15,10 +15,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from every_command import every_command
+from typer.main import get_command
 
 import starcat as package
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
+from starcat.cli.main import app
+from starcat.cli.panels import OPTIONS, PANELS
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.methods.table import METHODS
 from starcat.specs.reading import preset_names
@@ -67,7 +70,7 @@ def test_help_lists_every_command(starcat):
 
 def test_no_command_shows_the_help(starcat):
     run = starcat([])
-    assert "Commands:" in run.out + run.err
+    assert "Design a database:" in run.out + run.err
     assert run.code == 2
 
 
@@ -341,10 +344,10 @@ def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
 def test_identify_as_json(starcat, frame, small_artifact):
     [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
-        "frame", "status", "origin", "n_matched",
+        "frame", "status", "origin", "n_matched", "remarks",
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec",
-        "reduced_chi_square", "remarks", "false_match_probability",
+        "reduced_chi_square", "false_match_probability",
         "focal_length_px", "focal_length_error_px", "time_s", "stars",
     ]  # fmt: skip
     assert answer["status"] == "identified"
@@ -474,3 +477,55 @@ def test_progress_is_drawn_on_a_terminal(small_artifact):
     assert "self-test" in drawn
     assert "self-test" not in run.stdout.decode()
     assert "Simulated fields" in run.stdout.decode()
+
+
+def test_every_command_has_its_panel_in_the_help(starcat):
+    told = [name for names in PANELS.values() for name in names]
+    assert sorted(told) == sorted(get_command(app).commands)
+    run = starcat(["--help"])
+    assert [line[:-1] for line in run.out.splitlines() if line[:-1] in PANELS] == list(PANELS)
+
+
+def test_every_option_of_identify_has_its_panel(starcat):
+    told = [name for names in OPTIONS.values() for name in names]
+    params = get_command(app).commands["identify"].params
+    options = {param.name for param in params if param.param_type_name == "option"}
+    assert sorted(told) == sorted(options | {"help"})
+    lines = starcat(["identify", "--help"]).out.splitlines()
+    assert [line[:-1] for line in lines if line[:-1] in OPTIONS] == list(OPTIONS)
+
+
+def test_a_database_is_identical_to_itself(starcat, small_artifact):
+    run = starcat(["diff", small_artifact, small_artifact])
+    assert (
+        run.out == "small-1.0.0 and small-1.0.0 are identical: spec, sources, stars and products\n"
+    )
+
+
+def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifact, tmp_path):
+    frame = tmp_path / "frame.csv"
+    said = starcat(["simulate", small_artifact, "-o", frame, "--seed", "7"])
+    [told] = said.err.splitlines()
+    count = len(frame.read_text().splitlines()) - 1
+    assert told.startswith(f"wrote {frame}: {count} centroids, {count} of guide stars; true att")
+    [found] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    true = [float(number) for number in re.findall(r"[-+]?\d+\.\d{4}", told)]
+    names = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg")
+    assert [found[name] for name in names] == pytest.approx(true, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "verify nope", "inspect nope", "coverage nope", "rebuild nope", "selftest nope",
+        "evaluate nope", "simulate nope -o x.csv", "sql nope", "export nope --to csv -o x",
+        "identify nope nope.csv", "identify {small} nope.csv", "identify {small} nope.png",
+        "identify {small} nope.csv --camera nope.toml", "calibrate {small} nope.csv -o x.toml",
+        "build nope.toml", "estimate nope.toml", "ingest sao --input nope.dat -o x",
+        "crossmatch nope.parquet nope.parquet -o x",
+    ],
+)  # fmt: skip
+def test_what_is_not_there_has_one_wording_and_one_exit_code(starcat, small_artifact, command):
+    run = starcat(command.format(small=small_artifact).split())
+    assert run.code == 3, run.err
+    assert re.search(r"nope\S*: no such [a-z, ]+; ", " ".join(run.err.split())), run.err

@@ -50,7 +50,7 @@ def test_an_error_under_json_is_an_object(starcat, tmp_path):
     error = error_of(run.err)
     assert (run.code, run.out, run.err.count("\n")) == (3, "", 1)
     assert (error["code"], error["kind"]) == (3, "ArtifactMissing")
-    assert "none-1.0.0: not an artifact" in error["message"]
+    assert "none-1.0.0: no such database" in error["message"]
     assert error["hint"] == "give the folder <name>-<version> that 'starcat build' made"
 
 
@@ -72,7 +72,7 @@ def test_usage_errors_under_json_are_objects(starcat, arguments, words, hint):
 
 def test_what_stands_behind_two_dashes_is_no_option(starcat):
     run = starcat(["inspect", "--", "--json"])
-    assert run.err.startswith("starcat: error: --json: not an artifact")
+    assert run.err.startswith("starcat: error: --json: no such database")
     assert starcat(["inspect", "--", "--debug"]).err.startswith("starcat: error: --debug: not an")
 
 

@@ -262,7 +262,7 @@ def test_a_folder_without_a_file_that_is_needed(tmp_path, source, present, messa
 
 
 def test_a_path_that_does_not_exist(tmp_path):
-    with pytest.raises(SourceMissing, match=r"nowhere does not exist.*extra\.dat\[\.gz\]"):
+    with pytest.raises(SourceMissing, match=r"nowhere: no such file.*extra\.dat\[\.gz\]"):
         SourceFiles.find(SOURCE, [tmp_path / "nowhere"])
 
 

@@ -702,7 +702,7 @@ def test_a_database_that_is_cut_short_is_refused(artifact_copy):
 
 
 def test_no_artifact(tmp_path):
-    with pytest.raises(ProductError, match="give the folder of an artifact"):
+    with pytest.raises(ProductError, match="give the folder <name>"):
         Matcher.open(tmp_path / "nowhere")
 
 

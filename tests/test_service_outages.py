@@ -167,6 +167,7 @@ def test_a_root_that_is_gone_is_told(own):
 # Uploads.
 
 
+@pytest.mark.slow
 def test_an_interrupted_upload_is_no_defect(own, tmp_path):
     part = b'--edge\r\nContent-Disposition: form-data; name="file"; filename="f.png"\r\n\r\nxx'
     kinds = ["multipart/form-data; boundary=edge", "application/json"]

@@ -411,7 +411,7 @@ def test_an_answer_that_stops_halfway_leaves_no_file(
         (["sql", "{}", "SELECT 1", "--named", "magnitudes"], "either a query or --named"),
         (["sql", "{}", "--named", "crossmatch"], "about 2 targets; 1 given"),
         (["sql", "{}", "--named", "magnitudes", "--set", "x"], "not NAME=VALUE"),
-        (["sql", "nosuch", "SELECT 1"], "does not exist"),
+        (["sql", "nosuch", "SELECT 1"], "no such database"),
         (["sql", "{}", "COPY stars TO 'x.csv'"], "COPY is refused"),
         (["sql", "{}", "SELEC " + "x, " * 200], "no valid SQL"),
     ],
@@ -419,7 +419,7 @@ def test_an_answer_that_stops_halfway_leaves_no_file(
 def test_wrong_questions_are_told(starcat, small_artifact, arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = starcat([small_artifact if text == "{}" else text for text in arguments])
-    assert run.code == (3 if words == "does not exist" else 2)
+    assert run.code == (3 if words == "no such database" else 2)
     assert words in run.err
     assert not list(tmp_path.iterdir())
 

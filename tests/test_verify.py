@@ -224,7 +224,7 @@ def test_an_unreadable_file_is_found(copy):
 
 
 def test_no_folder_is_an_error(tmp_path):
-    with pytest.raises(ProductError, match="no such artifact"):
+    with pytest.raises(ProductError, match="no such database"):
         verify_artifact(tmp_path / "nothing")
 
 

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
+from starcat.errors import ProductError, SchemaVersionError, no_database
 from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
@@ -104,11 +104,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
-        raise (ArtifactMissing if is_missing else ProductError)(
-            f"{folder}: not an artifact, {MANIFEST_NAME} cannot be read ({error.strerror}); give "
-            "the folder <name>-<version> that 'starcat build' made",
-            path=folder,
+        if isinstance(error, FileNotFoundError | NotADirectoryError):
+            raise no_database(folder) from error
+        raise ProductError(
+            f"{folder}: {MANIFEST_NAME} cannot be read ({error.strerror})", path=folder
         ) from error
     return parse_manifest(data, str(path), "rebuild the artifact", path)
 

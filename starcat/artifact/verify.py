@@ -31,7 +31,7 @@ from starcat.artifact.other_catalogs import COUNTS, joined_problems
 from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of
 from starcat.catalog.verdict import Reason
-from starcat.errors import ArtifactMissing, ProductError, StarcatError
+from starcat.errors import ProductError, StarcatError, no_database
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.hdf5 import own_group
 
@@ -79,11 +79,7 @@ class Verification:
 def verify_artifact(folder: Path) -> Verification:
     """Check files, schemas, contents, orders, indices, references and counts of an artifact."""
     if not folder.is_dir():
-        raise ArtifactMissing(
-            f"{folder}: no such artifact; give the folder <name>-<version> that 'starcat build' "
-            "made",
-            path=folder,
-        )
+        raise no_database(folder)
     log = _Log()
     # Held against a damaged manifest, files that are whole would get the blame.
     if log.run(MANIFEST_NAME, "", _manifest_problems, folder / MANIFEST_NAME):

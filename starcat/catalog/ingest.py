@@ -217,16 +217,23 @@ def check_band(source: DataSource, band: str | None) -> str:
     return band
 
 
+NOTABLE_YEARS = 0.005
+"""Difference of epochs that is told; archives have dates, and few digits of them."""
+
+
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
     """Return a note where most stars of a catalog are not at the epoch that was asked for."""
     epochs = floats_of(stars, "epoch_jyear")
-    unmoved = epochs[epochs != epoch_jyear] if epoch_jyear is not None else epochs[:0]
+    if epoch_jyear is None:
+        return ()
+    unmoved = epochs[np.abs(epochs - epoch_jyear) >= NOTABLE_YEARS]
     if 2 * len(unmoved) <= len(epochs):
         return ()
-    years = " to ".join(f"{year:g}" for year in sorted({unmoved.min(), unmoved.max()}))
+    ends = {f"{year:.2f}" for year in (unmoved.min(), unmoved.max())}
+    years = " to ".join(sorted(ends))
     return (
         f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
-        f"at J{years}, not J{epoch_jyear:g}",
+        f"at J{years}, not J{epoch_jyear:.2f}",
     )
 
 

@@ -70,8 +70,7 @@ class SourceFiles:
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
-                    f"{source.name}: {path} does not exist; give a file or a folder with "
-                    f"{expected}",
+                    f"{source.name}: {path}: no such file; give a file or a folder with {expected}",
                     source=source.name,
                     path=path,
                 )

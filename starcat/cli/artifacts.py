@@ -163,6 +163,9 @@ def print_verification(found: Verification) -> None:
 
 def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     """Print what differs between two artifacts."""
+    if found.is_same and not found.software:
+        typer.echo(f"{name_a} and {name_b} are identical: spec, sources, stars and products")
+        return
     _print_changes("Spec", found.spec)
     _print_changes("Sources", found.sources)
     _print_changes("Software", found.software)

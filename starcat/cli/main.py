@@ -13,10 +13,9 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from starcat.cli import (
     artifacts,
@@ -31,22 +30,13 @@ from starcat.cli import (
     specs,
     sql,
 )
+from starcat.cli.panels import WholeSummaries
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__
 
 # Exit codes after a signal, as the shells have them.
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
-
-
-class WholeSummaries(TyperGroup):
-    """The commands in the help, each with its first sentence and no dots for the rest."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line or more a command."""
-        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
 
 
 app = typer.Typer(
@@ -58,13 +48,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
-PARTS = (
+for part in (
     *(catalogs, specs, builds, artifacts, sql, exchange),
     *(releases, matching, evaluation, serving),
-)
-"""In the order of --help."""
-
-for part in PARTS:
+):
     app.add_typer(part.app)
 
 

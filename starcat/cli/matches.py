@@ -167,7 +167,9 @@ def _print_one(answer: FrameAnswer, database: Database) -> None:
             sigma = np.sqrt(result.covariance_arcsec2.diagonal())
             rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
         elif name == "q_body_from_icrs":
-            rows.append((name, value))
+            rows.append((name, ", ".join(f"{one:+.7f}" for one in value)))
+        elif name.endswith("_deg"):
+            rows.append((name, f"{value:.4f}"))
         elif name == "remarks":
             rows += [("remark", remark) for remark in value]
         else:

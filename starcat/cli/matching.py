@@ -10,6 +10,7 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_things, progress_bars, say, show
+from starcat.cli.panels import OptionsInPanels
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -100,11 +101,18 @@ def simulate(
     eye = database.camera
     frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
     write_simulated(output, frame, eye, seed)
-    if json:  # people want to guess
-        print_json(simulated_facts(frame, output))
+    told = simulated_facts(frame, output)
+    if json:
+        print_json(told)
+        return
+    say(
+        f"wrote {output}: {told['centroids']} centroids, {told['guide_stars']} of guide stars; "
+        f"true attitude RA {told['boresight_ra_deg']:.4f}, Dec {told['boresight_dec_deg']:+.4f}, "
+        f"roll {told['roll_deg']:.4f} deg"
+    )
 
 
-@app.command()
+@app.command(cls=OptionsInPanels)
 def identify(
     context: typer.Context,
     artifact: Folder,

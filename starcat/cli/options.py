@@ -171,9 +171,15 @@ def field_range(text: str | None) -> tuple[float, float] | None:
         return None
     low, separator, high = text.partition(":")
     try:
-        return float(low), float(high if separator else low)
+        if separator:
+            return float(low), float(high)
+        about = float(low)
     except ValueError:
         raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+    raise ConfigError(
+        f"--fov {text!r} is one field of view; write the range that is possible, such as "
+        f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
+    )
 
 
 def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from starcat.cli.console import say
-from starcat.errors import ConfigError, QueryError
+from starcat.errors import ConfigError, FileMissing, QueryError
 
 if TYPE_CHECKING:
     from starcat.cli.queries import Question
@@ -90,7 +90,7 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
         if not frames.is_file():
-            raise ConfigError(f"{frames}: cannot be read (No such file or directory)")
+            raise FileMissing(f"{frames}: no such file; give centroids (CSV, JSON) or an image")
         found = client.identify(database, frames, options)
         if picture is not None:
             drawn = client.picture(database, frames, options, picture.suffix.lower()[1:])

@@ -104,7 +104,8 @@ def tables_of(path: Path) -> NamedTables:
         return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
-            f"{path}: does not exist; give the folder of an artifact or a Parquet file", path=path
+            f"{path}: no such database or file; give the folder of a database or a Parquet file",
+            path=path,
         )
     return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
 

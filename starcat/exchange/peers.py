@@ -97,7 +97,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Read what is of use of an npz file; the patterns stay where they are."""
     if not path.exists():
         raise SourceMissing(
-            f"{path}: does not exist; give a database of cedar-solve or tetra3", path=path
+            f"{path}: no such file; give a database of cedar-solve or tetra3", path=path
         )
     wanted = ("star_table", "star_catalog_IDs", "props_packed")
     try:

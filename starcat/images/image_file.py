@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, reason
+from starcat.errors import ConfigError, FileMissing, reason
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
 from starcat.version import install_command
@@ -106,6 +106,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
 def _unpacked(path: Path) -> bytes:
     try:
         data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileMissing(f"{path}: no such file; give an image") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
     if not data.startswith(b"\x1f\x8b"):

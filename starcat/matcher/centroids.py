@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, OutputError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, reason
 
 BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
 """Names of a column of brightness; the first that a file has is used."""
@@ -43,12 +43,19 @@ class MeasuredFrame:
     ignored: tuple[str, ...] = ()
 
 
+HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
+"""Columns of a CSV file whose first line is numbers."""
+
+
 def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
     path = Path(path)
     try:
         # Spreadsheets put a mark of the byte order before the header.
         text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
+        raise FileMissing(text) from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
     except UnicodeDecodeError as error:
@@ -60,6 +67,9 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
     rows = csv.DictReader(text.splitlines())
     try:
         names = rows.fieldnames or ()
+        if len(names) in HEADLESS and all(map(_is_number, names)):
+            rows = csv.DictReader(text.splitlines(), HEADLESS[len(names)])
+            names = rows.fieldnames or ()
         if {"x_px", "y_px"} - set(names):
             raise ConfigError(
                 f"{path}: columns {', '.join(names) or 'none'}; the header has to name x_px and "
@@ -85,6 +95,14 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
     sigma_px = table[:, -1] if SIGMA in beside else None
     ignored = _unknown(names, ("x_px", "y_px", SIGMA))
     return MeasuredFrame(path.stem, table[:, :2], mag, sigma_px, ignored)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _magnitudes(values: Array, name: str) -> Array:

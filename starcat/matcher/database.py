@@ -22,13 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
-from starcat.errors import (
-    ArtifactMissing,
-    ConfigError,
-    ProductError,
-    SchemaVersionError,
-    StarcatError,
-)
+from starcat.errors import ConfigError, ProductError, SchemaVersionError, StarcatError, no_database
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.onboard.reading import OnboardImage, read_image
@@ -143,9 +137,7 @@ def products_in(artifact: Path) -> tuple[str, ...]:
 def _database_file(artifact: Path) -> Path:
     path = artifact / "database.h5" if artifact.is_dir() else artifact
     if not path.is_file():
-        raise ArtifactMissing(
-            f"{path}: no such database; give the folder of an artifact", path=path
-        )
+        raise no_database(artifact)
     return path
 
 

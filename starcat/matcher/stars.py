@@ -82,6 +82,14 @@ NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(11 
 """The stars of a frame that was not identified."""
 
 
+def name_of_number(star_id: int) -> str:
+    """Return what to call a star of an onboard image, which has numbers only.
+
+    The embedded sky has the stars that Gaia lacks under their negative numbers of Hipparcos.
+    """
+    return str(star_id) if star_id > 0 else f"HIP {-star_id}"
+
+
 def matched_stars(
     star_index: NDArray[np.int32],
     matrix: Matrix,
@@ -112,7 +120,7 @@ def matched_stars(
         spot=spot,
         star_id=ids,
         star_index=row,
-        star=tuple(name.decode() or str(number) for name, number in names),
+        star=tuple(name.decode() or name_of_number(number) for name, number in names),
         ra_deg=ra_deg,
         dec_deg=dec_deg,
         mag=mag,

@@ -85,7 +85,7 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     source, inputs = _source_of(text, path)
     if source is None:
         is_there = path.exists()
-        what = "cannot tell what it is" if is_there else "does not exist"
+        what = "cannot tell what it is" if is_there else "no such database, file or source"
         raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of an artifact or a HATS catalog, a Parquet file, an "
             "archive file (SOURCE=PATH where its name is not the archive's), or a source that "

@@ -33,7 +33,9 @@ COEFFICIENTS = tuple(field.name for field in fields(Distortion))
 
 def read_camera(path: Path) -> Camera:
     """Read a camera from a TOML file."""
-    return parse_camera(text_of_toml(path, "no such camera file"), path)
+    return parse_camera(
+        text_of_toml(path, "no such camera file; 'starcat calibrate' writes one"), path
+    )
 
 
 def parse_camera(text: str, path: Path) -> Camera:

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from starcat.errors import ConfigError, quoted, reason, suggest
+from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 
@@ -67,7 +67,7 @@ def text_of_toml(path: Path, missing: str) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: {missing}") from None
+        raise FileMissing(f"{path}: {missing}") from None
     except (OSError, ValueError) as error:
         why = reason(error) if isinstance(error, OSError) else error
         raise ConfigError(f"{path}: not a readable TOML file: {why}") from error

@@ -4,8 +4,8 @@
 
 `build`, `ingest --to hats` and `evaluate` on made stars get SIGINT or SIGTERM at a time drawn
 from the length of an undisturbed run. Each has to end with 130 or 143, or of the signal itself
-where Python had not begun or was already leaving, and never of another one. Nothing may stand at
-the output of a build but what verifies, and the same command has to end well afterwards.
+where Python had not begun or was already leaving, and never of another one. Nothing
+half done may stay beside the output of a build, and the same command has to end well afterwards.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ that is sent to the last that has arrived, with a new connection only where the 
 last.
 
     python tests/benchmarks/service.py --seconds 60 --clients 50 --builds 4
-    python tests/benchmarks/service.py --seconds 60 --clients 48 --greedy 2
+    python tests/benchmarks/service.py --warm-s 15 --clients 48 --greedy 2 --pause-s 2
 """
 
 from __future__ import annotations
@@ -193,8 +193,7 @@ class Load:
         return "127.0.0.1" if self.is_one_address else f"127.0.1.{number + 1}"
 
     async def greedy(self, number: int, found: Found) -> None:
-        """Be a client that asks for all it can get, once times are noted."""
-        await asyncio.sleep(self.begins_at - time.monotonic())
+        """Be a client that asks for all it can get."""
         own = self.address(number)
         await asyncio.gather(*(self._greed(one, own, found) for one in range(AT_ONCE)))
 
@@ -313,7 +312,7 @@ def main(rows: Rows) -> None:
     need("fastapi", "uvicorn", "jinja2")
     options = Options(__doc__)
     options.size("--seconds", 60.0, 3.0, "of load")
-    options.size("--warm-s", 5.0, 2.0, "of load before, until processes are there")
+    options.size("--warm-s", 5.0, 2.0, "of load before times are noted: processes are started")
     options.size("--clients", 50, 5, "at the same time")
     options.size("--pause-s", 0.5, 0.1, "between two requests, mean")
     options.size("--builds", 0, 1, "builds that are queued meanwhile")

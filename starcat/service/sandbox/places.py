@@ -25,7 +25,7 @@ from anyio import CapacityLimiter, to_thread
 from starcat.query.engine import Allowance
 from starcat.service.problems import Problem
 
-SHORT_PLACES = 8
+SHORT_PLACES = 6
 """Places of queries that are short, beside those that `Settings.queries` gives to long ones."""
 
 SHORT_S = 0.25
@@ -81,7 +81,7 @@ class Places:
             place.result(patience_s)
         except OutOfTime:
             if self._given_up(who, place):
-                raise busy(patience_s) from None
+                raise self._too_late(who, patience_s) from None
 
     async def take_later(self, who: str, patience_s: float) -> None:
         """Take a place as `take` does, holding no thread meanwhile."""
@@ -93,7 +93,7 @@ class Places:
                 await asyncio.shield(asyncio.wrap_future(place))
         except TimeoutError:
             if self._given_up(who, place):
-                raise busy(patience_s) from None
+                raise self._too_late(who, patience_s) from None
         except BaseException:
             if not self._given_up(who, place):
                 self.release(who)
@@ -105,6 +105,15 @@ class Places:
             self._free += 1
             self._held[who] -= 1
             self._give()
+
+    def _too_late(self, who: str, waited_s: float) -> Problem:
+        """Return what is said where no place was free in time, by whose doing that was."""
+        own = self._held[who]
+        after = "ask again later"
+        why = f"the service was busy for {waited_s:g} s: too many requests at once; {after}"
+        if own:
+            why = f"{own} of your requests took more than {waited_s:g} s; {after}, one at a time"
+        return Problem(429 if own else 503, why, headers={"Retry-After": "10"})
 
     def _asked(self, who: str) -> Future[None]:
         place: Future[None] = Future()
@@ -245,12 +254,3 @@ def held(places: Places, who: str) -> Iterator[None]:
         yield
     finally:
         places.release(who)
-
-
-def busy(waited_s: float) -> Problem:
-    """Return what is said where no place was free in time."""
-    return Problem(
-        503,
-        f"the service was busy for {waited_s:g} s: too many requests at once; ask again later",
-        headers={"Retry-After": "10"},
-    )

@@ -6,7 +6,8 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from concurrent.futures import TimeoutError as OutOfTime
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
@@ -23,9 +24,11 @@ IDLE = 8
 SPARE = 2
 """Processes that are started before it is known what they are to open, which takes less time."""
 
+BACK_S = 0.2
+"""Seconds in which a process that others use may come back, before another is started."""
+
 BEGINNING = 2
-"""Processes with the same key that are started at the same time: one that others give back is
-there sooner than the third would be."""
+"""Processes with the same key that are started at the same time."""
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query may take for what does not fit into its memory."""
@@ -114,6 +117,10 @@ class Pool(Generic[K, ProcessT]):
                 return found
             waiting: Future[Lent[K, ProcessT]] = Future()
             self._wanted.append((key, waiting))
+            is_used = key in self._beginning or any(one[0] == key for one in self._lent)
+        with suppress(OutOfTime):
+            return waiting.result(BACK_S if is_used else 0.0)
+        with self._lock:
             self._begin_wanted(key)
         return waiting.result()
 

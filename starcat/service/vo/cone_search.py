@@ -17,7 +17,7 @@ from starcat.service.access import Reader
 from starcat.service.problems import ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import chunks_of
-from starcat.service.vo.tap import VOTableRoute, in_address
+from starcat.service.vo.tap import HELD_BYTES, VOTableRoute, in_address
 from starcat.store.layout import is_store
 from starcat.vo.cone import MEDIA_TYPE, ConeRequest, cone_query, cone_request, star_view, with_ucds
 
@@ -37,8 +37,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}(\.[A-Za-z0-9_-]{1,99}){0,9}"
 _OF_A_JOB = re.compile(r"-[0-9a-f]{16}(\.parquet)?$")
 _VOTABLE = {"Content-Type": MEDIA_TYPE}
 _STARS = "stars.parquet"
-_HELD_BYTES = 4 << 20
-"""What an answer may take of the memory; a larger one is held in a file without a name."""
 _PARAMETERS = (
     ("RA", "number", 83.6, "Right ascension of the centre, ICRS, decimal degrees."),
     ("DEC", "number", -5.4, "Declination of the centre, ICRS, decimal degrees."),
@@ -111,7 +109,7 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
             scratch = service.paths.scratch
             chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
             held: SpooledTemporaryFile[bytes]
-            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115
+            held = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
             try:
                 held.writelines(chunks)
             except BaseException:

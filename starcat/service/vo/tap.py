@@ -10,11 +10,12 @@ import shutil
 import threading
 import time
 from collections.abc import AsyncIterator, Generator, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import SpooledTemporaryFile
 from typing import Annotated, Any, Literal
 
 from anyio import CancelScope, to_thread
@@ -25,6 +26,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
+from starcat.query.engine import CLOCK_TIMES
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
 from starcat.service.sandbox.places import SHORT_S, Lease, Overdue, lease
@@ -49,6 +51,9 @@ MAX_PARAMETERS = 100
 MAX_PARAMETER_BYTES = 1 << 20
 
 READ_BYTES = 1 << 18
+
+HELD_BYTES = 4 << 20
+"""What an answer may take of the memory; a larger one is held in a file without a name."""
 
 LOOK_S = 1.0
 """How often a reader that waits looks whether the answer has ended."""
@@ -209,7 +214,9 @@ class Spool:
         self._is_done = False
         self._error: BaseException | None = None
         self._changed = threading.Condition()
-        self._file = TemporaryFile(dir=scratch)  # noqa: SIM115 - closed by `close`
+        # Closed by `close`. A disk that a long query writes to keeps no short answer waiting.
+        self._file: SpooledTemporaryFile[bytes]
+        self._file = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
         self._thread = threading.Thread(target=self._make, name="tap-answer", daemon=True)
         self._thread.start()
 
@@ -234,7 +241,7 @@ class Spool:
 
         Until then it can still be begun again, for which `Overdue` is raised: nothing was sent.
         """
-        until_s = time.monotonic() + SHORT_S
+        until_s = time.monotonic() + CLOCK_TIMES * SHORT_S
         with self._changed:
             while not (self._is_done or place.is_long or time.monotonic() > until_s):
                 self._changed.wait(TICK_S)
@@ -307,8 +314,9 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         if gone.is_set():
             raise ClientGone
 
-    with scratch_folder(service.paths) as folder:
-        files = given.keep(folder) | service.query_jobs.answers(asked.uploads, owner)
+    with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
+        files = given.keep(folder) if folder else {}
+        files |= service.query_jobs.answers(asked.uploads, owner)
         parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")
