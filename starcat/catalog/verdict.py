@@ -42,7 +42,6 @@ class Reason(Enum):
 
 
 _CODES = {reason: code for code, reason in enumerate(Reason, start=1)}
-_NAMES = pa.array(["kept", *(reason.name for reason in Reason)])
 
 
 class Verdicts:
@@ -63,7 +62,9 @@ class Verdicts:
     @property
     def reasons(self) -> pa.Array:
         """Names of the reasons of the rejected records, in order."""
-        return _NAMES.take(pa.array(self._code[self._code != 0]))
+        # Made here: the first array of a list imports pandas, where that is installed.
+        names = pa.array(["kept", *(reason.name for reason in Reason)])
+        return names.take(pa.array(self._code[self._code != 0]))
 
 
 class Quality(IntFlag):

@@ -7,6 +7,7 @@ J1991.25; where its mflag is H, the VT column holds a Hipparcos Hp magnitude.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -34,11 +35,17 @@ COLUMNS = {
 PROX_BEYOND = 999
 """Value of ``prox`` for "no other star within 99.9 arcsec"; the unit is 0.1 arcsec."""
 
-_NUMBER_TEXTS = pa.array([str(number) for number in range(100_000)])
-"""Texts of all numbers that TYC2 and TYC3 can be, as looking up is faster than formatting."""
 
-_REGION_TEXTS = pc.binary_join_element_wise("TYC", _NUMBER_TEXTS[:10_000], " ")
-"""Texts of all numbers that TYC1 can be, with the name of the catalog before them."""
+@cache
+def _number_texts() -> pa.Array:
+    """Return texts of all numbers that TYC2 and TYC3 can be: looking up is faster than writing."""
+    return pa.array([str(number) for number in range(100_000)])
+
+
+@cache
+def _region_texts() -> pa.Array:
+    """Return texts of all numbers that TYC1 can be, with the name of the catalog before them."""
+    return pc.binary_join_element_wise("TYC", _number_texts()[:10_000], " ")
 
 
 def magnitudes(records: Records, band: str) -> Array:
@@ -128,6 +135,6 @@ def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
     """Return the packed number and the designation of Tycho records."""
     parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
     number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]
-    region = _REGION_TEXTS.take(pa.array(parts[0]))
-    texts = [_NUMBER_TEXTS.take(pa.array(part)) for part in parts[1:]]
+    region = _region_texts().take(pa.array(parts[0]))
+    texts = [_number_texts().take(pa.array(part)) for part in parts[1:]]
     return number, pc.binary_join_element_wise(region, *texts, "-")
