@@ -473,7 +473,10 @@ def test_the_terminal_shows_every_row_within_100_columns(content, capsys):
     assert re.search(r"triangles +MiB +8\.2 +1\.729 +2\.4 +yes", shown.out)
     assert re.search(r"records +170,551 +166,799", shown.out)
     assert re.search(r"S0 +a made-up paper +48 ", shown.out)
-    assert shown.err == "wrote index.html\n"
+    *columns, wrote = shown.err.splitlines()
+    assert wrote == "wrote index.html"
+    told = dict(column.split(": ", 1) for column in columns)
+    assert told["ceiling"].startswith("frames that hold at least four guide stars")
     print_evaluation(Evaluation((content,), Path("index.html")), as_json=True)
     assert json.loads(capsys.readouterr().out) == [content]
 
