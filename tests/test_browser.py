@@ -223,6 +223,7 @@ def published(identified: str, page: Page, shoot: Callable[[str], None]) -> str:
     return page.locator("#browser-1\\.0\\.0 pre code").inner_text()
 
 
+@pytest.mark.slow
 def test_what_was_published_is_pulled_from_a_shell(published, tmp_path):
     assert published.startswith("starcat pull browser@1.0.0 --registry http://127.0.0.1:")
     command = [sys.executable, "-m", *published.split(), "--output", tmp_path / "onboard"]

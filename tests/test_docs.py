@@ -90,6 +90,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_has_every_page(site):
     every = {page.stem for page in (ROOT / "docs").glob("*.md")}
     assert every == {page.stem for page in site.glob("*.html")} - {"genindex", "search"}

@@ -177,6 +177,7 @@ def test_a_cluster_longer_than_messages_go(tmp_path):
     assert sorted(table["n_stars"].to_pylist())[:2] == [1, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who_moves", ["the star", "the candidate"])
 def test_a_star_that_was_far_away_a_century_ago(who_moves, tmp_path):
     """Barnard's star moves 1,030 arcsec in a century, over several of the small partitions."""

@@ -256,6 +256,7 @@ def ran(served: Served, address: str, capsys: pytest.CaptureFixture[str], **quer
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_python_of_a_database_opens_it(served, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     out = ran(served, PAGE, capsys)
@@ -289,6 +290,7 @@ def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
     assert len(shown) == 25
 
 
+@pytest.mark.slow
 def test_the_python_of_an_answer_identifies_the_frame(served, capsys):
     query = {"database": DATABASE, "seed": "7"}
     out = ran(served, "/identify", capsys, **query)

@@ -267,6 +267,7 @@ def some_steps(folder: Path, run: Callable[[int], int], points: int) -> list[int
     return sorted({1 + k * (last - 1) // points for k in range(points + 1)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", POINTS)
 def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     before, artifact = str(artifact_version("1.0.1")), str(artifact_version("1.0.2"))
@@ -290,6 +291,7 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
         assert [*(tmp_path / "registry/.incoming").glob("*.part")] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", POINTS)
 def test_a_pull_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     artifact, output, count = artifact_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")

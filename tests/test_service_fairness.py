@@ -191,6 +191,7 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
     assert len(asyncio.run(go())) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_query_that_is_begun_again_has_the_same_answer(pool, small_artifact, monkeypatch):
     monkeypatch.setattr(places, "SHORT_S", 0.05)

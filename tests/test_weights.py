@@ -157,6 +157,7 @@ def test_noises_that_cannot_be_are_refused(sky, sigma_px, words):
         Matcher(sky).identify_many([px], sigma_px=[sigma_px])
 
 
+@pytest.mark.slow
 def test_spots_of_a_picture_weigh_by_their_light(sky):
     """Where the noise of their light is their error; where the lens is not known they do not."""
     matcher, errors = Matcher(sky, tolerance_px=3.0), {"told": [], "untold": []}
