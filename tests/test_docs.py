@@ -96,6 +96,7 @@ def test_the_site_has_every_page(site):
     assert every == {page.stem for page in site.glob("*.html")} - {"genindex", "search"}
 
 
+@pytest.mark.slow
 def test_the_site_loads_nothing_from_elsewhere(site):
     """Formulas included: they are MathML, which needs no script."""
     for page in site.rglob("*.html"):
