@@ -67,7 +67,7 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
     rows = csv.DictReader(text.splitlines())
     try:
         names = rows.fieldnames or ()
-        if len(names) in HEADLESS and all(map(_is_number, names)):
+        if len(names) in HEADLESS and all(map(is_number, names)):
             rows = csv.DictReader(text.splitlines(), HEADLESS[len(names)])
             names = rows.fieldnames or ()
         if {"x_px", "y_px"} - set(names):
@@ -97,7 +97,8 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
     return MeasuredFrame(path.stem, table[:, :2], mag, sigma_px, ignored)
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
     try:
         float(text)
     except ValueError:

@@ -72,7 +72,8 @@ class Rates:
 
 def rates_of(content: Mapping[str, Any]) -> Rates:
     """Return the rates that a report tells."""
-    return Rates(**{f.name: content[f.name] for f in fields(Rates) if f.name in content})
+    told = {f.name: content[f.name] for f in fields(Rates) if f.name in content}
+    return Rates(**{"noise_mag": None, **told})  # version 0.1.0 gave no magnitudes
 
 
 def self_test(

@@ -21,6 +21,7 @@ from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry.camera import Camera
 from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
+from starcat.matcher.centroids import is_number
 from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
@@ -383,7 +384,7 @@ def _rows(text: str) -> list[list[str]]:
                 "frame of stars. Leave out the faint ones",
                 key="centroids",
             )
-        if not (2 <= len(words) <= 3 and all(map(_is_number, words))):
+        if not (2 <= len(words) <= 3 and all(map(is_number, words))):
             raise ConfigError(
                 f"line {number}: {quoted(line.strip())}; expected two or three numbers, 'x y' or "
                 "'x y brightness'",
@@ -398,11 +399,3 @@ def _rows(text: str) -> list[list[str]]:
             )
         rows.append(words)
     return rows
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -18,6 +18,7 @@ from starcat.service.jobs.submission import cancel_job, may_change, retry_job
 from starcat.service.pages.draft import draft_of_content, without_defaults
 from starcat.service.pages.rendering import count_text, page_router, render, size_text
 from starcat.service.service import TheService
+from starcat.simulation.selftest import rates_of
 
 JOBS_A_PAGE = 50
 LINES = 500  # lines of the log that a page has; the address of the log has all
@@ -88,7 +89,8 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
         took=took_s(job),
         progress=progress_text(job),
         may_change=may_change(job, who),
-        rates=(job.result or {}).get("rates", []),
+        # A job of an older version has recorded no share of all pointings.
+        rates=[rates_of(one).as_dict() for one in (job.result or {}).get("rates", ())],
         charts=charts_of(job),
         chart=(CHART_WIDTH, CHART_HEIGHT),
     )

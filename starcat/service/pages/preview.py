@@ -21,6 +21,7 @@ from starcat.report.coverage_map import (
     raster_png,
     sky_map,
 )
+from starcat.report.report import BLIND_SHARE
 from starcat.service.catalogs import Catalogs
 from starcat.service.pages.rendering import count_text
 from starcat.simulation.selftest import wilson_interval
@@ -30,9 +31,6 @@ MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wi
 MOST_BARS = 48
 MOST_MAPPED = 50_000
 """Of more boresights than these no map is drawn: their fields would be finer than its dots."""
-
-MOST_BLIND = 0.001
-"""Share of the sky with too few stars that a build says nothing of."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
     """Return whether nearly every field has the stars that it needs, and what to do if not."""
     blind, stars = 1.0 - found.enough_share, found.coverage.stars
     spec = found.spec
-    if blind > MOST_BLIND:
+    if blind > BLIND_SHARE:
         words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
         advice, test = _advice(spec, catalogs), spec.self_test
         hits = round(found.enough_share * test.frames)

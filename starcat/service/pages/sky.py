@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse, Response
 from starcat.catalog.source import data_source
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import directions_from_radec, radec_from_directions
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.service.access import Reader
 from starcat.service.api.sql import SqlQuery, result_table
 from starcat.service.library import Database
@@ -170,7 +170,7 @@ def around(places: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     if length < 0.3 * len(places):  # all over the sky
         return {"ra": 0.0, "dec": 0.0, "size": 360.0}
     middle /= length
-    reach = float(np.degrees(np.arccos(np.clip((directions @ middle).min(), -1.0, 1.0))))
+    reach = float(np.degrees(separation(directions, middle).max()))
     ra_deg, dec_deg = radec_from_directions(middle)
     size = 360.0 if reach > 60.0 else max(3.0 * reach, 1.0)
     return {"ra": round(float(ra_deg), 4), "dec": round(float(dec_deg), 4), "size": size}
