@@ -81,3 +81,30 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
         np.where(unknown, motion.pm_dec_mas_yr, pm_dec_end),
     )
     return end, u
+
+
+def central_error(
+    error_mas: Array, pm_error_mas_yr: Array, correlation: Array, epoch_jyear: float
+) -> tuple[Array, Array]:
+    """Return the position error of an axis at its central epoch, and that epoch.
+
+    There position and proper motion are independent, so that years later the variance of the
+    position is that of the centre and the years squared times that of the motion. Where one of
+    the three is not known, the error stays at its own epoch.
+
+    Parameters
+    ----------
+    error_mas, pm_error_mas_yr, correlation : array, shape (N,)
+        Standard errors of position and proper motion along the axis and their correlation.
+    epoch_jyear : float
+        Epoch of the position, Julian years.
+
+    Returns
+    -------
+    tuple of array, shape (N,)
+        Error at the central epoch, mas, and that epoch.
+    """
+    shift = -correlation * error_mas / pm_error_mas_yr
+    is_whole = np.isfinite(shift)
+    smaller = error_mas * np.sqrt(1.0 - np.where(is_whole, correlation, 0.0) ** 2)
+    return smaller, epoch_jyear + np.where(is_whole, shift, 0.0)
