@@ -90,19 +90,7 @@ def central_error(
 
     There position and proper motion are independent, so that years later the variance of the
     position is that of the centre and the years squared times that of the motion. Where one of
-    the three is not known, the error stays at its own epoch.
-
-    Parameters
-    ----------
-    error_mas, pm_error_mas_yr, correlation : array, shape (N,)
-        Standard errors of position and proper motion along the axis and their correlation.
-    epoch_jyear : float
-        Epoch of the position, Julian years.
-
-    Returns
-    -------
-    tuple of array, shape (N,)
-        Error at the central epoch, mas, and that epoch.
+    the three arrays, of shape (N,), has no value, the error stays at its own epoch.
     """
     shift = -correlation * error_mas / pm_error_mas_yr
     is_whole = np.isfinite(shift)
