@@ -186,7 +186,7 @@ def read_sources(
         spec.catalog.source,
         paths[spec.catalog.source],
         band=spec.catalog.band,
-        epoch_jyear=spec.epoch_jyear,
+        epoch_jyear=spec.middle_jyear,
         read_limit_mag=spec.catalog.read_limit_mag,
         neighbours=not spec.catalog.motions,  # found where the stars will be
         workers=workers,
@@ -265,7 +265,7 @@ def database_facts(spec: BuildSpec) -> dict[str, str | float]:
         "name": spec.name,
         "version": spec.version,
         "frame": "ICRS",
-        "epoch_jyear": spec.epoch_jyear,
+        "epoch_jyear": spec.middle_jyear,
         "camera": json.dumps({**size, "focal_length_px": camera.focal_length_px}, sort_keys=True),
         "spec": json.dumps(content, sort_keys=True),
     }

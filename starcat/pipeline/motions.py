@@ -78,10 +78,10 @@ def join_motions(
         found.note(matches)
         sources.append(facts)
         told += notes
-    moved = _with_motions(stars, found, spec.epoch_jyear)
+    moved = _with_motions(stars, found, spec.middle_jyear)
     table = found.table(stars, moved)
     # What reading said of stars that stay behind is no longer so.
-    stale = unmoved_stars(catalog.source, stars, spec.epoch_jyear)
+    stale = unmoved_stars(catalog.source, stars, spec.middle_jyear)
     told = [*(note for note in catalog.notes if note not in stale), *told]
     moved = add_nearest_neighbours(moved, workers)
     return JoinedMotions(replace(catalog, stars=moved, notes=tuple(told)), table, tuple(sources))
@@ -129,7 +129,7 @@ def motion_notes(spec: BuildSpec, products: Sequence[Product]) -> tuple[str, ...
     return (
         f"{spec.catalog.source}: {sum(counts[name] for name in unmoved):,} of {counts.total():,} "
         f"guide stars have no motion in {', '.join(spec.catalog.motions)} and are not moved to "
-        f"J{spec.epoch_jyear:g} ({reasons}); the product motions lists them",
+        f"J{spec.middle_jyear:g} ({reasons}); the product motions lists them",
     )
 
 

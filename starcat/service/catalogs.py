@@ -275,7 +275,7 @@ def _facts(spec: BuildSpec, read: CatalogSnapshot) -> CatalogRead:
     return CatalogRead(
         spec.catalog.source,
         band,
-        spec.epoch_jyear,
+        spec.middle_jyear,
         len(read.stars),
         mags and mags[0],
         mags and mags[1],

@@ -6,10 +6,11 @@ spec travels in the manifest of the artifact. `starcat.specs.reading` reads one 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PlainValidator, model_validator
 
+from starcat.errors import quoted
 from starcat.geometry.camera import Camera
 from starcat.specs.product_sections import (
     NAME_PATTERN,
@@ -24,7 +25,7 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions")
+LATER_KEYS = ("products.levels", "catalog.motions", "selection.max_drift_arcsec")
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -123,6 +124,13 @@ class Selection(Section):
         le=10_000,
         description="thins to an even density: keeps the stars that are among this many brightest "
         "of any field of the tiling",
+    )
+    max_drift_arcsec: float | None = Field(
+        None,
+        gt=0.0,
+        le=36_000.0,
+        description="stars that are further from their place at the ends of the span of "
+        "epoch_jyear are rejected",
     )
     doubles: Doubles = Doubles()
     variables: Variables = Variables()
@@ -224,6 +232,29 @@ class SelfTest(Section):
     )
 
 
+Epoch = Annotated[float, Field(ge=1800.0, le=2200.0)]
+
+
+def _epoch_or_span(value: Any) -> float | tuple[float, float]:
+    """Return a Julian year, or the two of a span, after checking them."""
+    years = value if isinstance(value, list | tuple) else [value]
+    if len(years) not in (1, 2) or isinstance(value, list | tuple) and len(years) == 1:
+        raise ValueError(f"found {len(years)} years; give one, or [begin, end] of a span")
+    for year in years:
+        is_number = isinstance(year, int | float) and not isinstance(year, bool)
+        if not is_number or not 1800.0 <= year <= 2200.0:
+            raise ValueError(f"found {quoted(str(year))}; give a Julian year from 1800 to 2200")
+    if len(years) == 1:
+        return float(years[0])
+    begin, end = map(float, years)
+    if begin >= end:
+        raise ValueError(
+            f"the span ends at {end:g}, not after it begins at {begin:g}; give [begin, end], or "
+            "one year"
+        )
+    return begin, end
+
+
 class BuildSpec(Section):
     """Everything that a database depends on, but for its input files."""
 
@@ -239,8 +270,13 @@ class BuildSpec(Section):
         examples=["1.0.0"],
     )
     description: str = Field("", max_length=2000, description="what the database is for")
-    epoch_jyear: float = Field(
-        ge=1800.0, le=2200.0, description="Julian year of all positions", examples=[2026.0]
+    epoch_jyear: Annotated[
+        float | tuple[float, float],
+        PlainValidator(_epoch_or_span, json_schema_input_type=Epoch | tuple[Epoch, Epoch]),
+    ] = Field(
+        description="Julian year of all positions, or a span [begin, end]: positions are then at "
+        "its middle, and how far a star drifts to the ends is told",
+        examples=[2026.0],
     )
     catalog: Catalog
     selection: Selection
@@ -298,6 +334,18 @@ class BuildSpec(Section):
             if getattr(own, key) == type(own).model_fields[key].default:
                 del told[key]
         return content
+
+    @property
+    def span_jyear(self) -> tuple[float, float]:
+        """The first and the last Julian year that the database is for, often the same."""
+        given = self.epoch_jyear
+        return given if isinstance(given, tuple) else (given, given)
+
+    @property
+    def middle_jyear(self) -> float:
+        """Julian year of all positions."""
+        begin, end = self.span_jyear
+        return begin + 0.5 * (end - begin)
 
     @property
     def sources(self) -> tuple[str, ...]:
