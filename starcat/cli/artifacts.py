@@ -18,7 +18,7 @@ from starcat.cli.console import (
     show,
     warn,
 )
-from starcat.cli.options import Input, Json, inputs_by_source
+from starcat.cli.options import Input, Json, inputs_by_source, to_folder
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
@@ -58,9 +58,7 @@ def inspect(
 @app.command()
 def coverage(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for CSV, JSON, PNG and SVG.")
-    ] = None,
+    output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
     json: Json = False,
 ) -> None:
     """Say how many stars, pairs and triangles the fields of an artifact hold.
@@ -126,7 +124,7 @@ def rebuild(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     inputs: Input = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the new artifact.")
+        Path | None, to_folder("Where the new database goes; default: it is not kept.")
     ] = None,
     json: Json = False,
 ) -> None:

@@ -26,6 +26,7 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
+    to_folder,
 )
 from starcat.cli.remote import service_of
 from starcat.errors import BuildError
@@ -47,9 +48,7 @@ def build(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
-    ] = Path("dist"),
+    output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a different artifact of that name.")
     ] = False,

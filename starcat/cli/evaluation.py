@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_table, progress_bars, say, show
-from starcat.cli.options import Input, Json, inputs_by_source
+from starcat.cli.options import Input, Json, inputs_by_source, to_folder
 from starcat.errors import ConfigError
 from starcat.progress import Progress
 
@@ -83,7 +83,7 @@ EcssExample = Annotated[
         help="Print a sensor with every key explained.",
     ),
 ]
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of records and reports.")]
+Output = Annotated[Path, to_folder("Where the records and reports go.")]
 
 
 @app.command()

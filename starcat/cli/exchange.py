@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_facts, print_table, print_things, say, show
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_either
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
 
@@ -39,11 +39,9 @@ FormatName = Annotated[
 ]
 OutputPath = Annotated[
     Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        help="Folder to put one file a product into, default: export; for onboard and c the "
-        "file, default: <name>-<version>.img or .c.",
+    to_either(
+        "Where the result goes: the folder of one file a product, default: export; for onboard and "
+        "c the file, default: <name>-<version>.img or .c."
     ),
 ]
 MaxPartitionRows = Annotated[

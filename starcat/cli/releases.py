@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_things, progress_bars, say, show
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_folder
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -47,9 +47,7 @@ def pull(
     registry: Annotated[
         str | None, typer.Option(help="Folder or http(s) address; default: that of the lock file.")
     ] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
-    ] = Path("dist"),
+    output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     locked: Annotated[
         bool,
         typer.Option(

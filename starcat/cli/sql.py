@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_file
 from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS
 
@@ -31,7 +31,7 @@ Values = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
 ]
 OutputFile = Annotated[
-    Path | None, typer.Option("--output", "-o", help="File; its suffix selects the format.")
+    Path | None, to_file("Where the answer goes; the suffix selects the format.")
 ]
 FormatName = Annotated[
     str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
