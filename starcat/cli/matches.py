@@ -132,7 +132,8 @@ def print_contents(
 
 
 def _print_one(content: dict[str, Any], database: str) -> None:
-    rows = [row for name, value in content.items() for row in _rows_of_fact(name, value)]
+    facts = {name: value for name, value in content.items() if name != "frame"}
+    rows = [row for name, value in facts.items() for row in _rows_of_fact(name, value)]
     reasons = Counter(star["dropped"] for star in content["stars"] if "dropped" in star)
     rows += [(f"dropped, {why.replace('_', ' ')}", count) for why, count in sorted(reasons.items())]
     print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Folder = Annotated[Path, typer.Argument(help="The folder <name>-<version>.")]
+Folder = Annotated[Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")]
 FrameFiles = Annotated[
     list[str],
     typer.Argument(
@@ -84,7 +84,7 @@ def simulate(
     output: Annotated[Path, opt.to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
-    false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
+    false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are no stars.")] = 0,
     json: opt.Json = False,
 ) -> None:
     """Write one simulated frame, centroids or image, to try 'starcat identify' with.

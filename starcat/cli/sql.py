@@ -22,7 +22,7 @@ Arguments = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="TARGET... [QUERY]",
-        help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
+        help="Databases, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
         "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
     ),
 ]
@@ -57,7 +57,7 @@ def sql(
     memory_limit_gb: Annotated[float, typer.Option(min=0.1, help="Memory it may take.")] = 2.0,
     json: Json = False,
 ) -> None:
-    """Ask questions about artifacts and catalogs in SQL; nothing is written but -o FILE.
+    """Ask questions about databases and catalogs in SQL; nothing is written but -o FILE.
 
     Every product is a view: stars, rejected, pairs, triangles ... With several targets each has
     a schema of its name, and they are a, b, c ... too. The folder of a store may be any HATS
