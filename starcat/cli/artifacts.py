@@ -190,10 +190,7 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     print_table(
         "Products",
         ("product", f"rows of {name_a}", f"rows of {name_b}", "content"),
-        [
-            (p.product, _count(p.rows_a), _count(p.rows_b), "same" if p.is_same else "differs")
-            for p in found.products
-        ],
+        [(p.product, _count(p.rows_a), _count(p.rows_b), p.content) for p in found.products],
         numbers=(1, 2),
     )
 

@@ -15,7 +15,6 @@ from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
     FieldDeg,
-    Levels,
     Mag,
     Products,
     Section,
@@ -23,6 +22,11 @@ from starcat.specs.product_sections import (
 
 MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
+
+
+LATER_KEYS = ("products.levels", "catalog.motions")
+"""Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
+spec without them makes the bytes that it always made."""
 
 
 class Catalog(Section):
@@ -286,10 +290,13 @@ class BuildSpec(Section):
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
-        if self.products.levels == Levels():
-            del content["products"]["levels"]
-        if not self.catalog.motions:
-            del content["catalog"]["motions"]
+        for name in LATER_KEYS:
+            section, _, key = name.rpartition(".")
+            own, told = self, content
+            for part in filter(None, section.split(".")):
+                own, told = getattr(own, part), told[part]
+            if getattr(own, key) == type(own).model_fields[key].default:
+                del told[key]
         return content
 
     @property
