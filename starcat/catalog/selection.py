@@ -1,8 +1,8 @@
 """Selection: which stars of a table become guide stars, and why the others do not.
 
-Filters are tried in a fixed order (magnitude, doubles, variables, count, density) and the first
-that applies is the verdict. Doubles are judged by separation and magnitude difference at the
-sensor's resolution and variables by amplitude; a bare flag of an archive is only one input.
+Filters are tried in a fixed order (magnitude, distrust, doubles, variables, count, density) and
+the first that applies is the verdict. Doubles are judged by separation and magnitude difference
+at the sensor's resolution and variables by amplitude; a bare flag of an archive is only one input.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
+from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
     directions_of,
@@ -69,6 +70,9 @@ def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
         verdicts.reject(mag < selection.bright_limit_mag, Reason.too_bright)
         verdicts.reject(mag > selection.faint_limit_mag, Reason.too_faint)
     note("magnitude")
+    if selection.observed.reject:
+        verdicts.reject(is_distrusted(stars, selection.observed), Reason.distrusted)
+        note("distrust")
     if selection.doubles.action == "remove":
         verdicts.reject(has_companion(stars, selection), Reason.double)
     is_flagged = is_unresolved_double(stars, selection.doubles)

@@ -32,6 +32,7 @@ class Reason(Enum):
     uncertain_magnitude = "the magnitude may be wrong by more than 0.3 mag"
     too_bright = "brighter than bright_limit_mag"
     too_faint = "fainter than faint_limit_mag"
+    distrusted = "distrusted by what flew: [selection.observed] lists it"
     double = "a companion within min_separation_deg"
     merged = "merged into the brighter star of a close group"
     flagged_double = "the archive flags an unresolved double"

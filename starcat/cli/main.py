@@ -24,6 +24,7 @@ from starcat.cli import (
     evaluation,
     exchange,
     interrupts,
+    learning,
     matching,
     releases,
     serving,
@@ -50,7 +51,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, specs, builds, artifacts, sql, exchange),
-    *(releases, matching, evaluation, serving),
+    *(releases, matching, learning, evaluation, serving),
 ):
     app.add_typer(part.app)
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.ingest import Ingested
+from starcat.catalog.observed import with_observed
 from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, sort_rows
@@ -138,6 +139,7 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
+    stars = with_observed(stars, spec.selection.observed)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)

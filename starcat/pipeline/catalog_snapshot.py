@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.catalog.observed import with_observed
 from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
 from starcat.pipeline.cost import table_bytes
@@ -70,6 +71,7 @@ def read_snapshot(
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
+    stars = with_observed(stars, spec.selection.observed)
     catalog = joined.catalog
     return CatalogSnapshot(
         stars.combine_chunks(),
@@ -89,6 +91,7 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "catalog": content["catalog"],
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
+        "observed": content["selection"]["observed"],
     }
     if spec.catalog.motions:
         model = content["products"]["crossmatch"]
