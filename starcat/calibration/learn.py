@@ -98,27 +98,20 @@ def learn(
     Parameters
     ----------
     sightings : Sightings
-        What the frames show of their stars.
+        What ``n_frames`` identified frames show of their stars.
     stars : SkyStars
         The stars of the database.
-    n_frames : int
-        Number of identified frames.
     by_frame : bool, default False
         Whether every frame has an offset of its own, such as with exposures that differ.
     min_frames : int, default 3
         Fewest frames that a star is judged from.
     colour_term : float, default 0
-        What the magnitudes of the database have already, which matters for those of unknown colour.
+        That the magnitudes of the database have already; it bears on stars of unknown colour.
 
     Returns
     -------
     Lesson
         Terms, noise, a record of each star, and those to distrust.
-
-    Raises
-    ------
-    CalibrationError
-        If fewer than 20 stars have a measured magnitude.
     """
     found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
     if found < FEWEST_STARS:
