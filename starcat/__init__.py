@@ -104,7 +104,13 @@ def __getattr__(name: str) -> Any:
     # A program that wants to see the library's messages sets up logging itself.
     logging.getLogger(__name__).addHandler(logging.NullHandler())
     module, attribute = _HOMES[name]
-    found = globals()[name] = getattr(import_module(module), attribute)
+    try:
+        found = globals()[name] = getattr(import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        from starcat.version import lacking
+
+        text = lacking(f"starcat.{name}", error)
+        raise ModuleNotFoundError(text, name=error.name) from error
     return found
 
 

@@ -1,5 +1,24 @@
-"""``python -m starcat``: the same as the command ``starcat``."""
+"""``python -m starcat``, and the command ``starcat`` of both distributions.
 
-from starcat.cli.main import main
+Where a library of the command line is missing, or the whole of it as in ``starcat-matcher``, what
+there is identifies, and says of the rest what is lacking.
+"""
 
-main()
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command line, or what there is of it."""
+    try:
+        from starcat.cli.main import main as run
+    except ModuleNotFoundError as lacking:
+        from starcat.cli.alone import run_alone
+
+        sys.exit(run_alone(sys.argv[1:], lacking))
+    run()
+
+
+if __name__ == "__main__":
+    main()

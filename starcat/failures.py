@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 from typer import Abort, TyperException
 
 from starcat.errors import StarcatError, reason
+from starcat.version import lacking
 
 DEFECT = 70
 """Exit code of a defect of starcat: that of an internal error among those of BSD."""
@@ -59,6 +60,9 @@ def failure_of(error: Exception, doing: str) -> Failure:
         return Failure(
             error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
         )
+    if isinstance(error, ModuleNotFoundError) and _is_outsider(error.name):
+        text = lacking(doing, error)
+        return Failure(2, kind, text, hint_in(text))
     if isinstance(error, MemoryError):
         hint = "ask for less at a time, or use a machine with more memory"
         text = f"out of memory{_in_brackets(error)} while '{doing}' ran{_stage_of(error)}; {hint}"
@@ -70,6 +74,10 @@ def failure_of(error: Exception, doing: str) -> Failure:
     text = shown(str(error), MAX_FOREIGN) or "no message"
     what = f"this is a defect of starcat: '{doing}'{_stage_of(error)} ended with {kind}: {text}"
     return Failure(DEFECT, kind, f"{what}; {hint}", hint)
+
+
+def _is_outsider(name: str | None) -> bool:
+    return name is not None and name.partition(".")[0] != "starcat"
 
 
 class ValidationFailure(Protocol):

@@ -207,7 +207,7 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
-    """The artifact of `small_spec`; to be copied by who changes it."""
+    """The database of `small_spec`; to be copied by who changes it."""
     from starcat.pipeline.build import build
     from starcat.specs.reading import spec_from_dict
 
@@ -234,7 +234,7 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    """A registry with the release of the small artifact; to be copied by who uses it."""
+    """A registry with the release of the small database; to be copied by who uses it."""
     from starcat.releases.publishing import publish_artifact
 
     folder = tmp_path_factory.mktemp("published") / "registry"
@@ -244,7 +244,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) ->
 
 @pytest.fixture
 def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
-    """The small artifact as a copy that may be changed; `artifact_copies.seal` puts it right."""
+    """The small database as a copy that may be changed; `artifact_copies.seal` puts it right."""
     from artifact_copies import copied
 
     return copied(small_artifact, tmp_path)
@@ -273,7 +273,7 @@ def client(root: Path, request: pytest.FixtureRequest) -> Iterator[TestClient]:
 def artifact_version(
     tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
 ) -> Callable[[str], Path]:
-    """The small artifact as another version: a sound artifact without the time of a build.
+    """The small database as another version: a sound database without the time of a build.
 
     The database, the manifest and the report differ from those of other versions, as they do
     when it is built; the tables are the same files.

@@ -357,6 +357,10 @@ EDITED = {
         ({"bt_mag": "13.146"}, {"mag": pytest.approx(12.056), "quality_flags": 0}),
     ],
     "2mass": [
+        ({"err_maj": "0.08", "j_msigcom": "0.03", "h_msigcom": "0.04"}, {
+            "band": "(J+H)/2", "ra_error_mas": pytest.approx(80.0),
+            "mag_error": pytest.approx(0.025),
+        }),
         ({"ph_qual": "AAU"}, {"mag": None}),
         ({"ph_qual": "AAX"}, {"mag": None}),
         ({"ph_qual": "UUA"}, {"mag": 11.963, "second_mag": None, "colour_mag": None}),
@@ -415,6 +419,17 @@ EDITED = {
     ],
     "hipparcos": [
         ({}, {"band": "Hp", "mag": -1.0876, "second_mag": -1.44, "second_band": "V"}),
+        ({}, {"ra_error_mas": None, "pm_ra_error_mas_yr": None, "parallax_mas": None}),
+        ({"e_ra": "  0.84", "e_de": "  0.00", "e_pm_ra": "  0.95", "plx": "  -0.30"}, {
+            "ra_error_mas": 0.84, "ra_central_jyear": 1991.25, "dec_error_mas": None,
+            "pm_ra_error_mas_yr": 0.95, "parallax_mas": -0.3,
+        }),
+        ({"e_ra": "  1.00", "e_pm_ra": "  0.50", "pm_ra_ra": "-0.60"}, {
+            "ra_error_mas": pytest.approx(0.8), "ra_central_jyear": pytest.approx(1992.45),
+        }),
+        ({"v_i": "0.66", "sp_type": "K5V         "}, {
+            "second_colour_mag": 0.66, "second_colour_bands": "V-I", "spectral_type": "K5V",
+        }),
         *(
             ({"var_flag": flag, "hp_max": brightest, "hp_min": faintest}, {
                 "amplitude_mag": None if mag is None else pytest.approx(mag),

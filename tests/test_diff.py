@@ -1,4 +1,4 @@
-"""The difference between artifacts: which stars came, went and moved, and why."""
+"""The difference between databases: which stars came, went and moved, and why."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
+from artifact_copies import copied, seal
 
 from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.pipeline.build import build
 from starcat.specs.reading import spec_from_dict
+from starcat.storage.schema import product_schema
 
 Make = Callable[..., Artifact]
 
@@ -171,3 +174,18 @@ def test_the_command_prints_some_and_json_has_all(small_artifact, make, starcat)
 
 def test_a_folder_that_is_no_artifact_is_an_error(small_artifact, tmp_path, starcat):
     assert starcat(["diff", small_artifact, tmp_path]).code == 3
+
+
+def test_columns_of_a_newer_schema_are_told_and_the_others_compared(small_artifact, tmp_path):
+    """A database of 0.1.0 has the stars of 1.0.0."""
+    older = copied(small_artifact, tmp_path)
+    schema = product_schema("stars", "1.0.0").arrow_schema
+    table = pq.read_table(older / "stars.parquet").select(schema.names)
+    pq.write_table(table.cast(schema), older / "stars.parquet")
+    told = {"schema": "stars-1.0.0", "content_sha256": "0" * 64}
+    seal(older, lambda manifest: manifest["products"]["stars"].update(told))
+    found = diff_artifacts(open_artifact(older), open_artifact(small_artifact))
+    change = {one.product: one for one in found.products}["stars"]
+    assert change.content == "22 columns more, the others are the same"
+    assert not change.is_same
+    assert not found.moved

@@ -133,6 +133,16 @@ def test_a_recursion_without_end_is_a_defect(starcat, monkeypatch):
     assert "RecursionError" in run.err
 
 
+def test_a_library_that_is_missing_is_named(starcat, breaking):
+    breaking(ModuleNotFoundError("No module named 'rich'", name="rich.table"))
+    run = starcat(["sources"])
+    assert (run.code, run.err) == (
+        2,
+        "starcat: error: starcat sources needs the library 'rich', which is not installed; pip "
+        "install starcat-guide-stars\n",
+    )
+
+
 def test_a_want_of_memory_is_no_defect(starcat, breaking):
     breaking(MemoryError("Unable to allocate 16.0 TiB"))
     run = starcat(["sources"])

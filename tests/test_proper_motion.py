@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.proper_motion import MAS, Motion, propagate, propagate_directions
+from starcat.catalog.proper_motion import (
+    MAS,
+    Motion,
+    central_error,
+    propagate,
+    propagate_directions,
+)
 from starcat.geometry.sphere import directions_from_radec, separation
 
 ARCSEC = np.pi / (180.0 * 3600.0)
@@ -146,3 +152,17 @@ def test_a_star_that_ends_exactly_at_the_pole():
     assert end.dec_deg.tolist() == [90.0]
     assert end.pm_ra_cosdec_mas_yr.tolist() == [0.0]
     np.testing.assert_allclose(end.pm_dec_mas_yr, left, rtol=1e-12)
+
+
+@given(st.floats(0.1, 100.0), st.floats(0.1, 10.0), st.floats(-0.99, 0.99), st.floats(-60.0, 60.0))
+def test_errors_of_a_centre_are_those_of_the_covariance(error, pm_error, correlation, years):
+    covariance = correlation * error * pm_error
+    expected = error**2 + 2.0 * years * covariance + (years * pm_error) ** 2
+    smallest, centre = central_error(*np.array([[error], [pm_error], [correlation]]), 1991.25)
+    since = 1991.25 + years - centre
+    assert smallest**2 + (since * pm_error) ** 2 == pytest.approx([expected], rel=1e-6)
+
+
+def test_an_error_without_its_correlation_stays_at_its_epoch():
+    error, centre = central_error(np.array([2.0]), np.array([1.0]), np.array([np.nan]), 1991.25)
+    assert (error[0], centre[0]) == (2.0, 1991.25)

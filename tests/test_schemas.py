@@ -60,7 +60,7 @@ PRODUCT_FILE = {
 }
 SUFFIXES = {
     "deg": "_deg", "rad": "_rad", "arcsec": "_arcsec", "mas/yr": "_mas_yr", "mag": "_mag",
-    "px": "_px", "rad2": "_rad2",
+    "px": "_px", "rad2": "_rad2", "mas": "_mas", "km/s": "_km_s",
 }  # fmt: skip
 
 
@@ -104,7 +104,7 @@ class TestEveryFile:
         for column in read_schema(path).columns:
             if column.unit in SUFFIXES:
                 suffix = SUFFIXES[column.unit]
-                assert column.name.endswith(suffix) or column.name == suffix[1:], column.name
+                assert f"{suffix}_" in f"_{column.name}_", column.name
             for unit, suffix in SUFFIXES.items():
                 if column.name.endswith(suffix):
                     assert column.unit == unit, column.name

@@ -1,11 +1,9 @@
-"""The REST interface about databases, the registry and releases, on a small artifact."""
+"""The REST interface about databases, the registry and releases, on a small database."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from services import DATABASE, add_database, client_of, waiting_build
 from starcat.artifact.verify import verify_artifact
 from starcat.releases.pulling import pull_release
 from starcat.releases.registry import FolderRegistry
+from starcat.service.jobs.cluster import unpack
 
 SETTINGS = {"anonymous": "publisher"}
 OTHER = "fedcba9876543210"
@@ -161,8 +160,7 @@ def test_a_link_is_no_file(own, own_root, tmp_path):
 def test_the_archive_is_the_artifact(client, tmp_path):
     answer = client.get(f"{API}/archive")
     assert int(answer.headers["content-length"]) == len(answer.content)
-    with tarfile.open(fileobj=io.BytesIO(answer.content)) as archive:
-        archive.extractall(tmp_path / "out", filter="data")
+    unpack(answer.content, tmp_path / "out")
     assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
     assert client.get(f"{API}/archive").content == answer.content
 

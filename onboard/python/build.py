@@ -1,11 +1,13 @@
 """Compile the C matcher for Python when a wheel is built or starcat is installed in place.
 
-Hatchling runs the hook. Where there is no compiler, or ``STARCAT_WITHOUT_C`` is set, the wheel is
-a pure one, and the matcher of numpy serves alone.
+Hatchling runs the hook for both distributions. Into ``starcat-matcher`` it puts the modules that
+identifying imports; ``starcat-guide-stars`` has all of them. Where there is no compiler, or
+``STARCAT_WITHOUT_C`` is set, the wheel is a pure one, and the matcher of numpy serves alone.
 """
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import sys
@@ -22,6 +24,9 @@ MODULE = "starcat.matcher._onboard"
 DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192"}
 """The ground has memory for wider and denser fields than an onboard computer."""
 
+BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
+"""Where ``starcat-matcher`` is entered, besides the modules of the matcher themselves."""
+
 
 class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
     """Compiles the extension beside the module that imports it."""
@@ -32,6 +37,8 @@ class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
         """Compile, and make the wheel one for this platform if that went well."""
         if self.target_name != "wheel":
             return
+        if is_matcher := self.metadata.name == "starcat-matcher":
+            build_data["force_include"] |= files_of_the_matcher()
         try:
             compiled = compile_binding()
         except Exception as error:
@@ -41,7 +48,47 @@ class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
             return
         build_data["pure_python"] = False
         build_data["tag"] = f"cp311-abi3-{re.sub('[-.]', '_', sysconfig.get_platform())}"
-        build_data["artifacts"].append(compiled.relative_to(ROOT).as_posix())
+        name = compiled.relative_to(ROOT).as_posix()
+        if is_matcher:
+            build_data["force_include"][str(compiled)] = name
+        else:
+            build_data["artifacts"].append(name)
+
+
+def files_of_the_matcher() -> dict[str, str]:
+    """Return the files of the distribution that only identifies, by path, with their new names."""
+    names = {"starcat/py.typed": "starcat/py.typed", "LICENSE": "starcat/LICENSE"}
+    names |= {name: name for name in sorted(modules_of_the_matcher())}
+    return {str(ROOT / old): new for old, new in names.items()}
+
+
+def modules_of_the_matcher() -> set[str]:
+    """Return the modules that the beginnings and the matcher import, as paths from the root."""
+    matcher = (ROOT / "starcat" / "matcher").rglob("*.py")
+    left = [*BEGINNINGS, *(path.relative_to(ROOT).as_posix() for path in matcher)]
+    found: set[str] = set()
+    while left:
+        name = left.pop()
+        if name in found or not (ROOT / name).is_file():
+            continue
+        found.add(name)
+        left += [str(Path(name).parent.as_posix()) + "/__init__.py"]
+        left += imported_by(ast.parse((ROOT / name).read_text(encoding="utf-8")))
+    return found
+
+
+def imported_by(tree: ast.Module) -> list[str]:
+    """Return what a module imports when it is imported itself: no types, nothing in functions."""
+    found = []
+    for node in tree.body:
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            if name.split(".")[0] == "starcat":
+                path = name.replace(".", "/")
+                found += [f"{path}.py", f"{path}/__init__.py"]
+    return found
 
 
 def compile_binding() -> Path:

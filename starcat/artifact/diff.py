@@ -1,4 +1,4 @@
-"""What differs between two artifacts: spec, sources, software, stars and products.
+"""What differs between two databases: spec, sources, software, stars and products.
 
 Stars are matched by their permanent number, so that the answer says which star of the sky came,
 went or moved, and why, and not which row.
@@ -39,17 +39,17 @@ class Change:
 
 @dataclass(frozen=True)
 class OneSided:
-    """A guide star of one artifact that is none of the other."""
+    """A guide star of one database that is none of the other."""
 
     star_id: int  # permanent number
     designation: str
     mag: float | None  # magnitude, where it is a guide star
-    reason: str  # why the other artifact rejected it, or that it never read it
+    reason: str  # why the other database rejected it, or that it never read it
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A guide star of both artifacts whose position or magnitude differs."""
+    """A guide star of both databases whose position or magnitude differs."""
 
     star_id: int  # permanent number
     designation: str
@@ -60,17 +60,18 @@ class Moved:
 
 @dataclass(frozen=True)
 class ProductChange:
-    """A product in both artifacts."""
+    """A product in both databases."""
 
     product: str
-    rows_a: int | None  # records; None where an artifact does not have it
+    rows_a: int | None  # records; None where a database does not have it
     rows_b: int | None
     is_same: bool  # whether schema and content digest are equal
+    content: str  # "same", "differs", or which columns another schema brought
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What differs between artifact A and artifact B."""
+    """What differs between database A and database B."""
 
     spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
     sources: tuple[Change, ...]
@@ -91,7 +92,7 @@ class Difference:
 
 
 def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
-    """Compare two artifacts."""
+    """Compare two databases."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
     # A number means the same star only within one catalog.
@@ -106,12 +107,12 @@ def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
         came=_one_sided(stars_b, rows_b, known_a, _read_limit_mag(a, b)),
         went=_one_sided(stars_a, rows_a, known_b, _read_limit_mag(b, a)),
         moved=_moved(stars_a.take(rows_a), stars_b.take(rows_b)),
-        products=_products(a.manifest["products"], b.manifest["products"]),
+        products=_products(a, b),
     )
 
 
 def _read_limit_mag(artifact: Artifact, other: Artifact) -> float:
-    """Return the magnitude beyond which an artifact lists no star of the other's catalog."""
+    """Return the magnitude beyond which a database lists no star of the other's catalog."""
     mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
     limit_mag = mine.get("read_limit_mag")
     is_same = all(mine.get(key) == theirs.get(key) for key in ("source", "band"))
@@ -209,13 +210,31 @@ def _moved(a: pa.Table, b: pa.Table) -> tuple[Moved, ...]:
     )
 
 
-def _products(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[ProductChange, ...]:
+def _products(a: Artifact, b: Artifact) -> tuple[ProductChange, ...]:
+    facts_a, facts_b = a.manifest["products"], b.manifest["products"]
     changes = []
-    for name in dict.fromkeys([*a, *b]):
-        one, other = a.get(name), b.get(name)
-        is_same = all(
-            one is not None and other is not None and one[key] == other[key]
-            for key in ("schema", "content_sha256")
-        )
-        changes.append(ProductChange(name, one and one["rows"], other and other["rows"], is_same))
+    for name in dict.fromkeys([*facts_a, *facts_b]):
+        one, other = facts_a.get(name), facts_b.get(name)
+        has_both = one is not None and other is not None
+        is_same = has_both and all(one[key] == other[key] for key in ("schema", "content_sha256"))
+        content = "same" if is_same else "differs"
+        if has_both and one["schema"] != other["schema"]:
+            content = _change_of_schema(a.table(name), b.table(name))
+        rows_a, rows_b = (facts and facts["rows"] for facts in (one, other))
+        changes.append(ProductChange(name, rows_a, rows_b, is_same, content))
     return tuple(changes)
+
+
+def _change_of_schema(a: pa.Table, b: pa.Table) -> str:
+    """Return which columns a product of another schema has, and whether the others are equal."""
+    shared = [name for name in a.column_names if name in b.column_names]
+    told = [
+        f"{len(names)} columns {which}"
+        for which, names in (
+            ("more", set(b.column_names) - set(shared)),
+            ("fewer", set(a.column_names) - set(shared)),
+        )
+        if names
+    ]
+    is_equal = all(a[name].equals(b[name]) for name in shared)
+    return ", ".join([*told, "the others are the same" if is_equal else "others differ"])

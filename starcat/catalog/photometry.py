@@ -14,6 +14,9 @@ from starcat.errors import ConfigError
 JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
 """BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""
 
+JOHNSON_SLOPE = 0.090
+"""V is VT less this much of BT - VT."""
+
 _TERM = re.compile(r"(?:(\d+(?:\.\d+)?|\.\d+)\*)?(J|H|Ks)")
 
 
@@ -37,7 +40,7 @@ def johnson_v(bt_mag: Array, vt_mag: Array) -> JohnsonV:
     """
     colour = bt_mag - vt_mag
     low, high = JOHNSON_COLOUR_RANGE_MAG
-    mag = vt_mag - 0.090 * np.clip(colour, low, high)
+    mag = vt_mag - JOHNSON_SLOPE * np.clip(colour, low, high)
     missing = np.isnan(mag)
     mag = np.where(missing, np.where(np.isnan(vt_mag), bt_mag, vt_mag), mag)
     out_of_range = (colour < low) | (colour > high)

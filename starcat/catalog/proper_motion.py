@@ -81,3 +81,18 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
         np.where(unknown, motion.pm_dec_mas_yr, pm_dec_end),
     )
     return end, u
+
+
+def central_error(
+    error_mas: Array, pm_error_mas_yr: Array, correlation: Array, epoch_jyear: float
+) -> tuple[Array, Array]:
+    """Return the position error of an axis at its central epoch, and that epoch.
+
+    There position and proper motion are independent, so that years later the variance of the
+    position is that of the centre and the years squared times that of the motion. Where one of
+    the three arrays, of shape (N,), has no value, the error stays at its own epoch.
+    """
+    shift = -correlation * error_mas / pm_error_mas_yr
+    is_whole = np.isfinite(shift)
+    smaller = error_mas * np.sqrt(1.0 - np.where(is_whole, correlation, 0.0) ** 2)
+    return smaller, epoch_jyear + np.where(is_whole, shift, 0.0)

@@ -161,6 +161,11 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
     return joined.take(pa.array(np.cumsum(is_flagged) - 1, mask=~is_flagged))
 
 
+def known(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return standard errors with NaN for those that are 0, by which archives mean none."""
+    return np.where(errors > 0.0, errors, np.nan)
+
+
 def where_known(values: NDArray[np.float64], text: str) -> pa.Array:
     """Return a text for every value that is known, such as its source."""
     return pc.if_else(pa.array(np.isnan(values)), pa.scalar(None, pa.string()), text)

@@ -41,8 +41,8 @@ Made = TypeVar("Made")
 READABLE_LAYOUT = 1
 """Major version of the HDF5 layout that this matcher reads."""
 
-READABLE_SCHEMAS = 1
-"""Major version of the products' schemas that this matcher reads."""
+NEWEST_SCHEMAS = {"stars": 2}
+"""Newest major version of a product's schema that this matcher reads, where it is not 1."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Database:
     def check_has_products(self, why: str, **fact: Any) -> None:
         """Check that this is no onboard image, which has none."""
         if self.image is not None:
-            raise ConfigError(f"{why}; open the artifact that it is of", **fact)
+            raise ConfigError(f"{why}; open the database that it is of", **fact)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: all but what can be made again there."""
@@ -213,7 +213,7 @@ def _product(
         raise ProductError(
             f"{path}: {name} does not name its schema; build it again", product=name, path=path
         )
-    _check_version(schema.rpartition("-")[2], READABLE_SCHEMAS, name, path)
+    _check_version(schema.rpartition("-")[2], NEWEST_SCHEMAS.get(name, 1), name, path)
     numbers = {
         key: float(value)
         for key, value in group.attrs.items()
@@ -238,13 +238,15 @@ def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
     return np.frombuffer(mapped, dataset.dtype, count, offset)
 
 
-def _check_version(found: str, readable: int, product: str, path: Path) -> None:
-    if found.split(".")[0] != str(readable):
+def _check_version(found: str, newest: int, product: str, path: Path) -> None:
+    readable = [str(major) for major in range(1, newest + 1)]
+    if found.split(".")[0] not in readable:
+        expected = " and ".join(f"{major}.x" for major in readable)
         raise SchemaVersionError(
-            f"{path}: {product} is of version {found}; this matcher reads {readable}.x",
+            f"{path}: {product} is of version {found}; this matcher reads {expected}",
             product=product,
             found=found,
-            expected=f"{readable}.x",
+            expected=expected,
         )
 
 
@@ -348,7 +350,7 @@ class _Checks:
 def damaged(product: str, what: str, found: str) -> ProductError:
     """Return the error of a database that no build wrote as it is."""
     return ProductError(
-        f"{product}/{what} {found}; the database is damaged. Build the artifact again, or fetch "
+        f"{product}/{what} {found}; the database is damaged. Build the database again, or fetch "
         "it again",
         product=product,
     )

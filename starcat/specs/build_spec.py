@@ -1,7 +1,7 @@
 """The build spec: everything that a database depends on, but for its input files.
 
 Every key has a unit in its name, a range and a meaning, which ``docs/spec.md`` lists. The whole
-spec travels in the manifest of the artifact. `starcat.specs.reading` reads one from a file.
+spec travels in the manifest of the database. `starcat.specs.reading` reads one from a file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
     FieldDeg,
-    Levels,
     Mag,
     Products,
     Section,
@@ -23,6 +22,11 @@ from starcat.specs.product_sections import (
 
 MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
+
+
+LATER_KEYS = ("products.levels", "catalog.motions")
+"""Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
+spec without them makes the bytes that it always made."""
 
 
 class Catalog(Section):
@@ -208,7 +212,7 @@ class SelfTest(Section):
         0.2,
         ge=0.0,
         le=10.0,
-        description="noise of the magnitude of a spot, standard deviation; it decides what is "
+        description="noise of the magnitude of a centroid, standard deviation; it decides what is "
         "tried first",
     )
     min_identified: float = Field(
@@ -225,7 +229,7 @@ class BuildSpec(Section):
 
     name: str = Field(
         pattern=NAME_PATTERN,
-        description="name of the artifact: small letters, digits and hyphens",
+        description="name of the database: small letters, digits and hyphens",
         examples=["mycam"],
     )
     version: str = Field(
@@ -284,12 +288,15 @@ class BuildSpec(Section):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Return what an artifact says of its spec."""
+        """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
-        if self.products.levels == Levels():
-            del content["products"]["levels"]
-        if not self.catalog.motions:
-            del content["catalog"]["motions"]
+        for name in LATER_KEYS:
+            section, _, key = name.rpartition(".")
+            own, told = self, content
+            for part in filter(None, section.split(".")):
+                own, told = getattr(own, part), told[part]
+            if getattr(own, key) == type(own).model_fields[key].default:
+                del told[key]
         return content
 
     @property

@@ -41,7 +41,7 @@ def products_page() -> str:
         NOTE + "# Products\n\n"
         "Every product is a Parquet file; those that a matcher needs are groups of `database.h5`\n"
         "too. Angles between stars are radians, positions degrees, all ICRS at the epoch of the\n"
-        "manifest. `i`, `j` and the like are rows of the artifact's own `stars`.\n"
+        "manifest. `i`, `j` and the like are rows of the database's own `stars`.\n"
     ]
     for path in sorted(resource_folder("schemas").glob("*.json")):
         if path.stem.startswith("manifest-"):

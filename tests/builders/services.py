@@ -35,7 +35,7 @@ def client_of(
 
 
 def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
-    """Copy an artifact into the folder of a service; return where it is."""
+    """Copy a database into the folder of a service; return where it is."""
     return copied(artifact, root / "databases" / database)
 
 

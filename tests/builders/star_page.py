@@ -158,7 +158,7 @@ def table_section(story: Story) -> str:
     return f"""## 3. A row of the star table
 
 All catalogs become the same table ({link("starcat/catalog/stars.py")}), with names, units and
-meanings from `schemas/stars-1.0.0.json`. Of all {read:,} records,
+meanings from `schemas/stars-2.0.0.json`. Of all {read:,} records,
 {link("starcat/catalog/stars.py")} finds each star's nearest neighbour, before anything is left
 out. SAO says that Polaris varies but not by how much, so
 {link("starcat/catalog/variability.py")} joins the amplitude that another catalog, Hipparcos,
@@ -320,7 +320,7 @@ Each is a pure function of unit vectors, in starcat/products: {links}."""
 def artifact_section(story: Story) -> str:
     manifest = story.built.manifest
     source = manifest["sources"][0]["files"][0]
-    return f"""## 7. The artifact
+    return f"""## 7. The database
 
 {link("starcat/artifact/writer.py")} writes the folder `{story.built.folder.name}`, reads it back,
 and only then gives it its name. Polaris can be followed through it:

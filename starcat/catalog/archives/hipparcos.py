@@ -9,15 +9,22 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.catalog.proper_motion import central_error
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, numbered, where_known
+from starcat.catalog.stars import Columns, join_flags, known, numbered, text_column, where_known
 from starcat.catalog.verdict import Verdicts
+
+ASTROMETRY = (
+    "ra_deg", "de_deg", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx", "e_pm_ra", "e_pm_de",
+    "pm_ra_ra", "pm_de_de",
+)  # fmt: skip
+"""Columns of a place that both catalogs of I/239 have."""
 
 COLUMNS = {
     "hip_main": (
-        "hip", "proxy", "v_mag", "var_flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "bt_mag",
-        "vt_mag", "b_v", "hp_mag", "hp_max", "hp_min", "hvar_type", "ccdm", "n_comp", "mult_flag",
-        "rho", "dhp", "hd",
+        "hip", "proxy", "v_mag", "var_flag", *ASTROMETRY, "bt_mag", "e_bt_mag", "vt_mag",
+        "e_vt_mag", "b_v", "e_b_v", "v_i", "hp_mag", "e_hp_mag", "hp_max", "hp_min", "hvar_type",
+        "ccdm", "n_comp", "mult_flag", "rho", "dhp", "hd", "sp_type",
     ),
 }  # fmt: skip
 
@@ -38,6 +45,7 @@ def shared_columns(records: Records, mag: Array, second_mag: Array) -> Columns:
         "ra_deg": records["ra_deg"],
         "dec_deg": records["de_deg"],
         "epoch_jyear": 1991.25,
+        **_errors(records),
         "pm_ra_cosdec_mas_yr": records["pm_ra"],
         "pm_dec_mas_yr": records["pm_de"],
         "mag": mag,
@@ -46,6 +54,24 @@ def shared_columns(records: Records, mag: Array, second_mag: Array) -> Columns:
         "colour_bands": "B-V",
         "hd_number": records["hd"],
     }
+
+
+def _errors(records: Records) -> Columns:
+    """Return parallaxes, and errors where those of position and motion are independent."""
+    columns: Columns = {
+        "parallax_mas": records["plx"],
+        "parallax_error_mas": known(records["e_plx"]),
+    }
+    for axis, own, motion, correlation in (
+        ("ra", "e_ra", "e_pm_ra", "pm_ra_ra"),
+        ("dec", "e_de", "e_pm_de", "pm_de_de"),
+    ):
+        error, central = central_error(
+            known(records[own]), known(records[motion]), records[correlation], 1991.25
+        )
+        columns[f"{axis}_error_mas"], columns[f"{axis}_central_jyear"] = error, central
+        columns[f"pm_{axis}_error_mas_yr"] = known(records[motion])
+    return columns
 
 
 def stars(records: Records, band: str, _: Verdicts) -> Columns:
@@ -63,6 +89,10 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
         "designation": numbered("HIP", number),
         "band": band,
         "second_band": second,
+        "mag_error": _magnitude_errors(records, band),
+        "second_colour_mag": records["v_i"],
+        "second_colour_bands": "V-I",
+        "spectral_type": text_column(records["sp_type"]),
         "double_flag": join_flags(
             {
                 "CCDM": (in_ccdm, records["ccdm"]),
@@ -81,6 +111,15 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
         "amplitude_source": where_known(amplitude, "hipparcos"),
         "hip_number": number,
     }
+
+
+def _magnitude_errors(records: Records, band: str) -> Array:
+    """Return the errors of the magnitudes; that of V is made of those of Hp and B-V."""
+    if band != "V":
+        return known(records[f"e_{_MAGNITUDES[band]}"])
+    # V is Hp less a function of B-V that rises by about 0.2 mag a magnitude of colour.
+    error: Array = np.hypot(known(records["e_hp_mag"]), 0.2 * np.nan_to_num(records["e_b_v"]))
+    return error
 
 
 def amplitudes(records: Records) -> Array:

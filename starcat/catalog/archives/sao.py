@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, numbered
+from starcat.catalog.stars import Columns, join_flags, known, numbered, text_column
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 
@@ -21,7 +21,8 @@ COLUMNS = {
     "sao": (
         "sao", "del_flag", "p_mag", "v_mag", "sp_type", "r_vmag", "rem", "dm_component", "hd",
         "m_hd", "ra2000_h", "ra2000_m", "ra2000_s", "pm_ra2000", "de2000_sign", "de2000_d",
-        "de2000_m", "de2000_s", "pm_de2000", "ra2000_rad", "de2000_rad",
+        "de2000_m", "de2000_s", "pm_de2000", "ra2000_rad", "de2000_rad", "e_pm_ra", "e_ra2_s",
+        "ep_ra2", "e_pm_de", "e_de2_s", "ep_de2",
     ),
 }  # fmt: skip
 
@@ -52,6 +53,13 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
         "epoch_jyear": 2000.0,
         "pm_ra_cosdec_mas_yr": pm_ra,
         "pm_dec_mas_yr": pm_dec,
+        "ra_error_mas": 10.0 * known(records["e_ra2_s"]),
+        "dec_error_mas": 10.0 * known(records["e_de2_s"]),
+        "ra_central_jyear": records["ep_ra2"],
+        "dec_central_jyear": records["ep_de2"],
+        "pm_ra_error_mas_yr": known(records["e_pm_ra"]),
+        "pm_dec_error_mas_yr": known(records["e_pm_de"]),
+        "spectral_type": text_column(records["sp_type"]),
         "mag": magnitudes(records, band),
         "band": band,
         "second_mag": records["p_mag" if band == "V" else "v_mag"],

@@ -14,17 +14,19 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, text_column
+from starcat.catalog.stars import Columns, join_flags, known, text_column
 from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "psc": (
         "ra", "dec", "designation", "j_m", "h_m", "k_m", "ph_qual", "rd_flg", "bl_flg", "cc_flg",
-        "gal_contam", "mp_flg", "pts_key", "jdate", "use_src",
+        "gal_contam", "mp_flg", "pts_key", "jdate", "use_src", "err_maj", "j_msigcom",
+        "h_msigcom", "k_msigcom",
     ),
 }  # fmt: skip
 
 _BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
+_ERRORS = {"J": "j_msigcom", "H": "h_msigcom", "Ks": "k_msigcom"}
 
 
 def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
@@ -41,6 +43,8 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     second = "Ks" if "Ks" not in weights else "H" if "H" not in weights else "J"
     colour = "J-H" if second == "Ks" else "J-Ks"
     blended = _any_flag(records, "bl_flg", b"23456789", weights)
+    epoch_jyear = 2000.0 + (records["jdate"] - 2451545.0) / 365.25
+    error_mas = 1000.0 * known(records["err_maj"])
     return {
         "star_id": number,
         "designation": pc.binary_join_element_wise(
@@ -48,8 +52,15 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
         ),
         "ra_deg": records["ra"],
         "dec_deg": records["dec"],
-        "epoch_jyear": 2000.0 + (records["jdate"] - 2451545.0) / 365.25,
+        "epoch_jyear": epoch_jyear,
+        "ra_error_mas": error_mas,  # the larger axis of the ellipse for both
+        "dec_error_mas": error_mas,
+        "ra_central_jyear": epoch_jyear,
+        "dec_central_jyear": epoch_jyear,
         "mag": magnitudes(records, band),
+        "mag_error": np.sqrt(
+            sum((weight * known(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
+        ),
         "band": band,
         "second_mag": mags[second],
         "second_band": second,

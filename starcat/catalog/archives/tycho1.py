@@ -9,16 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.catalog.archives.hipparcos import shared_columns
-from starcat.catalog.archives.tycho2 import tycho_identity
+from starcat.catalog.archives.hipparcos import ASTROMETRY, shared_columns
+from starcat.catalog.archives.tycho2 import tycho_identity, tycho_magnitude_error
 from starcat.catalog.readers.records import Records
 from starcat.catalog.stars import Columns, join_flags, where_known
 from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "tyc_main": (
-        "tyc1", "tyc2", "tyc3", "proxy", "v_mag", "ra_deg", "de_deg", "dubious", "pm_ra", "pm_de",
-        "bt_mag", "r_bt_mag", "vt_mag", "b_v", "q", "vt_max", "vt_min", "var", "var_flag",
+        "tyc1", "tyc2", "tyc3", "proxy", "v_mag", *ASTROMETRY, "dubious", "bt_mag", "r_bt_mag",
+        "e_bt_mag", "vt_mag", "e_vt_mag", "b_v", "q", "vt_max", "vt_min", "var", "var_flag",
         "mult_flag", "hip", "hd", "remark",
     ),
 }  # fmt: skip
@@ -45,6 +45,7 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
         "designation": designation,
         "band": band,
         "second_band": second,
+        "mag_error": tycho_magnitude_error(records, band),
         **_duplicity(records),
         **_variability(records),
         "hip_number": records["hip"],

@@ -16,19 +16,22 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.photometry import johnson_v
+from starcat.catalog.photometry import JOHNSON_SLOPE, johnson_v
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags
+from starcat.catalog.stars import Columns, join_flags, known
 from starcat.catalog.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
     "tyc2": (
-        "tyc1", "tyc2", "tyc3", "pflag", "ra_mean_deg", "de_mean_deg", "pm_ra", "pm_de", "bt_mag",
-        "vt_mag", "prox", "hip", "ccdm", "ra_deg", "de_deg", "ep_ra_1990", "ep_de_1990", "posflg",
+        "tyc1", "tyc2", "tyc3", "pflag", "ra_mean_deg", "de_mean_deg", "pm_ra", "pm_de",
+        "e_ra_mean", "e_de_mean", "e_pm_ra", "e_pm_de", "ep_ra_mean", "ep_de_mean", "bt_mag",
+        "e_bt_mag", "vt_mag", "e_vt_mag", "prox", "hip", "ccdm", "ra_deg", "de_deg", "ep_ra_1990",
+        "ep_de_1990", "e_ra", "e_de", "posflg",
     ),
     "suppl_1": (
-        "tyc1", "tyc2", "tyc3", "flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "mflag", "bt_mag",
-        "vt_mag", "prox", "hip", "ccdm",
+        "tyc1", "tyc2", "tyc3", "flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "e_ra", "e_de",
+        "e_pm_ra", "e_pm_de", "mflag", "bt_mag", "e_bt_mag", "vt_mag", "e_vt_mag", "prox", "hip",
+        "ccdm",
     ),
 }  # fmt: skip
 
@@ -69,7 +72,10 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
         "designation": designation,
         "pm_ra_cosdec_mas_yr": records["pm_ra"],
         "pm_dec_mas_yr": records["pm_de"],
+        "pm_ra_error_mas_yr": known(records["e_pm_ra"]),
+        "pm_dec_error_mas_yr": known(records["e_pm_de"]),
         "mag": mag,
+        "mag_error": tycho_magnitude_error(records, band),
         "band": band,
         "second_mag": records["bt_mag" if band != "BT" else "vt_mag"],
         "second_band": "BT" if band != "BT" else "VT",
@@ -94,6 +100,10 @@ def _place_tyc2(records: Records) -> dict[str, Any]:
         "ra_deg": np.where(no_mean, records["ra_deg"], records["ra_mean_deg"]),
         "dec_deg": np.where(no_mean, records["de_deg"], records["de_mean_deg"]),
         "epoch_jyear": np.where(no_mean, observed_jyear, 2000.0),
+        "ra_error_mas": known(np.where(no_mean, records["e_ra"], records["e_ra_mean"])),
+        "dec_error_mas": known(np.where(no_mean, records["e_de"], records["e_de_mean"])),
+        "ra_central_jyear": np.where(no_mean, observed_jyear, records["ep_ra_mean"]),
+        "dec_central_jyear": np.where(no_mean, observed_jyear, records["ep_de_mean"]),
         "is_photocentre": photocentre,
         "double_flags": {
             "pflag": (records["pflag"] == b"P", records["pflag"]),
@@ -108,6 +118,10 @@ def _place_suppl(records: Records) -> dict[str, Any]:
         "ra_deg": records["ra_deg"],
         "dec_deg": records["de_deg"],
         "epoch_jyear": 1991.25,
+        "ra_error_mas": known(records["e_ra"]),
+        "dec_error_mas": known(records["e_de"]),
+        "ra_central_jyear": 1991.25,
+        "dec_central_jyear": 1991.25,
         "is_photocentre": nowhere,
         "double_flags": {"pflag": (nowhere, None)},
     }
@@ -129,6 +143,14 @@ def _magnitudes(records: Records, band: str) -> tuple[Array, dict[Quality, Mask]
         Quality.COLOUR_OUT_OF_RANGE: v.is_out_of_range,
     }
     return v.mag, bits
+
+
+def tycho_magnitude_error(records: Records, band: str) -> Array:
+    """Return the errors of the magnitudes of Tycho records; NaN where V is an estimate."""
+    bt_error, vt_error = known(records["e_bt_mag"]), known(records["e_vt_mag"])
+    if band == "V":
+        return np.hypot((1.0 + JOHNSON_SLOPE) * vt_error, JOHNSON_SLOPE * bt_error)
+    return bt_error if band == "BT" else vt_error
 
 
 def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from queue import Empty, SimpleQueue
 from tarfile import TarError
 from tarfile import open as open_tar
@@ -231,9 +231,17 @@ def pack(root: Path, *folders: Path) -> bytes:
 
 
 def unpack(archive: bytes, root: Path) -> None:
-    """Unpack an archive of plain files, which all lie below its root."""
+    """Unpack an archive of folders and plain files, which all lie below its root."""
     with open_tar(fileobj=BytesIO(archive)) as tar:
-        tar.extractall(root, filter="data")
+        for member in tar:
+            path = PurePosixPath(member.name)
+            data = tar.extractfile(member) if member.isfile() else None
+            if path.is_absolute() or ".." in path.parts or not (data or member.isdir()):
+                raise TarError(f"{member.name!r} is no plain file below the archive's root")
+            target = root / path
+            (target.parent if data else target).mkdir(parents=True, exist_ok=True)
+            if data:
+                target.write_bytes(data.read())
 
 
 def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> None:

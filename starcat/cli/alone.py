@@ -1,0 +1,129 @@
+"""What the command ``starcat`` does where only numpy, h5py and cffi are installed: it identifies.
+
+As ``starcat-matcher`` has it, or an installation whose libraries are missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcat.errors import StarcatError
+from starcat.version import __version__, lacking
+
+if TYPE_CHECKING:
+    from starcat.matcher.result import MatchResult
+
+FOV_ERROR = 0.05
+"""As ``starcat identify`` has it, for methods that find the scale themselves."""
+
+USAGE = 2
+
+
+def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
+    """Run ``identify``; of any other command say that it is not there. Returns the exit code."""
+    command = next((word for word in arguments if not word.startswith("-")), "")
+    if command not in ("", "identify"):
+        return _refused(lacking(f"starcat {command}", missing), USAGE)
+    try:
+        given = _parser().parse_args(list(arguments) or ["--help"])
+        _identify(given.database, given.frames, given.fov_error, as_lines=given.json)
+    except StarcatError as error:
+        return _refused(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        return _refused(lacking("starcat identify", error), USAGE)
+    except BrokenPipeError:  # the reader of the output is gone
+        return 1
+    return 0
+
+
+def _refused(text: str, code: int) -> int:
+    sys.stderr.write(f"starcat: error: {text}\n")
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "starcat",
+        description="Identifies stars. All other commands are in starcat-guide-stars, which also "
+        "reads pictures and other cameras than the database's.",
+    )
+    parser.add_argument("--version", action="version", version=f"starcat {__version__} (matcher)")
+    identify = parser.add_subparsers(metavar="identify").add_parser(
+        "identify", description="Identify the stars of frames and find the camera's attitude."
+    )
+    identify.add_argument("database", help="the folder <name>-<version>, or an onboard image")
+    identify.add_argument("frames", nargs="+", type=Path, help="centroids: CSV or JSON")
+    identify.add_argument(
+        "--fov-error", type=float, metavar="0.05", help="error of the focal length that is allowed"
+    )
+    identify.add_argument("--json", action="store_true", help="JSON, a line a frame")
+    return parser
+
+
+def _identify(
+    database: str, files: Sequence[Path], fov_error: float | None, *, as_lines: bool
+) -> None:
+    from starcat.matcher.centroids import read_frames
+    from starcat.matcher.matcher import Matcher
+    from starcat.matcher.settings import SCALE_FREE
+
+    matcher = Matcher.open(database, None)
+    default = FOV_ERROR if matcher.method in SCALE_FREE else 0.0
+    error = default if fov_error is None else fov_error
+    for frame in (frame for path in files for frame in read_frames(path)):
+        found = matcher.identify(
+            frame.centroids_px, magnitudes=frame.mag, sigma_px=frame.sigma_px, fov_error=error
+        )
+        if as_lines:
+            sys.stdout.write(json.dumps(_content(frame.name, found)) + "\n")
+        else:
+            sys.stdout.write(_told(frame.name, found))
+    sys.stdout.flush()
+
+
+def _content(name: str, found: MatchResult) -> dict[str, Any]:
+    """Return an answer with the keys that ``starcat identify --json`` has."""
+    content: dict[str, Any] = {"frame": name, "status": found.status, "n_matched": found.n_matched}
+    if found.refusal is not None:
+        why = found.refusal
+        return content | {
+            "refusal": {"reason": why.reason, "words": why.message, "advice": why.hint}
+        }
+    stars = found.stars
+    numbers = ("x_px", "y_px", "mag", "ra_deg", "dec_deg", "dx_px", "dy_px")
+    columns = {key: getattr(stars, key).tolist() for key in numbers}
+    columns |= {"star": list(stars.star), "star_id": [str(number) for number in stars.star_id]}
+    return content | {
+        "boresight_ra_deg": found.boresight_ra_deg,
+        "boresight_dec_deg": found.boresight_dec_deg,
+        "roll_deg": found.roll_deg,
+        "q_body_from_icrs": found.q_body_from_icrs.tolist(),
+        "residual_arcsec": found.residual_arcsec,
+        "false_match_probability": found.false_match_probability,
+        "stars": [
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+        ],
+    }
+
+
+def _told(name: str, found: MatchResult) -> str:
+    lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
+    if found.refusal is not None:
+        lines.append(f"  {found.refusal.message}; try: {found.refusal.hint}")
+    if found.ok:
+        stars = found.stars
+        quaternion = ", ".join(f"{value:+.7f}" for value in found.q_body_from_icrs)
+        lines.append(f"  q_body_from_icrs {quaternion}")
+        lines += [
+            f"  {x:9.2f} {y:9.2f}  {mag:6.2f}  {ra:10.5f} {dec:+10.5f}  {star}"
+            for x, y, mag, ra, dec, star in zip(
+                stars.x_px, stars.y_px, stars.mag, stars.ra_deg, stars.dec_deg, stars.star,
+                strict=True,
+            )
+        ]  # fmt: skip
+    return "\n".join([*lines, *(f"  remark: {remark}" for remark in found.remarks)]) + "\n"
