@@ -13,13 +13,14 @@ from starcat.arrays import Array
 NONE_BRIGHTER = float("-inf")
 
 _GAIA = ((NONE_BRIGHTER, 0.15), (3.0, 0.05), (4.0, 0.01), (6.0, 0.004), (17.0, 0.02))
+_GAIA_COLOUR = ((NONE_BRIGHTER, 0.15), (3.0, 0.05), (4.0, 0.004), (17.0, 0.02))
 _TYCHO = ((NONE_BRIGHTER, 0.05), (2.0, 0.012), (9.0, 0.03), (10.0, 0.07), (11.0, 0.15))
 _TWOMASS = ((NONE_BRIGHTER, 0.20), (4.5, 0.03), (14.0, 0.1))
 
 ERRORS_MAG = {
-    # Riello et al. 2021, A&A 649, A3, sections 8 and appendix C: saturation below 6 mag is
-    # corrected for in part; below 3 mag the detectors are saturated in every mode.
-    "G": _GAIA, "BP": _GAIA, "RP": _GAIA,
+    # Riello et al. 2021, A&A 649, A3, appendix C: saturation shifts G brighter than 6 mag by about
+    # 0.01, and BP and RP brighter than 4; below 3 mag nothing is certain.
+    "G": _GAIA, "BP": _GAIA_COLOUR, "RP": _GAIA_COLOUR,
     # ESA SP-1200, volume 1, section 1.3 and Hog et al. 2000, A&A 355, L27, table 1
     "Hp": ((NONE_BRIGHTER, 0.002),), "BT": _TYCHO, "VT": _TYCHO,
     "V": ((NONE_BRIGHTER, 0.01), (9.0, 0.02)), "B": ((NONE_BRIGHTER, 0.015), (9.0, 0.03)),
@@ -45,5 +46,5 @@ def band_error(band: str, mag: Array, source: str = "") -> Array:
 
 
 def variability_error(amplitude_mag: Array) -> Array:
-    """Return the standard deviation that an amplitude (whole range) makes; 0 where none is known."""
+    """Return the standard deviation that a whole range makes; 0 where none is known."""
     return np.asarray(AMPLITUDE_SHARE * np.nan_to_num(amplitude_mag, nan=0.0))

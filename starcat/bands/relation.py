@@ -43,7 +43,6 @@ TYPE_WIDTH, CLASS_WIDTH = 1.5, 0.7
 """Subclasses and luminosity classes that a spectral type spreads over."""
 
 
-
 @dataclass(frozen=True)
 class Prediction:
     """Magnitudes in a sensor's band."""
@@ -69,6 +68,7 @@ class Relation:
     band_mag: Array  # shape (G,): from errors of the passbands and their zero points
     typical_offset_mag: float  # without a colour
     typical_scatter_mag: float
+    typical_error_mag: float  # the error of the relation at common colours
 
     @property
     def error_mag(self) -> Array:
@@ -142,6 +142,8 @@ def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
     excess = shares - at_spectrum[..., None] * by_colour
     calibration = 1.0857 * np.sqrt(np.sum((excess * _zone_deviations()) ** 2, axis=2)).ravel()
     typical = float(np.sum(weight.ravel() * y))
+    band = each @ _band_variance(shipped(base), target) / total
+    at_colour = scatter**2 + each @ calibration**2 / total + band
     return Relation(
         base=base,
         colour=colour,
@@ -150,10 +152,11 @@ def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
         offset_mag=offset,
         slope=slope,
         scatter_mag=scatter,
-        calibration_mag=each @ calibration / total,
-        band_mag=np.sqrt(each @ _band_variance(shipped(base), target) / total),
+        calibration_mag=np.sqrt(each @ calibration**2 / total),
+        band_mag=np.sqrt(band),
         typical_offset_mag=typical,
         typical_scatter_mag=float(np.sqrt(np.sum(weight.ravel() * (y - typical) ** 2))),
+        typical_error_mag=float(np.sqrt(weight.ravel() @ np.interp(x, grid, at_colour))),
     )
 
 
@@ -161,7 +164,7 @@ def _band_variance(base: Response, target: Response) -> Array:
     """Return the variance that errors of two passbands make for each spectrum, shape (E * T,)."""
     if base is target:
         return np.zeros(library().weight.size)
-    variance = ZERO_POINT_MAG**2
+    variance = np.full(library().weight.shape, ZERO_POINT_MAG**2)
     for one in (base, target):
         shifted = replace(one, wavelength_nm=one.wavelength_nm * (1.0 + PASSBAND_SHARE))
         variance = variance + (magnitudes(shifted) - magnitudes(one)) ** 2
@@ -233,4 +236,5 @@ def combined(predictions: list[Prediction]) -> Prediction:
         mag = np.sum(np.where(counted, mags, 0.0) * weight, axis=0) / total
         error = np.sqrt(1.0 / total)
     has_colour = np.any(np.stack([one.has_colour for one in predictions]) & counted, axis=0)
-    return Prediction(mag, error, known.any(axis=0) & ~inside.any(axis=0), has_colour)
+    is_outside = np.asarray(known.any(axis=0) & ~inside.any(axis=0))
+    return Prediction(mag, error, is_outside, np.asarray(has_colour))

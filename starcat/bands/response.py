@@ -16,7 +16,7 @@ from typing import Literal, cast
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, quoted, suggest
+from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
 from starcat.resources import resource_folder
 
 Counts = Literal["photon", "energy"]
@@ -103,8 +103,7 @@ def _fault(wavelength: Array, value: Array) -> str | None:
         )
     if not 3 <= len(wavelength) <= MOST_ROWS:
         return (
-            f"{len(wavelength)} wavelengths; a curve needs 3 at least and {MOST_ROWS:,} at the "
-            "most"
+            f"{len(wavelength)} wavelengths; a curve needs 3 at least and {MOST_ROWS:,} at the most"
         )
     missing = ~(np.isfinite(wavelength) & np.isfinite(value))
     if missing.any():
@@ -177,11 +176,11 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
         elif line.strip():
             row = _row(name, number, line, is_first=not rows)
             rows += [row] if row else []
-    said = counts or remarks.get("counts")
+    said = counts or remarks.get("counts", "")
     if said not in ("photon", "energy"):
         raise ConfigError(
-            f"response {name}: it does not say what it is relative to; set per = \"photon\" "
-            "(quantum efficiency) or \"energy\" (A/W)",
+            f'response {name}: it does not say what it is relative to; set per = "photon" '
+            '(quantum efficiency) or "energy" (A/W)',
             key="per",
         )
     columns = np.array(rows, dtype=np.float64).reshape(-1, 2)
@@ -194,6 +193,22 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
         title=remarks.get("title", ""),
         source=remarks.get("source", ""),
     )
+
+
+def read_response(path: Path, per: str | None) -> Response:
+    """Return the response of a CSV file, which a spec says what it is relative to."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileMissing(
+            f"{path}: no such response; 'starcat bands' lists those that ship with starcat"
+        ) from None
+    except (OSError, ValueError) as error:
+        why = reason(error) if isinstance(error, OSError) else error
+        raise ConfigError(f"{path}: not a readable CSV file: {why}", key="response") from error
+    if per not in (None, "photon", "energy"):
+        raise ConfigError(f"per {per!r}: choose photon or energy", key="per", value=per)
+    return response_from_text(path.stem, text, cast("Counts | None", per))
 
 
 def _row(name: str, number: int, line: str, *, is_first: bool) -> tuple[float, float] | None:
@@ -236,7 +251,7 @@ def shipped(name: str) -> Response:
         hint = suggest(name, known)
         raise ConfigError(
             f"unknown response {name!r}; {hint}known ones: {', '.join(known)}. 'starcat bands' "
-            "tells what they are; your own is a CSV: file = \"sensor.csv\"",
+            'tells what they are; your own is a CSV: file = "sensor.csv"',
             key="response",
             value=name,
         )

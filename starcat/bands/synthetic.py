@@ -11,7 +11,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.bands.response import LIMITS_NM, Response, shipped
 from starcat.bands.spectra import library, parsed_type
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError
 
 AB_ZERO = 3.631e-20
 """erg/s/cm2/Hz of an AB magnitude of 0 (Oke and Gunn 1983, ApJ 266, 713)."""
@@ -62,10 +62,9 @@ def type_row(text: str) -> int:
     types = library().types
     name = text.lower()
     if name not in types:
-        hint = suggest(name, types)
+        near = [one.upper() for one in types if one[0] == name[0]]
         raise ConfigError(
-            f"zero point: no spectrum of the type {text!r}; {hint}the library has "
-            f"{', '.join(types[:6])}, ... (docs/bands.md)",
+            f"zero point: no spectrum of the type {text!r}; the library has {', '.join(near)}",
             key="zero_point",
             value=text,
         )
@@ -78,8 +77,8 @@ def checked_zero_point(text: str) -> str:
         return "vega 0"
     if np.isnan(parsed_type(text)[0]):
         raise ConfigError(
-            f"zero point: found {text!r}; expected 'vega' (Vega has magnitude 0) or a spectral type "
-            "such as A0V (a star of it has the magnitude that it has in V)",
+            f"zero point: found {text!r}; expected 'vega' (Vega has magnitude 0) or a spectral "
+            "type such as A0V (a star of it has the magnitude that it has in V)",
             key="zero_point",
             value=text,
         )

@@ -1,8 +1,8 @@
 """Compares magnitudes predicted from one catalog with those measured by another.
 
 ``python tests/builders/band_pairs.py CATALOGS`` prints the table of docs/bands.md, from the genuine
-records of a folder (``hip_main.dat.gz``, ``psc_measured.gz``) and the embedded sky. The stars are
-single and constant: no entry in CCDM, one component, and H52 is C or blank.
+records of a folder (``hip_main.dat.gz``, ``tyc_main.dat.gz``, ``psc_measured.gz``) and the embedded
+sky. The stars are single and constant: no entry in CCDM, one component, and H52 is C or blank.
 """
 
 from __future__ import annotations
@@ -65,28 +65,42 @@ class Pair:
 
 
 @cache
-def measured(catalogs: Path) -> dict[str, Array]:
-    """Return the magnitudes of single, constant Hipparcos stars in every band, NaN where none."""
-    path = catalogs / "hip_main.dat.gz"
+def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Array]:
+    """Return the magnitudes of single, constant stars in every band, NaN where none.
+
+    They are stars of Hipparcos to V 6.6. Few of them are faint enough for 2MASS: what is measured
+    there is compared for stars of Tycho-1 to V 8.
+    """
+    source, name = ("tycho1", "tyc_main.dat.gz") if infrared else ("hipparcos", "hip_main.dat.gz")
     found = {}
-    for band in ("V", "Hp", "BT", "VT"):
-        stars = _read("hipparcos", path, band, 2016.0)
+    for band in ("V", "BT", "VT") if infrared else ("V", "BT", "VT", "Hp"):
+        stars = _read(source, catalogs / name, band, 2016.0)
         found[band] = floats_of(stars, "mag")
     found["B"] = floats_of(stars, "colour_mag") + found["V"]
-    kept = np.isin(stars["star_id"].to_numpy(), single_and_constant(path))
+    if infrared:
+        found["Hp"] = np.full(len(stars), np.nan)
+        kept = ~(stars["is_flagged_double"].to_numpy() | stars["is_flagged_variable"].to_numpy())
+    else:
+        kept = np.isin(stars["star_id"].to_numpy(), single_and_constant(catalogs / name))
     gaia = _read("gaia", embedded_sky(), None, 2016.0)
     place, near = _nearest(directions_of(stars), directions_of(gaia))
     near &= gaia["star_id"].to_numpy()[place] > 0  # not those that Hipparcos itself supplied
     found["G"] = np.where(near, floats_of(gaia, "mag")[place], np.nan)
     found["BP"] = np.where(near, floats_of(gaia, "second_mag")[place], np.nan)
     found["RP"] = found["BP"] - floats_of(gaia, "colour_mag")[place]
-    u = directions_of(_read("hipparcos", path, "V", 1999.5))
-    for band in ("J", "H", "Ks"):
-        psc = _read("2mass", catalogs / "psc_measured.gz", band, None)
-        sound = psc["quality_flags"].to_numpy() & NOT_SOUND == 0
-        place, near = _nearest(u, directions_of(psc))
-        found[band] = np.where(near & sound[place], floats_of(psc, "mag")[place], np.nan)
+    found |= _infrared(catalogs, directions_of(_read(source, catalogs / name, "V", 1999.5)))
     return {band: mag[kept] for band, mag in found.items()}
+
+
+def _infrared(catalogs: Path, u: Array) -> dict[str, Array]:
+    """Return the 2MASS magnitudes at directions of 1999.5, where all three are sound."""
+    read = {b: _read("2mass", catalogs / "psc_measured.gz", b, None) for b in ("J", "H", "Ks")}
+    flags = np.bitwise_or.reduce([one["quality_flags"].to_numpy() for one in read.values()])
+    place, near = _nearest(u, directions_of(read["J"]))
+    near &= (flags & NOT_SOUND == 0)[place]
+    return {
+        band: np.where(near, floats_of(one, "mag")[place], np.nan) for band, one in read.items()
+    }
 
 
 def single_and_constant(path: Path) -> list[int]:
@@ -135,17 +149,22 @@ def pair(stars: dict[str, Array], source: str, target: str) -> Pair:
 
 def table(catalogs: Path) -> str:
     """Return the table of all pairs, as docs/bands.md has it."""
-    stars = measured(catalogs)
+    optical, infrared = measured(catalogs), measured(catalogs, infrared=True)
     lines = ["| from | " + " | ".join(TARGETS) + " |", "|---" * (len(TARGETS) + 1) + "|"]
-    for source, (base, _) in SOURCES.items():
+    for source, (base, colour) in SOURCES.items():
         cells = []
         for target in TARGETS:
-            if target == base:
+            if target == base or (target in colour and base in colour):
                 cells.append("")
                 continue
-            found = pair(stars, source, target)
+            is_infrared = {target, base} & {"J", "H", "Ks"}
+            found = pair(infrared if is_infrared else optical, source, target)
+            if not len(found.residual_mag):
+                cells.append("")
+                continue
             bias = float(np.median(found.residual_mag))
-            cells.append(f"{found.rms_mag:.3f} ({bias:+.3f}, {found.chi_square:.2f})")
+            count = len(found.residual_mag)
+            cells.append(f"{found.rms_mag:.3f} ({bias:+.3f}, {found.chi_square:.1f}, {count:,})")
         lines.append(f"| {source} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

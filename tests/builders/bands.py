@@ -12,6 +12,7 @@ import gzip
 import re
 import sys
 import tarfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -72,13 +73,14 @@ def library(path: Path) -> dict[str, Array]:
 def deviations(spectra: dict[str, Array]) -> Array:
     """Return the library's relative deviation at each row of the table."""
     at_row = np.empty(len(WAVELENGTH_NM))
-    for low, high in zip(ZONES_NM[:-1], ZONES_NM[1:], strict=True):
+    for low, high in pairwise(ZONES_NM):
         found = []
         for wavelength, flux, deviation in spectra.values():
             known = (wavelength >= low) & (wavelength < high) & (deviation > 0) & (flux > 0)
             if known.sum() > 5:
                 found.append(np.sqrt(np.mean((deviation[known] / flux[known]) ** 2)))
-        at_row[(WAVELENGTH_NM >= low) & (WAVELENGTH_NM < high)] = np.median(found)
+        in_zone = np.searchsorted(ZONES_NM, WAVELENGTH_NM, side="right") == 1 + ZONES_NM.index(low)
+        at_row[in_zone] = np.median(found)
     return at_row
 
 
