@@ -122,7 +122,9 @@ def spec_page() -> str:
         page.append("| key | unit | range | default | example | meaning |\n" + "|---" * 6 + "|")
         for key in section.keys:
             cells = (f"`{key.name}`", key.unit or key.kind, key.range, _default(key), _example(key))
-            page.append(f"| {' | '.join(cells)} | {key.description} |")
+            # A bar within a cell, as in a pattern, would end it.
+            row = " | ".join(cell.replace("|", r"\|") for cell in (*cells, key.description))
+            page.append(f"| {row} |")
         page.append("")
     return "\n".join(page)
 
