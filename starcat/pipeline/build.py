@@ -156,7 +156,9 @@ def _make(
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
     sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(
+        spec, sources, products, facts, fields, filters, rates, selected.neighbours
+    )
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)

@@ -67,7 +67,7 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()
     most = spec.selection.max_stars_per_field
-    check_tiling(len(stars), spec, most)
+    check_tiling(int(np.searchsorted(mag, spec.selection.faint_limit_mag, "right")), spec, most)
     if len(stars) < MIN_GUIDE_STARS:
         thinned_stars(read.stars, spec)  # says so, in the words of the build
     selected = thinned_stars(stars, spec)
@@ -88,6 +88,8 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
 
 def _faintest(selection: Selection) -> float:
     """Return the magnitude beyond which a star is too faint, and nobody's companion."""
+    if selection.neighbours.is_on:
+        return np.inf
     companions = selection.doubles.companion_limit_mag
     return max(selection.faint_limit_mag, -np.inf if companions is None else companions)
 

@@ -36,7 +36,7 @@ def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars
 
 def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
     """Select guide stars, and thin them if the spec says so."""
-    selected = select_guide_stars(stars, spec.selection)
+    selected = select_guide_stars(stars, spec.selection, spec.camera.camera().pixel_arcsec)
     check_guide_stars(selected, spec)
     most = spec.selection.max_stars_per_field
     if most is not None:
