@@ -125,16 +125,9 @@ self_test = { frames = 5, min_identified = 0.8 }
 @pytest.fixture(scope="session")
 def sao_lines() -> list[bytes]:
     """600 records in the layout of SAO, of stars that do not exist, V 2.0 to 6.4."""
-    generator = np.random.default_rng(600)
-    ra_rad = generator.uniform(0.0, 2.0 * np.pi, 600)
-    dec_rad = np.arcsin(generator.uniform(-1.0, 1.0, 600))
-    lines = []
-    for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
-        mag = 2.0 + 4.4 * number / 600
-        front = f"{number:6d}".ljust(80) + f"{mag:4.1f}A0V"
-        motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
-        lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
-    return lines
+    from archives import plain_sao
+
+    return plain_sao(600)
 
 
 @pytest.fixture

@@ -32,12 +32,15 @@ class Reason(Enum):
     uncertain_magnitude = "the magnitude may be wrong by more than 0.3 mag"
     too_bright = "brighter than bright_limit_mag"
     too_faint = "fainter than faint_limit_mag"
-    distrusted = "distrusted by what flew: [selection.observed] lists it"
     double = "a companion within min_separation_deg"
+    blended = (
+        "neighbours move its centroid or add to its light more than [selection.neighbours] allows"
+    )
     merged = "merged into the brighter star of a close group"
     flagged_double = "the archive flags an unresolved double"
     variable = "amplitude above max_amplitude_mag"
     flagged_variable = "flagged variable, amplitude unknown"
+    distrusted = "distrusted by what flew: [selection.observed] lists it"
     beyond_count = "fainter than the brightest max_stars"
     density = "in no field among the brightest max_stars_per_field"
 

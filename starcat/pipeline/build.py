@@ -29,7 +29,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
-from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
 from starcat.pipeline.recipes import (
@@ -158,7 +158,9 @@ def _make(
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
     sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(
+        spec, sources, products, facts, fields, filters, rates, selected.neighbours
+    )
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -166,6 +168,7 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),
