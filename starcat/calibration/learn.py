@@ -95,23 +95,9 @@ def learn(
 ) -> Lesson:
     """Fit the terms of the sensor and judge the stars.
 
-    Parameters
-    ----------
-    sightings : Sightings
-        What ``n_frames`` identified frames show of their stars.
-    stars : SkyStars
-        The stars of the database.
-    by_frame : bool, default False
-        Whether every frame has an offset of its own, such as with exposures that differ.
-    min_frames : int, default 3
-        Fewest frames that a star is judged from.
-    colour_term : float, default 0
-        That the magnitudes of the database have already; it bears on stars of unknown colour.
-
-    Returns
-    -------
-    Lesson
-        Terms, noise, a record of each star, and those to distrust.
+    With ``by_frame`` every frame has an offset of its own, as where exposures differ.
+    ``colour_term`` is what the magnitudes of the database have already; it bears on stars of
+    unknown colour.
     """
     found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
     if found < FEWEST_STARS:
