@@ -46,6 +46,7 @@ from starcat.pipeline.report_data import (
     filter_coverages,
     report_content,
 )
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
@@ -138,6 +139,8 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
+    in_band = in_band_of(stars, spec, workers)
+    stars = in_band.stars
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)
@@ -156,7 +159,7 @@ def _make(
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
     sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(spec, sources, products, facts, fields, filters, rates, in_band.made)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -164,6 +167,7 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *in_band.notes,
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),
@@ -224,7 +228,7 @@ def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     coverage = coverage_report(counted, spec)
     content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", content, coverage)
+    write_report(folder / "report", content, coverage, results.in_band)
     for warning in content["warnings"]:
         _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
     return coverage

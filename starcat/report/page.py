@@ -46,8 +46,10 @@ _ALT = {
 }
 
 
-def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page."""
+def report_page(
+    content: Mapping[str, Any], plots: Mapping[str, bytes], more: Sequence[str] = ()
+) -> str:
+    """Return the report of a build as an HTML page, with more sections after the selection."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -59,6 +61,7 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         "<h2>Selection</h2>",
         _filters(content["filters"]),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
+        *more,
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.specs.camera_response import CameraResponse
 from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
@@ -24,7 +25,7 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions")
+LATER_KEYS = ("products.levels", "catalog.motions", "camera.response")
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -151,6 +152,7 @@ class CameraSpec(Section):
     pixel_um: float | None = Field(
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
     )
+    response: CameraResponse = CameraResponse()
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
