@@ -12,8 +12,11 @@ import bands as builder
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from starcat.bands.catalogs import BANDS_AND_COLOURS, best_relation
+from starcat.bands.exposure import PHOTONS_S_MM2, Exposure, photons_s_mm2
 from starcat.bands.relation import Prediction, combined, predict_by_type, relation
 from starcat.bands.response import (
     checked_response,
@@ -27,6 +30,7 @@ from starcat.bands.synthetic import checked_zero_point, magnitudes
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.stars import table_from_columns
 from starcat.errors import ConfigError, FileMissing
+from starcat.images.render import Optics, star_electrons
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
 from starcat.resources import resource_folder
@@ -278,6 +282,62 @@ def test_a_file_is_read_only_with_a_spec_that_is_a_file(tmp_path):
     content["camera"]["response"] = {"name": "own", "file": "/etc/passwd"}
     with pytest.raises(ConfigError, match="where the spec is a file on this machine"):
         spec_from_dict(content, "form")
+
+
+EXPOSURE = """
+[camera.exposure]
+aperture_mm = 20.0
+quantum_efficiency = 0.5
+exposure_s = 0.1
+read_noise_e = 8.0
+full_well_e = 50000.0
+psf_sigma_px = 0.8
+dark_e_s = 50.0
+"""
+
+
+def test_photons_are_those_that_are_known():
+    # Bessell, Castelli and Plez 1998, table A2: 995.5 photons/s/cm2/A at V = 0, over 900 A or so.
+    assert photons_s_mm2(shipped("V")) == pytest.approx(995.5 * 900 / 100, rel=0.05)
+    assert photons_s_mm2(None) == PHOTONS_S_MM2
+
+
+@given(st.floats(1.0, 1e9), st.floats(0.0, 1e4), st.floats(0.0, 1e3), st.floats(0.5, 100.0))
+def test_a_limit_is_where_the_signal_to_noise_is(zero_point, background, noise, wanted):
+    exposure = Exposure(zero_point, background, noise, 1.0, 1e5)
+    found = exposure.signal_to_noise(np.array([exposure.limit_mag(wanted)]))
+    assert found[0] == pytest.approx(wanted, rel=1e-9)
+
+
+def test_a_saturated_pixel_holds_its_full_well():
+    exposure = Exposure(1e6, 10.0, 5.0, 0.8, 50_000.0)
+    star = (np.array([[4.5, 4.5]]), np.array([exposure.saturation_mag]))
+    light = star_electrons(*star, (9, 9), Optics(0.8, 1e6))
+    assert light.max() + 10.0 == pytest.approx(50_000.0, rel=1e-3)
+
+
+def test_limits_follow_from_an_exposure(tmp_path):
+    asked = 'name = "silicon-cmos"' + EXPOSURE + "min_snr = 5.0\nreject_saturated = true\n"
+    path = tmp_path / "spec.toml"
+    path.write_text((SPEC + asked).replace("faint_limit_mag = 4.5\n", ""), encoding="utf-8")
+    spec = read_spec(path)
+    exposure = spec.camera.exposure.exposure(spec.camera.response.response())
+    assert spec.selection.faint_limit_mag == round(exposure.limit_mag(5.0), 2)
+    assert spec.selection.bright_limit_mag == round(exposure.saturation_mag, 2)
+    assert spec_from_dict(spec.recorded(), "manifest") == spec
+    assert spec.exposure_notes == ()
+    with pytest.raises(ConfigError, match=r"camera\.exposure\.min_snr makes it 9"):
+        spec_of(tmp_path, asked)
+
+
+def test_an_exposure_that_contradicts_the_limits_is_told(tmp_path):
+    plain = spec_of(tmp_path, EXPOSURE)
+    assert [note.split(" ")[0] for note in plain.exposure_notes] == ["stars"]
+    assert "reject_saturated" in plain.exposure_notes[0]
+    deep = read_spec(tmp_path / "spec.toml", {"selection.faint_limit_mag": "12"})
+    assert "selection.faint_limit_mag 12 is beyond the sensor" in deep.exposure_notes[0]
+    with pytest.raises(ConfigError, match="full_well_e, psf_sigma_px missing or 0"):
+        spec_of(tmp_path, EXPOSURE[: EXPOSURE.index("full_well")])
 
 
 def star_table(count: int, **columns: Any) -> pa.Table:

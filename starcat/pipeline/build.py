@@ -168,6 +168,7 @@ def _make(
             *catalog.notes,
             *motion_notes(spec, products),
             *in_band.notes,
+            *spec.exposure_notes,
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),

@@ -184,7 +184,7 @@ def estimate(
         tuple((step.name, len(step.directions)) for step in choice.selected.steps),
         choice.rejected,
         tuple(refusals),
-        (*read.notes, *coverage_warnings(summary, gap)),
+        (*read.notes, *spec.exposure_notes, *coverage_warnings(summary, gap)),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
 from starcat.specs.camera_response import CameraResponse
 from starcat.specs.product_sections import (
     NAME_PATTERN,
@@ -25,7 +26,7 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions", "camera.response")
+LATER_KEYS = ("products.levels", "catalog.motions", "camera.response", "camera.exposure")
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -153,6 +154,7 @@ class CameraSpec(Section):
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
     )
     response: CameraResponse = CameraResponse()
+    exposure: CameraExposure = CameraExposure()
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
@@ -251,6 +253,19 @@ class BuildSpec(Section):
     products: Products = Products()
     self_test: SelfTest = SelfTest()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_of_the_exposure(cls, content: Any) -> Any:
+        return with_limits(content)
+
+    @model_validator(mode="after")
+    def _limits_said_once(self) -> BuildSpec:
+        wanted = self.camera.exposure.limits(self.camera.response.response())
+        problem = contradiction(wanted, {key: getattr(self.selection, key) for key in wanted})
+        if problem:
+            raise ValueError(problem)
+        return self
+
     @model_validator(mode="after")
     def _counterparts_in_other_catalogs(self) -> BuildSpec:
         if self.catalog.source in self.products.crossmatch.catalogs:
@@ -288,6 +303,13 @@ class BuildSpec(Section):
                 f"at most {MOST_BINS:,} fit. Make the bins wider or radius_deg smaller"
             )
         return self
+
+    @property
+    def exposure_notes(self) -> tuple[str, ...]:
+        """What the camera's exposure says of limits that are stated as magnitudes."""
+        selection, response = self.selection, self.camera.response.response()
+        limits = (selection.faint_limit_mag, selection.bright_limit_mag)
+        return exposure_notes(self.camera.exposure, response, *limits)
 
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""
