@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from itertools import pairwise
 from pathlib import Path
@@ -9,12 +10,14 @@ from typing import Any
 
 import band_pairs
 import bands as builder
+import jsonschema
 import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from starcat.artifact.verify import check_artifact
 from starcat.bands.catalogs import BANDS_AND_COLOURS, best_relation
 from starcat.bands.exposure import PHOTONS_S_MM2, Exposure, photons_s_mm2
 from starcat.bands.relation import Prediction, combined, predict_by_type, relation
@@ -27,7 +30,7 @@ from starcat.bands.response import (
 )
 from starcat.bands.spectra import library, parsed_type
 from starcat.bands.synthetic import checked_zero_point, magnitudes
-from starcat.catalog.sensor_band import in_sensor_band
+from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.catalog.stars import table_from_columns
 from starcat.errors import ConfigError, FileMissing
 from starcat.images.render import Optics, star_electrons
@@ -377,11 +380,54 @@ def test_spectral_types_stand_in_for_colours():
     assert (np.array(made.stars["mag_error"]) >= 0.2).all()  # of visual magnitudes
 
 
+def test_another_catalog_is_averaged_in():
+    response = shipped("silicon-cmos")
+    nothing = np.array([0.5, np.nan, 9.0, 0.5])
+    stars = star_table(4, colour_mag=nothing, colour_bands="BP-RP")
+    theirs = star_table(3, mag=[5.2, 6.6, 7.0], band="V", colour_mag=[0.6] * 3, colour_bands="B-V")
+    other = other_of(theirs, np.array([1, 2, 3]), "hipparcos", response)
+    own, both = (in_sensor_band(stars, "gaia", response, more) for more in ((), [other]))
+    assert both.stars["mag_source"].to_pylist() == [
+        "G, BP-RP",
+        "G alone + hipparcos V, B-V",
+        "hipparcos V, B-V",  # the own colour is outside of the relation's
+        "G, BP-RP + hipparcos V, B-V",
+    ]
+    assert both.stars["quality_flags"].to_pylist() == [0, 0, 0, 0]
+    error = [np.array(one.stars["mag_error"]) for one in (own, both)]
+    assert error[1][0] == error[0][0]
+    assert (error[1][1:] < error[0][1:]).all()
+    assert both.stars["mag"][2].as_py() == pytest.approx(other.prediction.mag[1])
+
+
 def test_a_catalog_without_colours_is_refused():
     with pytest.raises(ConfigError, match="no star of sao has a colour or a spectral type"):
         in_sensor_band(star_table(3, band="V"), "sao", shipped("silicon-cmos"))
     with pytest.raises(ConfigError, match="the passband of 2mass '\\(J\\+H\\)/2' is unknown"):
         in_sensor_band(star_table(3, band="(J+H)/2"), "2mass", shipped("ingaas"))
+
+
+@pytest.mark.slow
+@genuine
+def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path):
+    # Vega is a Hipparcos star of the embedded sky, with a magnitude and no colour.
+    asked = 'name = "silicon-cmos"\nphotometry = ["hipparcos"]\n'
+    spec = spec_of(tmp_path, asked + "[boresights]\ncount = 500\n[self_test]\nframes = 20\n")
+    inputs = {"hipparcos": [CATALOGS / "hip_main.dat.gz"]}
+    built = build(spec, inputs, tmp_path / "dist")
+    assert built.manifest["manifest_version"] == "1.3.0"
+    schema = json.loads((resource_folder("schemas") / "manifest-1.3.0.json").read_text())
+    jsonschema.validate(built.manifest, schema)
+    stars = read_parquet(built.folder / "stars.parquet").to_pandas().set_index("designation")
+    vega = stars.loc["HIP 91262"]
+    # The zero point is Vega's, and the catalog has Hp = 0.087 for it.
+    assert vega.mag == pytest.approx(0.0, abs=0.06)
+    assert vega.mag_error < 0.1
+    told = stars["mag_source"]
+    assert told.str.contains("hipparcos").mean() > 0.9
+    roles = [source["role"] for source in built.manifest["sources"]]
+    assert roles == ["stars", "photometry"]
+    check_artifact(built.folder)
 
 
 @pytest.mark.slow

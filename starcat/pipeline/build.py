@@ -139,7 +139,7 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
-    in_band = in_band_of(stars, spec, workers)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
     stars = in_band.stars
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
@@ -157,7 +157,13 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
-    sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
+    sources = [
+        star_source,
+        *motion_sources(motions, products),
+        *others,
+        *in_band.sources,
+        *matched.sources,
+    ]
     filters = filter_coverages(selected.steps, fields, spec)
     results = BuildResults(spec, sources, products, facts, fields, filters, rates, in_band.made)
     report = report_build(partial, results)

@@ -71,7 +71,7 @@ def read_snapshot(
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
-    in_band = in_band_of(stars, spec, workers)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
     catalog = joined.catalog
     return CatalogSnapshot(
         in_band.stars.combine_chunks(),
@@ -94,7 +94,7 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
     }
     if spec.camera.response.name is not None:
         wanted["response"] = content["camera"]["response"]
-    if spec.catalog.motions:
+    if spec.catalog.motions or spec.camera.response.photometry:
         model = content["products"]["crossmatch"]
         wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
     return wanted

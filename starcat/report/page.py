@@ -152,7 +152,8 @@ def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        what = "motion" if source["role"] == "motions" else "amplitude"
+        kinds = {"motions": "motion", "photometry": "magnitude partly"}
+        what = kinds.get(source["role"], "amplitude")
         rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
     for name, moved_arcsec in source.get("moved_arcsec", {}).items():
         rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))

@@ -276,6 +276,16 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
+    def _photometry_of_other_catalogs(self) -> BuildSpec:
+        named = self.camera.response.photometry
+        if self.catalog.source in named or len(set(named)) != len(named):
+            raise ValueError(
+                f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
+                f"{self.catalog.source}, that of the stars themselves"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _levels_are_wider(self) -> BuildSpec:
         wanted, own_deg = self.products.levels, self.camera.camera().fov_x_deg
         if not wanted.enabled:
@@ -327,7 +337,8 @@ class BuildSpec(Section):
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.catalog.motions, *self.selection.variables.join]
+        joined = (*self.selection.variables.join, *self.camera.response.photometry)
+        names = [self.catalog.source, *self.catalog.motions, *joined]
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:

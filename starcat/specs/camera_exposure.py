@@ -104,7 +104,7 @@ def with_limits(content: Any) -> Any:
         wanted = CameraExposure.model_validate(camera["exposure"]).limits(response)
     except ValidationError:
         return content  # which is told, with its key, when the sections are checked
-    return {**content, "selection": {**wanted, **selection}}
+    return {**content, "selection": {**wanted, **selection}} if wanted else content
 
 
 def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | None:

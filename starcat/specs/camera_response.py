@@ -52,6 +52,13 @@ class CameraResponse(Section):
     )
     optics_wavelength_nm: Column = Field((), description="wavelengths of the optics, rising")
     optics_transmission: Column = Field((), description="transmission at each, of any scale")
+    photometry: tuple[Literal["gaia", "hipparcos", "tycho1", "tycho2", "2mass"], ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        description="catalogs whose bands and colours are used as well, found as "
+        "[products.crossmatch] says; each magnitude is the mean of all by their errors",
+        examples=[["hipparcos"]],
+    )
     zero_point: str | None = Field(
         None,
         max_length=16,
