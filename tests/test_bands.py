@@ -408,6 +408,7 @@ def test_a_catalog_without_colours_is_refused():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 @genuine
 def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path):
     # Vega is a Hipparcos star of the embedded sky, with a magnitude and no colour.
@@ -431,6 +432,7 @@ def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_build_in_the_band_of_its_sensor(tmp_path):
     spec = spec_of(
         tmp_path, 'name = "red-ccd"\n[boresights]\ncount = 500\n[self_test]\nframes = 20\n'
