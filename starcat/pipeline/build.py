@@ -28,7 +28,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
-from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
 from starcat.pipeline.recipes import (
@@ -165,7 +165,17 @@ def _make(
         *matched.sources,
     ]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(spec, sources, products, facts, fields, filters, rates, in_band.made)
+    results = BuildResults(
+        spec,
+        sources,
+        products,
+        facts,
+        fields,
+        filters,
+        rates,
+        in_band=in_band.made,
+        neighbours=selected.neighbours,
+    )
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -175,6 +185,7 @@ def _make(
             *motion_notes(spec, products),
             *in_band.notes,
             *spec.exposure_notes,
+            *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),

@@ -13,7 +13,7 @@ from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versi
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
-from starcat.catalog.selection import Selected, Step
+from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
 from starcat.catalog.stars import floats_of
 from starcat.catalog.variability import AmplitudeTable
@@ -110,6 +110,7 @@ class BuildResults:
     filters: Sequence[FilterCoverage]  # what each filter left
     rates: Sequence[Rates]  # rates of the self-test
     in_band: InBand | None = None  # where the spec states a response
+    neighbours: NeighbourTally | None = None  # what the rule of neighbours decided
 
 
 def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
@@ -133,6 +134,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
         "products": products,
         "database_bytes": (folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in results.filters],
+        **({"neighbours": asdict(results.neighbours)} if results.neighbours else {}),
         "coverage": coverage.as_dict(),
         "magnitudes": {"band": str(tables["stars"]["band"][0]), **count_magnitudes(*mags)},
         "self_test": [rates.as_dict() for rates in results.rates],

@@ -60,6 +60,7 @@ def report_page(
         *(_source(source, content["reasons"]) for source in content["sources"]),
         "<h2>Selection</h2>",
         _filters(content["filters"]),
+        *([_neighbours(content["neighbours"])] if "neighbours" in content else []),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
         *more,
         "<h2>Coverage</h2>",
@@ -180,6 +181,14 @@ def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
     ]
     heads = ("after", "stars", "median a field", "fewest in a field", "fields below 4")
     return table("What each filter leaves in the fields of the tiling", heads, rows, (1, 2, 3, 4))
+
+
+def _neighbours(tally: Mapping[str, int]) -> str:
+    return (
+        f"<p>[selection.neighbours] keeps {tally['regained']:,} stars that the separation rule of "
+        f"[selection.doubles] would leave out, and leaves out {tally['lost']:,} that it would "
+        f"keep. The light of {tally['absorbed']:,} stars is in merged ones.</p>"
+    )
 
 
 def _coverage(coverage: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from starcat.geometry.camera import Camera
 from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
 from starcat.specs.camera_response import CameraResponse
+from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
@@ -26,7 +27,10 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions", "camera.response", "camera.exposure")
+LATER_KEYS = (
+    *("products.levels", "catalog.motions", "selection.neighbours"),
+    *("camera.response", "camera.exposure"),
+)
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -127,6 +131,7 @@ class Selection(Section):
         "of any field of the tiling",
     )
     doubles: Doubles = Doubles()
+    neighbours: NeighbourRule = NeighbourRule()
     variables: Variables = Variables()
 
     @model_validator(mode="after")
@@ -135,6 +140,23 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_rule_of_close_stars(self) -> Selection:
+        doubles = self.doubles
+        if self.neighbours.is_on and doubles.action == "merge":
+            raise ValueError(
+                'doubles.action = "merge" and [selection.neighbours] both say what becomes of '
+                'close stars; leave it out, and set neighbours.action = "merge" to merge them as '
+                "the sensor does"
+            )
+        if self.neighbours.is_on and doubles.companion_limit_mag is not None:
+            raise ValueError(
+                f"doubles.companion_limit_mag {doubles.companion_limit_mag:g} is of the separation "
+                "rule, which [selection.neighbours] replaces: it counts all stars that were read. "
+                "Leave it out, or set catalog.read_limit_mag"
             )
         return self
 
