@@ -157,25 +157,11 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
-    sources = [
-        star_source,
-        *motion_sources(motions, products),
-        *others,
-        *in_band.sources,
-        *matched.sources,
-    ]
+    sources = [star_source, *motion_sources(motions, products), *others]
+    sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(
-        spec,
-        sources,
-        products,
-        facts,
-        fields,
-        filters,
-        rates,
-        in_band=in_band.made,
-        neighbours=selected.neighbours,
-    )
+    own = (spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(*own, in_band=in_band.made, neighbours=selected.neighbours)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
