@@ -47,6 +47,7 @@ from starcat.pipeline.report_data import (
     filter_coverages,
     report_content,
 )
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
@@ -139,7 +140,8 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
-    stars = with_observed(stars, spec.selection.observed)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
+    stars = with_observed(in_band.stars, spec.selection.observed)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)
@@ -156,11 +158,11 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
-    sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
+    sources = [star_source, *motion_sources(motions, products), *others]
+    sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(
-        spec, sources, products, facts, fields, filters, rates, selected.neighbours
-    )
+    own = (spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(*own, in_band=in_band.made, neighbours=selected.neighbours)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -168,6 +170,8 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *in_band.notes,
+            *spec.exposure_notes,
             *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
@@ -229,7 +233,7 @@ def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     coverage = coverage_report(counted, spec)
     content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", content, coverage)
+    write_report(folder / "report", content, coverage, results.in_band)
     for warning in content["warnings"]:
         _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
     return coverage

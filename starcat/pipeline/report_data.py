@@ -14,6 +14,7 @@ from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
 from starcat.catalog.selection import NeighbourTally, Selected, Step
+from starcat.catalog.sensor_band import InBand
 from starcat.catalog.stars import floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
@@ -27,6 +28,7 @@ from starcat.report.report import (
     coverage_warnings,
     report_coverage,
 )
+from starcat.report.sensor_band import band_content
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
@@ -107,6 +109,7 @@ class BuildResults:
     fields: FieldStars  # the tiling of the guide stars
     filters: Sequence[FilterCoverage]  # what each filter left
     rates: Sequence[Rates]  # rates of the self-test
+    in_band: InBand | None = None  # where the spec states a response
     neighbours: NeighbourTally | None = None  # what the rule of neighbours decided
 
 
@@ -121,6 +124,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))
+    band = results.in_band
     return {
         **{name: recorded[name] for name in ("name", "version", "description", "epoch_jyear")},
         "frame": "ICRS",
@@ -134,6 +138,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
         "coverage": coverage.as_dict(),
         "magnitudes": {"band": str(tables["stars"]["band"][0]), **count_magnitudes(*mags)},
         "self_test": [rates.as_dict() for rates in results.rates],
+        **({} if band is None else {"band": band_content(band, spec.selection)}),
         "spec": recorded,
         "software": software_versions(),
     }

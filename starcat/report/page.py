@@ -46,8 +46,10 @@ _ALT = {
 }
 
 
-def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page."""
+def report_page(
+    content: Mapping[str, Any], plots: Mapping[str, bytes], more: Sequence[str] = ()
+) -> str:
+    """Return the report of a build as an HTML page, with more sections after the selection."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -60,6 +62,7 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         _filters(content["filters"]),
         *([_neighbours(content["neighbours"])] if "neighbours" in content else []),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
+        *more,
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),
@@ -150,7 +153,8 @@ def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        what = "motion" if source["role"] == "motions" else "amplitude"
+        kinds = {"motions": "motion", "photometry": "magnitude partly"}
+        what = kinds.get(source["role"], "amplitude")
         rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
     for name, moved_arcsec in source.get("moved_arcsec", {}).items():
         rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))
