@@ -24,7 +24,7 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions")
+LATER_KEYS = ("products.levels", "catalog.motions", "selection.thinning")
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -124,6 +124,12 @@ class Selection(Section):
         description="thins to an even density: keeps the stars that are among this many brightest "
         "of any field of the tiling",
     )
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
+    )
     doubles: Doubles = Doubles()
     variables: Variables = Variables()
 
@@ -133,6 +139,15 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_thin(self) -> Selection:
+        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
+            raise ValueError(
+                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
+                "max_stars or max_stars_per_field"
             )
         return self
 
