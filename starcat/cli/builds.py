@@ -249,12 +249,15 @@ def print_coverage_table(report: CoverageReport) -> None:
     print_things(title, spreads.items(), columns, numbers=(1, 2, 3, 4, 5))
     print_things(
         "Attitude error that the stars of a field allow, arcsec for 1 px of centroid noise",
-        report.evenness.spreads.items(),
+        [
+            (axis, *(_error_text(value) for value in vars(spread).values()))
+            for axis, spread in report.evenness.spreads.items()
+        ],
         {
             "error": "{0[0]} the boresight",
-            "median": "{0[1].median:.1f}",
-            "worst 1 %": "{0[1].one_percent:.1f}",
-            "worst": "{0[1].worst:.1f}",
+            "median": "{0[1]}",
+            "worst 1 %": "{0[2]}",
+            "worst": "{0[3]}",
         },
         numbers=(1, 2, 3),
     )
@@ -267,3 +270,7 @@ def print_coverage_table(report: CoverageReport) -> None:
         f"{report.evenness.cells:,} cells of the size of a field; 1 is even",
     }
     print_facts("", facts)
+
+
+def _error_text(error_arcsec: float) -> str:
+    return "no attitude" if error_arcsec == float("inf") else f"{error_arcsec:.1f}"

@@ -164,8 +164,8 @@ class _Precision:
         unit = (1.0, 1.0, 1.0 / float(np.sin(min(reach_rad, 0.5 * np.pi))))
         term = np.stack([entry * unit[i] * unit[j] for (i, j), entry in entries], axis=-1)
         count, field = len(fields.boresights), fields.field
-        prior = 3 * [PRIOR] + 3 * [0.0]
-        total = np.stack([np.bincount(field, one, count) for one in term.T], axis=-1) + prior
+        total: Array = np.stack([np.bincount(field, one, count) for one in term.T], axis=-1)
+        total = total + np.array(3 * [PRIOR] + 3 * [0.0])
         own = np.bincount(fields.star_index, minlength=len(directions))
         first = np.concatenate([[0], np.cumsum(own)])
         return cls(total, _cost(total), term[by_star], field[by_star], first.tolist())
