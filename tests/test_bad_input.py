@@ -113,7 +113,7 @@ class Place:
 
     @cached_property
     def copy(self) -> Path:
-        """A copy of the good artifact, to be damaged."""
+        """A copy of the good database, to be damaged."""
         return copied(self.artifact, self.folder)
 
     @cached_property
@@ -401,7 +401,7 @@ def off_the_sky(place: Place) -> None:
 
 
 def matched_store(change: Callable[[Path, pa.Table], object]) -> Callable[[Place], Call]:
-    """Find the stars of a good artifact in a store, one of whose partitions is changed."""
+    """Find the stars of a good database in a store, one of whose partitions is changed."""
 
     def damage(place: Place) -> None:
         store = place.folder / "store"
@@ -565,7 +565,7 @@ BUILDS: Cases = {
         lambda place: (place.out / "stars.parquet").mkdir(parents=True),
     ),
     "frame below a file": run("simulate {artifact} -o {file}/frame.csv"),
-    "another artifact of that name": other_artifact,
+    "another database of that name": other_artifact,
     "disk full while building": run(GOOD_BUILD, disk_of(1 << 14)),
     "disk full while writing the database": run(GOOD_BUILD, disk_of(300_000)),
     "disk full while ingesting": run(
@@ -574,11 +574,11 @@ BUILDS: Cases = {
 }
 
 
-# Artifacts and frames ----------------------------------------------------------------------
+# Databases and frames ----------------------------------------------------------------------
 
 
 def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], None]:
-    """Change the manifest of a copy of the good artifact."""
+    """Change the manifest of a copy of the good database."""
 
     def rewrite(place: Place) -> None:
         path = place.copy / "manifest.json"
@@ -590,7 +590,7 @@ def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], No
 
 
 def hdf5(change: Callable[[Place, h5py.File], object]) -> Callable[[Place], None]:
-    """Change the database of a copy of the good artifact."""
+    """Change the database of a copy of the good database."""
 
     def rewrite(place: Place) -> None:
         with h5py.File(place.copy / "database.h5", "r+") as file:
@@ -609,7 +609,7 @@ def set_index(_: Place, file: h5py.File) -> None:
 
 
 def checked(name: str, change: Callable[[Path], object]) -> Callable[[Place], Call]:
-    """Check a copy of the good artifact, to a file of which something was done."""
+    """Check a copy of the good database, to a file of which something was done."""
 
     def call(place: Place) -> Call:
         change(place.copy / name)
@@ -648,8 +648,8 @@ CALIBRATE = "calibrate {artifact} {frame} -o {out} "
 IDENTIFY_FITS = "identify {artifact} {folder}/frame.fits"
 
 ARTIFACTS_AND_FRAMES: Cases = {
-    "not an artifact": run("inspect {folder}"),
-    "artifact to verify missing": run("verify {folder}/small-1.0.0"),
+    "not a database": run("inspect {folder}"),
+    "database to verify missing": run("verify {folder}/small-1.0.0"),
     "manifest not JSON": run(
         "inspect {copy}", lambda place: os.truncate(place.copy / "manifest.json", 500)
     ),
@@ -665,7 +665,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "product of a newer schema": newer_schema,
     "Parquet file damaged": checked("pairs.parquet", flip),
     "one byte of the database changed": checked("database.h5", flip),
-    "file of an artifact missing": checked("rejected.parquet", Path.unlink),
+    "file of a database missing": checked("rejected.parquet", Path.unlink),
     "database cut off": run(
         "selftest {copy}", lambda place: os.truncate(place.copy / "database.h5", 20_000)
     ),
@@ -735,7 +735,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
 
 
 def sql(query: str, more: str = "") -> Callable[[Place], Call]:
-    """Ask about the good artifact."""
+    """Ask about the good database."""
     return run(f"sql {{artifact}} {shlex.quote(query)} {more}")
 
 
@@ -981,11 +981,11 @@ REGISTRIES: Cases = {
     "publishing into a folder with other things": run(
         "publish {artifact} {folder}/home", {"home/thesis.tex": "text"}
     ),
-    "publishing a damaged artifact": run(
+    "publishing a damaged database": run(
         "publish {copy} {folder}/registry", lambda place: flip(place.copy / "pairs.parquet")
     ),
     "no registry there": run("releases {folder}/registry"),
-    "artifact that a registry does not have": pull("smaller"),
+    "database that a registry does not have": pull("smaller"),
     "version that a registry does not have": pull("small@1.2.3"),
     "name and version of another form": pull("small@1.0"),
     "pull of nothing": run("pull -o {out}"),
@@ -995,7 +995,7 @@ REGISTRIES: Cases = {
     "lock file damaged": pinned("small", "starcat-lock", "starcat-luck"),
     "lock file of a newer starcat": pinned("small", '"lock_version": "1', '"lock_version": "2'),
     "published version that is not the pinned one": pinned("small", '"bytes": ', '"bytes": 1'),
-    "another artifact at the name of a pull": run(
+    "another database at the name of a pull": run(
         PULL.format("small", ""), {"out/small-1.0.0/manifest.json": "{}"}
     ),
     "index of a registry damaged": pull_damaged(
@@ -1096,11 +1096,11 @@ ONBOARD_IMAGES: Cases = {
     "option of an onboard image for tables": run(f"{EXPORT} --to fits --max-bytes 9000"),
     "option of tables for an onboard image": run(f"{ONBOARD} --product stars"),
     "option of HATS for another format": run(f"{EXPORT} --to csv --max-partition-rows 9"),
-    "onboard image of an artifact without triangles": run(
+    "onboard image of a database without triangles": run(
         "export {copy} --to onboard -o {out}/db.img",
         manifest(lambda content: content["products"].pop("triangles")),
     ),
-    "onboard image of a damaged artifact": run(
+    "onboard image of a damaged database": run(
         "export {copy} --to onboard -o {out}/db.img",
         lambda place: flip(place.copy / "triangles.parquet"),
     ),
@@ -1122,7 +1122,7 @@ ONBOARD_IMAGES: Cases = {
     "onboard image of another version": image(with_word(12, 2)),
     "onboard image with a number that cannot be": image(with_word(28, 7)),
     "onboard image with a section that cannot be": image(with_word(256 + 8, 24)),
-    "artifact held against an artifact": run("verify {artifact} --against {artifact}"),
+    "database held against a database": run("verify {artifact} --against {artifact}"),
 }
 
 
@@ -1264,9 +1264,7 @@ def test_the_page_lists_exactly_these_kinds():
     assert len(CASES) == sum(map(len, GROUPS)) >= 20
 
 
-@pytest.mark.parametrize(
-    "kind", ["file missing", "key unknown", "not an artifact", "no stars left"]
-)
+@pytest.mark.parametrize("kind", ["file missing", "key unknown", "not a database", "no stars left"])
 def test_exit_codes_reach_the_shell(kind, place):
     code, text = run_apart(place, CASES[kind](place))
     assert code == page_rows()[kind][1]

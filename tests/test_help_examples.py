@@ -1,6 +1,6 @@
 """The examples that the commands' help prints run as they are printed.
 
-Each runs in a folder with what a user would have there: an archive file, and the artifacts that
+Each runs in a folder with what a user would have there: an archive file, and the databases that
 the other examples speak of, built from a small sky so that most of this takes no time.
 """
 

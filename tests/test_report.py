@@ -409,7 +409,7 @@ def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
     assert "leaves holes" in run.err
 
 
-# Beside the artifact ------------------------------------------------------------------------
+# Beside the database ------------------------------------------------------------------------
 
 
 def test_times_stand_beside_the_artifact(artifact):

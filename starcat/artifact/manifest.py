@@ -1,4 +1,4 @@
-"""The manifest: what an artifact is made of, with a digest for every part.
+"""The manifest: what a database is made of, with a digest for every part.
 
 Nothing in it depends on the clock, the host or a path, so the same inputs and the same spec
 give the same manifest.
@@ -99,7 +99,7 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of an artifact."""
+    """Read the manifest of a database."""
     path = folder / MANIFEST_NAME
     try:
         data = path.read_bytes()
@@ -109,7 +109,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ProductError(
             f"{folder}: {MANIFEST_NAME} cannot be read ({error.strerror})", path=folder
         ) from error
-    return parse_manifest(data, str(path), "rebuild the artifact", path)
+    return parse_manifest(data, str(path), "rebuild the database", path)
 
 
 def parse_manifest(

@@ -1,4 +1,4 @@
-"""Writing the files of an artifact: its database, its tables, and the manifest last.
+"""Writing the files of a database: its HDF5 file, its tables, and the manifest last.
 
 The content digest of a table covers the values of its columns in a fixed little-endian layout, so
 it does not change with the version of the library that wrote the file.
@@ -34,7 +34,7 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 @dataclass(frozen=True)
 class Product:
-    """A product on its way into an artifact."""
+    """A product on its way into a database."""
 
     name: str  # name of the product, which is that of its schema
     table: pa.Table  # with the columns of the schema, in the schema's order of rows
@@ -45,7 +45,7 @@ class Product:
 def write_products(
     folder: Path, products: Sequence[Product], facts: Mapping[str, str | float]
 ) -> dict[str, dict[str, Any]]:
-    """Write the products of an artifact; return what the manifest records of each.
+    """Write the products of a database; return what the manifest records of each.
 
     ``records`` of the triangles is the sum over all boresights, which the papers count.
     """

@@ -26,6 +26,7 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
+    to_folder,
 )
 from starcat.cli.remote import service_of
 from starcat.errors import BuildError
@@ -47,14 +48,12 @@ def build(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
-    ] = Path("dist"),
+    output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a different artifact of that name.")
+        bool, typer.Option("--replace", help="Replace a different database of that name.")
     ] = False,
     workers: Annotated[
-        int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
+        int, typer.Option(min=1, max=64, help="Threads; the database is the same for any number.")
     ] = 2,
     max_memory: Annotated[
         float | None,
@@ -173,7 +172,7 @@ def _print_records(title: str, source: dict[str, Any]) -> None:
 
 
 def print_products(manifest: dict[str, Any]) -> None:
-    """Print the products of an artifact."""
+    """Print the products of a database."""
     files = manifest["files"]
     rows = [
         (
@@ -212,7 +211,7 @@ def print_rates(rates: Sequence[Rates]) -> None:
 
 
 def print_artifact(artifact: Artifact) -> None:
-    """Print what an artifact holds."""
+    """Print what a database holds."""
     from starcat.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest

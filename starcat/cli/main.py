@@ -19,6 +19,7 @@ import typer
 
 from starcat.cli import (
     artifacts,
+    bands,
     builds,
     catalogs,
     evaluation,
@@ -49,7 +50,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 for part in (
-    *(catalogs, specs, builds, artifacts, sql, exchange),
+    *(catalogs, bands, specs, builds, artifacts, sql, exchange),
     *(releases, matching, evaluation, serving),
 ):
     app.add_typer(part.app)

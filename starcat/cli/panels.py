@@ -7,7 +7,7 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 PANELS = {
-    "Design a database": ("sources", "presets", "init", "estimate"),
+    "Design a database": ("sources", "bands", "presets", "init", "estimate"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
     "Use it": ("simulate", "identify", "calibrate", "methods", "sql"),

@@ -187,7 +187,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
         f"{thinned.stars.median:,} in the middle one."
         "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
-        f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
+        f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
     )
     warn(told)
     say(starter.cost.in_words)

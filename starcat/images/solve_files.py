@@ -332,7 +332,7 @@ def _is_limited(result: MatchResult) -> bool:
 
 
 def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
-    """Open the database of an artifact, or an onboard image, for identifying with some options."""
+    """Open a database, or an onboard image, for identifying with some options."""
     given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
     method = given.pop("method")
     return Matcher.open(

@@ -1,4 +1,4 @@
-"""The stages of a build, in order: from a spec and archive files to an artifact.
+"""The stages of a build, in order: from a spec and archive files to a database.
 
 Each stage is a plain function of the results before it; the last ones write into a partial
 folder, read it back, identify simulated fields with it and only then give it its name.
@@ -69,9 +69,9 @@ _logger = logging.getLogger(__name__)
 class Built:
     """A finished build."""
 
-    folder: Path  # the artifact
+    folder: Path  # the database
     outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
-    manifest: dict[str, Any]  # manifest of the artifact
+    manifest: dict[str, Any]  # manifest of the database
     filters: tuple[FilterCoverage, ...]  # what each filter left
     coverage: CoverageReport  # coverage by the guide stars
     # rates of the self-test: clean and hard frames, and the same without magnitudes
@@ -81,7 +81,7 @@ class Built:
     times_s: dict[str, float]  # seconds by stage
 
     def __repr__(self) -> str:
-        """Return the artifact and how it identifies in one line."""
+        """Return the database and how it identifies in one line."""
         clean, hard = self.rates[:2]
         stars = self.manifest["products"]["stars"]["rows"]
         return (
@@ -101,7 +101,7 @@ def build(
     announce: Callable[[Cost], None] | None = None,
     max_memory_bytes: int | None = None,
 ) -> Built:
-    """Build an artifact."""
+    """Build a database."""
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
 
@@ -238,7 +238,7 @@ def make_products(
     fields: FieldStars,
     progress: Progress = no_progress,
 ) -> list[Product]:
-    """Compute the products of an artifact."""
+    """Compute the products of a database."""
     rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
     products = [

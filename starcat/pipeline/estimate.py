@@ -136,7 +136,7 @@ class Estimate:
 
     @property
     def total_bytes(self) -> int:
-        """Size of the artifact."""
+        """Size of the database."""
         return sum(self.cost.files.values())
 
     @property

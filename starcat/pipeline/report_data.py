@@ -145,7 +145,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
 
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:
-    """Return the coverage of an artifact, from its own boresights and stars."""
+    """Return the coverage of a database, from its own boresights and stars."""
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()

@@ -41,7 +41,7 @@ EPOCH_JYEAR = 2016.0
 """Of the embedded sky, whose stars have no proper motions."""
 
 ENOUGH_STARS = 10
-"""So many stars in nearly every field leave some when spots are missing."""
+"""So many stars in nearly every field leave some when centroids are missing."""
 
 ENOUGH_SHARE = 0.995
 """Share of the fields that have as many."""
@@ -274,7 +274,7 @@ def advice(starter: Starter) -> Sequence[str]:
     if own.stars.one_percent < ENOUGH_STARS - 2:
         told.append(
             f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
-            f"{ENOUGH_STARS} leave some where spots are missing: "
+            f"{ENOUGH_STARS} leave some where centroids are missing: "
             + (
                 "the embedded sky has no fainter ones, so many frames will have no answer"
                 if own.faint_limit_mag >= starter.deepest_mag
@@ -285,7 +285,7 @@ def advice(starter: Starter) -> Sequence[str]:
         told.append(
             f"the middle field has {own.stars.median} stars up to the limit, and the database "
             f"keeps the {STARS_A_FIELD} brightest of each field "
-            "(selection.max_stars_per_field): give the matcher the brightness of the spots, so "
+            "(selection.max_stars_per_field): give the matcher the brightness of the centroids, so "
             "that it begins with these"
         )
     if starter.left_out:

@@ -1,7 +1,7 @@
 """The build spec: everything that a database depends on, but for its input files.
 
 Every key has a unit in its name, a range and a meaning, which ``docs/spec.md`` lists. The whole
-spec travels in the manifest of the artifact. `starcat.specs.reading` reads one from a file.
+spec travels in the manifest of the database. `starcat.specs.reading` reads one from a file.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ class SelfTest(Section):
         0.2,
         ge=0.0,
         le=10.0,
-        description="noise of the magnitude of a spot, standard deviation; it decides what is "
+        description="noise of the magnitude of a centroid, standard deviation; it decides what is "
         "tried first",
     )
     min_identified: float = Field(
@@ -244,7 +244,7 @@ class BuildSpec(Section):
 
     name: str = Field(
         pattern=NAME_PATTERN,
-        description="name of the artifact: small letters, digits and hyphens",
+        description="name of the database: small letters, digits and hyphens",
         examples=["mycam"],
     )
     version: str = Field(
@@ -303,7 +303,7 @@ class BuildSpec(Section):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Return what an artifact says of its spec."""
+        """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
         for name in LATER_KEYS:
             section, _, key = name.rpartition(".")

@@ -41,7 +41,7 @@ def products_page() -> str:
         NOTE + "# Products\n\n"
         "Every product is a Parquet file; those that a matcher needs are groups of `database.h5`\n"
         "too. Angles between stars are radians, positions degrees, all ICRS at the epoch of the\n"
-        "manifest. `i`, `j` and the like are rows of the artifact's own `stars`.\n"
+        "manifest. `i`, `j` and the like are rows of the database's own `stars`.\n"
     ]
     for path in sorted(resource_folder("schemas").glob("*.json")):
         if path.stem.startswith("manifest-"):
@@ -122,7 +122,9 @@ def spec_page() -> str:
         page.append("| key | unit | range | default | example | meaning |\n" + "|---" * 6 + "|")
         for key in section.keys:
             cells = (f"`{key.name}`", key.unit or key.kind, key.range, _default(key), _example(key))
-            page.append(f"| {' | '.join(cells)} | {key.description} |")
+            # A bar within a cell, as in a pattern, would end it.
+            row = " | ".join(cell.replace("|", r"\|") for cell in (*cells, key.description))
+            page.append(f"| {row} |")
         page.append("")
     return "\n".join(page)
 

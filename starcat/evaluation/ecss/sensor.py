@@ -1,6 +1,6 @@
 """A star sensor as TOML: what turns the light of stars into electrons, and what is not known of it.
 
-The optics, the size of the detector and the stars are those of an artifact.
+The optics, the size of the detector and the stars are those of a database.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Sensor(Section):
 
     zero_point_e_s: Positive | None = _key(
         None,
-        "electrons/s of a star of magnitude 0 in the band of the artifact; or else aperture_mm and "
+        "electrons/s of a star of magnitude 0 in the band of the database; or else aperture_mm and "
         "quantum_efficiency",
         6.0e6,
     )
@@ -78,7 +78,7 @@ class Sensor(Section):
         5.0, "threshold of detection, standard deviations"
     )
     limit_mag: Mag | None = _key(
-        None, "fainter spots are not used, mag; default: 0.3 beyond the artifact's", 6.3
+        None, "fainter spots are not used, mag; default: 0.3 beyond the database's", 6.3
     )
     most_spots: Annotated[int, Field(ge=4, le=10_000)] = _key(64, "brightest spots that are used")
     update_rate_hz: Positive = _key(..., "frames/s", 5.0)
@@ -185,7 +185,7 @@ def sensor_toml(sensor: Sensor) -> str:
 
 def example_toml() -> str:
     """Return a sensor with every key explained: its meaning, unit and default."""
-    lines = ["# A star sensor: starcat evaluate ARTIFACT --ecss SENSOR.toml"]
+    lines = ["# A star sensor: starcat evaluate DATABASE --ecss SENSOR.toml"]
     for name, field in Sensor.model_fields.items():
         text, value = str(field.description), (field.examples or [field.default])[0]
         if field.is_required():
