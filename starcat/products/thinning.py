@@ -21,9 +21,9 @@ from starcat.products.boresights import FieldStars
 BATCH = 0.1
 """Share of the stars, those with the smallest cells, of which a round drops some."""
 
-PRIOR = 1e-6
-"""Information on each axis before any star, so that a field without stars has an error too: that of
-a thousand times a star's noise."""
+PRIOR = 1e-2
+"""Information on each axis before any star, that of a star being 1, so that a field without stars
+has an error too: ten times the noise of a star."""
 
 POWER = 4
 """Power of the variances that are added up. So high a one is nearly the variance of the worst
@@ -99,6 +99,8 @@ def cell_areas(directions: Directions) -> tuple[Array, NDArray[np.int64]]:
         half = np.arctan2(volume, 1.0 + sum(dots))
         areas += np.bincount(corners[:, k], half, len(areas))
         areas += np.bincount(corners[:, (k + 1) % 3], half, len(areas))
+    # No cell is larger than half of the sphere; the angles of wide triangles lack whole turns.
+    areas += 2.0 * np.pi * ((areas < -1e-6).astype(np.float64) - (areas > 2.0 * np.pi + 1e-6))
     return areas, corners
 
 
