@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -29,6 +28,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.pipeline import guide_stars
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import even_stars, thinned_stars
+from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, NominalField, reach_rad, tile_sphere
 from starcat.products.evenness import (
     ARCSEC,
@@ -351,28 +351,68 @@ def test_the_self_test_identifies_no_fewer(rule, thinned):
         assert other.wrong == 0
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+    """All stars of gaia-12deg."""
+    return open_artifact(build(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("whole")).folder)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("rule", RULES)
-def test_frames_of_the_whole_sky_are_identified_no_less_often(rule, thinned, tmp_path_factory):
-    """Frames with all stars to G = 6, of which a database of 3,000 stars has not half."""
-    every = build(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("whole"))
-    rates = {}
-    for name in ("brightest", rule):
-        matcher = Matcher.open(thinned[name].folder)
-        rates[name] = sum(right_answers(matcher, open_artifact(every.folder), 500))
-    assert rates[rule] >= rates["brightest"]
+def test_frames_of_the_whole_sky_are_identified_more_often(thinned, whole):
+    """Frames with stars to G = 6, of which a database of 3,000 stars has not half: 437 of 500."""
+    rates = right_answers(thinned, whole, np.inf)
+    assert rates["brightest"] < 450
+    assert min(rates[rule] for rule in RULES) > 490
 
 
-def right_answers(matcher: Matcher, whole: Artifact, frames: int) -> Iterator[bool]:
-    """Identify frames of another database's stars."""
-    stars, camera = whole.table("stars"), matcher.database.camera
-    row = {number: row for row, number in enumerate(matcher.database.star_id.tolist())}
-    index = [row.get(number, -1) for number in stars["star_id"].to_pylist()]
-    sky = Sky(directions_of(stars), floats_of(stars, "mag"), np.array(index, dtype=np.int32))
-    generator = np.random.default_rng(13)
-    noise = Noise(0.5, drop_probability=0.1, noise_mag=0.2)
-    for matrix in random_attitudes(frames, generator):
-        frame = simulate_frame(sky, camera, matrix, noise, generator)
-        result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
-        yield result.ok and answers_rightly(result, frame, matcher)
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_where_a_sensor_sees_few_stars_only_the_bright_ones_help(thinned, whole):
+    """Frames with stars to G = 5: 387 of 500, with information 376, with voronoi 347."""
+    rates = right_answers(thinned, whole, 5.0)
+    assert rates["brightest"] > rates["information"] > rates["voronoi"] > 330
+
+
+def right_answers(
+    made: dict[str, Built], whole: Artifact, limit_mag: float, frames: int = 500
+) -> dict[str, int]:
+    """Count the frames of another database's stars that each database identifies."""
+    stars, found = whole.table("stars"), {}
+    for rule, built in made.items():
+        matcher = Matcher.open(built.folder)
+        row = {number: row for row, number in enumerate(matcher.database.star_id.tolist())}
+        index = [row.get(number, -1) for number in stars["star_id"].to_pylist()]
+        sky = Sky(directions_of(stars), floats_of(stars, "mag"), np.array(index, dtype=np.int32))
+        generator = np.random.default_rng(13)
+        noise = Noise(0.5, drop_probability=0.1, noise_mag=0.2, limit_mag=limit_mag)
+        found[rule] = 0
+        for matrix in random_attitudes(frames, generator):
+            frame = simulate_frame(sky, matcher.database.camera, matrix, noise, generator)
+            result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            found[rule] += result.ok and answers_rightly(result, frame, matcher)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_light_keeps_the_stars_that_sensors_see(thinned, whole):
+    """Without it the error is 8 % less, and half of the four brightest of each field are gone."""
+    spec, stars = preset("gaia-12deg"), whole.table("stars")
+    size, directions = field_size(spec), directions_of(stars)
+    fields = tile_guide_stars(stars, spec)
+    none = np.zeros(len(stars))
+    dark = thin_by_information(fields, directions, none, reach_rad(size, "rectangular"), 3000)
+    left = tile_sphere(10_000, directions[dark], none[dark], size)
+    focal_length_px = spec.camera.camera().focal_length_px
+    even = evenness_of(left, directions[dark], size, "rectangular", focal_length_px)
+    with_light = thinned["information"].coverage.evenness.spreads["across"].one_percent
+    assert 0.85 < even.spreads["across"].one_percent / with_light < 0.95
+    _, four = fields.brightest(4)
+    ids = stars["star_id"].to_numpy()
+    shares = {"dark": float(np.isin(four, dark).mean())}
+    for rule, built in thinned.items():
+        own = open_artifact(built.folder).table("stars")["star_id"].to_numpy()
+        shares[rule] = float(np.isin(ids[four], own).mean())
+    assert shares["dark"] < 0.6
+    assert shares["information"] > shares["brightest"] > 0.99

@@ -27,7 +27,7 @@ MOST_FIELD_STARS = 4_000_000
 FIRST_LOOK = 4.0
 """Times as many stars as fill a field of the mean are looked at first."""
 
-POOL = 4.0
+POOL = 2.0
 """Times as many stars of a field as stay on average, the brightest, may stay by another rule."""
 
 

@@ -115,7 +115,10 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
+        None,
+        ge=1,
+        le=2_000_000_000,
+        description="number of stars that are kept, by default the brightest",
     )
     max_stars_per_field: int | None = Field(
         None,
