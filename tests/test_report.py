@@ -383,7 +383,7 @@ def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
     run = starcat(["coverage", artifact.folder, "-o", tmp_path / "new" / "folder"])
     assert run.code == 0
     made = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
-    assert made == {name for name in FILES if name.startswith("coverage")}
+    assert made == {name for name in FILES if name.startswith(("attitude", "coverage"))}
     for name in made:
         again = (tmp_path / "new" / "folder" / name).read_bytes()
         assert again == (artifact.folder / "report" / name).read_bytes(), name
