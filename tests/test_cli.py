@@ -62,6 +62,29 @@ def test_each_option_says_what_it_does(name):
         assert getattr(parameter, "help", None), f"{name} {parameter.name}"
 
 
+def test_o_is_everywhere_where_the_result_goes(starcat, small_artifact, tmp_path):
+    outputs = {
+        name: option
+        for name, command in every_command().items()
+        for option in command.params
+        if "-o" in option.opts
+    }
+    assert len(outputs) == 12
+    for name, option in outputs.items():
+        assert option.opts == ["--output", "-o"], name
+        assert option.metavar in ("FILE", "FOLDER", "FILE|FOLDER"), name
+        assert option.help.startswith("Where "), name
+    file = tmp_path / "file"
+    file.write_text("")
+    for arguments in (["coverage", small_artifact, "-o", file], ["pull", "a", "-o", file]):
+        run = starcat(arguments)
+        assert (run.code, run.err) == (
+            1, f"starcat: error: {file}: is a file; choose a folder with --output\n"
+        )  # fmt: skip
+    run = starcat(["simulate", small_artifact, "-o", tmp_path])
+    assert "is a folder; choose a file with --output" in run.err
+
+
 def test_help_lists_every_command(starcat):
     run = starcat(["--help"])
     assert run.code == 0

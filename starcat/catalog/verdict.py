@@ -33,6 +33,9 @@ class Reason(Enum):
     too_bright = "brighter than bright_limit_mag"
     too_faint = "fainter than faint_limit_mag"
     double = "a companion within min_separation_deg"
+    blended = (
+        "neighbours move its centroid or add to its light more than [selection.neighbours] allows"
+    )
     merged = "merged into the brighter star of a close group"
     flagged_double = "the archive flags an unresolved double"
     variable = "amplitude above max_amplitude_mag"

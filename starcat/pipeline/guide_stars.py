@@ -24,6 +24,9 @@ from starcat.specs.build_spec import BuildSpec
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
 
+LEAST_CONTAMINATION = 0.001
+"""A thousandth of a star's light moves no centroid; fainter neighbours need not be known."""
+
 FIRST_LOOK = 4.0
 """Times as many stars as fill a field of the mean are looked at first."""
 
@@ -41,7 +44,7 @@ def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars
 
 def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
     """Select guide stars, and thin them if the spec says so."""
-    selected = select_guide_stars(stars, spec.selection)
+    selected = select_guide_stars(stars, spec.selection, spec.camera.camera().pixel_arcsec)
     check_guide_stars(selected, spec)
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
@@ -146,6 +149,23 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
             f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}"
         )
+
+
+def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
+    """Return what to say of a catalog that has not all neighbours of [selection.neighbours]."""
+    rule, mag = spec.selection.neighbours, floats_of(stars, "mag")
+    share = max(rule.max_contamination, LEAST_CONTAMINATION)
+    if not rule.is_on or share >= 0.5 or np.isnan(mag).all():
+        return ()
+    faintest, fainter = np.nanmax(mag), 2.5 * np.log10((1.0 - share) / share)
+    if faintest - fainter >= spec.selection.faint_limit_mag:
+        return ()
+    return (
+        f"selection.neighbours: the faintest star that was read has magnitude {faintest:.2f}, and "
+        f"a neighbour {fainter:.2f} mag fainter than a guide star is still {share:.3g} of its "
+        f"light. Stars fainter than {faintest - fainter:.2f} are judged by some of their "
+        "neighbours only: read a deeper catalog, or raise catalog.read_limit_mag",
+    )
 
 
 def check_fields(fields: FieldStars, spec: BuildSpec) -> None:

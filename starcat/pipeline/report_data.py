@@ -14,7 +14,8 @@ from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versi
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
-from starcat.catalog.selection import Selected, Step
+from starcat.catalog.selection import NeighbourTally, Selected, Step
+from starcat.catalog.sensor_band import InBand
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
@@ -29,6 +30,7 @@ from starcat.report.report import (
     coverage_warnings,
     report_coverage,
 )
+from starcat.report.sensor_band import band_content
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
@@ -114,6 +116,8 @@ class BuildResults:
     fields: FieldStars  # the tiling of the guide stars
     filters: Sequence[FilterCoverage]  # what each filter left
     rates: Sequence[Rates]  # rates of the self-test
+    in_band: InBand | None = None  # where the spec states a response
+    neighbours: NeighbourTally | None = None  # what the rule of neighbours decided
 
 
 def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
@@ -127,6 +131,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))
+    band = results.in_band
     return {
         **{name: recorded[name] for name in ("name", "version", "description", "epoch_jyear")},
         "frame": "ICRS",
@@ -136,9 +141,11 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
         "products": products,
         "database_bytes": (folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in results.filters],
+        **({"neighbours": asdict(results.neighbours)} if results.neighbours else {}),
         "coverage": coverage.as_dict(),
         "magnitudes": {"band": str(tables["stars"]["band"][0]), **count_magnitudes(*mags)},
         "self_test": [rates.as_dict() for rates in results.rates],
+        **({} if band is None else {"band": band_content(band, spec.selection)}),
         "spec": recorded,
         "software": software_versions(),
     }

@@ -47,8 +47,10 @@ _ALT = {
 }
 
 
-def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page."""
+def report_page(
+    content: Mapping[str, Any], plots: Mapping[str, bytes], more: Sequence[str] = ()
+) -> str:
+    """Return the report of a build as an HTML page, with more sections after the selection."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -59,7 +61,9 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         *(_source(source, content["reasons"]) for source in content["sources"]),
         "<h2>Selection</h2>",
         _filters(content["filters"]),
+        *([_neighbours(content["neighbours"])] if "neighbours" in content else []),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
+        *more,
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),
@@ -152,7 +156,8 @@ def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        what = "motion" if source["role"] == "motions" else "amplitude"
+        kinds = {"motions": "motion", "photometry": "magnitude partly"}
+        what = kinds.get(source["role"], "amplitude")
         rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
     for name, moved_arcsec in source.get("moved_arcsec", {}).items():
         rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))
@@ -179,6 +184,14 @@ def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
     ]
     heads = ("after", "stars", "median a field", "fewest in a field", "fields below 4")
     return table("What each filter leaves in the fields of the tiling", heads, rows, (1, 2, 3, 4))
+
+
+def _neighbours(tally: Mapping[str, int]) -> str:
+    return (
+        f"<p>[selection.neighbours] keeps {tally['regained']:,} stars that the separation rule of "
+        f"[selection.doubles] would leave out, and leaves out {tally['lost']:,} that it would "
+        f"keep. The light of {tally['absorbed']:,} stars is in merged ones.</p>"
+    )
 
 
 def _coverage(coverage: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.catalog.sensor_band import InBand
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
@@ -32,6 +33,7 @@ from starcat.report.plots import (
     draw_map,
     save_plot,
 )
+from starcat.report.sensor_band import band_section, draw_band
 from starcat.storage.digests import json_bytes
 
 DECIMALS = 6
@@ -200,7 +202,12 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
     return {"from_mag": edges[:-1], "to_mag": edges[1:], "guide_stars": kept, "rejected": rejected}
 
 
-def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageReport) -> None:
+def write_report(
+    folder: Path,
+    content: Mapping[str, Any],
+    coverage: CoverageReport,
+    in_band: InBand | None = None,
+) -> None:
     """Write all files of a report; ``content`` is that of report.json."""
     title, counts = f"{content['name']}-{content['version']}", content["magnitudes"]
     write_coverage(folder, title, coverage)
@@ -215,4 +222,8 @@ def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageRep
         name: (folder / f"{name}.svg").read_bytes()
         for name in ("coverage_map", "coverage_histogram", "attitude_error", "stars_by_magnitude")
     }
-    (folder / "index.html").write_text(report_page(content, plots), encoding="utf-8")
+    more: list[str] = []
+    if in_band is not None:
+        save_plot(draw_band(title, in_band), folder, "sensor_band")
+        more = band_section(content["band"], (folder / "sensor_band.svg").read_bytes())
+    (folder / "index.html").write_text(report_page(content, plots, more), encoding="utf-8")

@@ -11,6 +11,9 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
+from starcat.specs.camera_response import CameraResponse
+from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
@@ -24,7 +27,11 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions", "selection.thinning")
+LATER_KEYS = (
+    *("products.levels", "catalog.motions", "selection.neighbours"),
+    "selection.thinning",
+    *("camera.response", "camera.exposure"),
+)
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -134,6 +141,7 @@ class Selection(Section):
         "large for their brightness; or those that the attitude of the worst fields needs most",
     )
     doubles: Doubles = Doubles()
+    neighbours: NeighbourRule = NeighbourRule()
     variables: Variables = Variables()
 
     @model_validator(mode="after")
@@ -154,6 +162,23 @@ class Selection(Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _one_rule_of_close_stars(self) -> Selection:
+        doubles = self.doubles
+        if self.neighbours.is_on and doubles.action == "merge":
+            raise ValueError(
+                'doubles.action = "merge" and [selection.neighbours] both say what becomes of '
+                'close stars; leave it out, and set neighbours.action = "merge" to merge them as '
+                "the sensor does"
+            )
+        if self.neighbours.is_on and doubles.companion_limit_mag is not None:
+            raise ValueError(
+                f"doubles.companion_limit_mag {doubles.companion_limit_mag:g} is of the separation "
+                "rule, which [selection.neighbours] replaces: it counts all stars that were read. "
+                "Leave it out, or set catalog.read_limit_mag"
+            )
+        return self
+
 
 class CameraSpec(Section):
     """The camera that the database is for: by its field of view, or by lens and pixel."""
@@ -169,6 +194,8 @@ class CameraSpec(Section):
     pixel_um: float | None = Field(
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
     )
+    response: CameraResponse = CameraResponse()
+    exposure: CameraExposure = CameraExposure()
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
@@ -267,12 +294,35 @@ class BuildSpec(Section):
     products: Products = Products()
     self_test: SelfTest = SelfTest()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_of_the_exposure(cls, content: Any) -> Any:
+        return with_limits(content)
+
+    @model_validator(mode="after")
+    def _limits_said_once(self) -> BuildSpec:
+        wanted = self.camera.exposure.limits(self.camera.response.response())
+        problem = contradiction(wanted, {key: getattr(self.selection, key) for key in wanted})
+        if problem:
+            raise ValueError(problem)
+        return self
+
     @model_validator(mode="after")
     def _counterparts_in_other_catalogs(self) -> BuildSpec:
         if self.catalog.source in self.products.crossmatch.catalogs:
             raise ValueError(
                 f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
                 "themselves; name others"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _photometry_of_other_catalogs(self) -> BuildSpec:
+        named = self.camera.response.photometry
+        if self.catalog.source in named or len(set(named)) != len(named):
+            raise ValueError(
+                f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
+                f"{self.catalog.source}, that of the stars themselves"
             )
         return self
 
@@ -305,6 +355,13 @@ class BuildSpec(Section):
             )
         return self
 
+    @property
+    def exposure_notes(self) -> tuple[str, ...]:
+        """What the camera's exposure says of limits that are stated as magnitudes."""
+        selection, response = self.selection, self.camera.response.response()
+        limits = (selection.faint_limit_mag, selection.bright_limit_mag)
+        return exposure_notes(self.camera.exposure, response, *limits)
+
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
@@ -321,7 +378,8 @@ class BuildSpec(Section):
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.catalog.motions, *self.selection.variables.join]
+        joined = (*self.selection.variables.join, *self.camera.response.photometry)
+        names = [self.catalog.source, *self.catalog.motions, *joined]
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:
