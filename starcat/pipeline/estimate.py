@@ -22,7 +22,13 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
 from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
-from starcat.pipeline.guide_stars import MOST_FIELD_STARS, check_fields, check_tiling, thinned_stars
+from starcat.pipeline.guide_stars import (
+    MOST_FIELD_STARS,
+    check_fields,
+    check_tiling,
+    depth_notes,
+    thinned_stars,
+)
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars
@@ -186,7 +192,12 @@ def estimate(
         tuple((step.name, len(step.directions)) for step in choice.selected.steps),
         choice.rejected,
         tuple(refusals),
-        (*read.notes, *coverage_warnings(summary, gap)),
+        (
+            *read.notes,
+            *spec.exposure_notes,
+            *depth_notes(read.stars, spec),
+            *coverage_warnings(summary, gap),
+        ),
     )
 
 
