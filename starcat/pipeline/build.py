@@ -230,7 +230,8 @@ def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
     spec = results.spec
     counted = field_coverage(results.fields, spec.boresights.brightest)
-    coverage = coverage_report(counted, spec)
+    stars = next(each.table for each in results.products if each.name == "stars")
+    coverage = coverage_report(counted, results.fields, directions_of(stars), spec)
     content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
     write_report(folder / "report", content, coverage, results.in_band)

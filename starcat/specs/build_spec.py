@@ -28,7 +28,8 @@ MOST_BINS = 10_000_000
 
 
 LATER_KEYS = (
-    *("products.levels", "catalog.motions", "selection.neighbours", "selection.observed"),
+    *("products.levels", "catalog.motions", "selection.neighbours"),
+    *("selection.thinning", "selection.observed"),
     *("camera.response", "camera.exposure"),
 )
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
@@ -177,7 +178,10 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
+        None,
+        ge=1,
+        le=2_000_000_000,
+        description="number of stars that are kept, by default the brightest",
     )
     max_stars_per_field: int | None = Field(
         None,
@@ -185,6 +189,12 @@ class Selection(Section):
         le=10_000,
         description="thins to an even density: keeps the stars that are among this many brightest "
         "of any field of the tiling",
+    )
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
     )
     doubles: Doubles = Doubles()
     neighbours: NeighbourRule = NeighbourRule()
@@ -197,6 +207,15 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_thin(self) -> Selection:
+        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
+            raise ValueError(
+                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
+                "max_stars or max_stars_per_field"
             )
         return self
 
