@@ -257,8 +257,10 @@ def init(
     from starcat.pipeline.starter import starter_spec, write_starter
     from starcat.specs.build_spec import CameraSpec
 
-    size = {"width_px": camera.width_px, "height_px": camera.height_px}
-    made = starter_spec(name, CameraSpec(**size, fov_x_deg=camera.fov_x_deg), faint_limit_mag)
+    wanted = CameraSpec(
+        width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
+    )
+    made = starter_spec(name, wanted, faint_limit_mag)
     if output is not None:
         write_starter(made, Path(output), replace=replace)
     return made

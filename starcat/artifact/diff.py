@@ -146,7 +146,9 @@ def _source_facts(artifact: Artifact) -> dict[str, Any]:
     for source in artifact.manifest["sources"]:
         # A catalog may be read again: for amplitudes, motions and counterparts.
         role = source["role"]
-        name = source["source"] + (f" {role}" if role in ("crossmatch", "motions") else "")
+        name = source["source"] + (
+            f" {role}" if role in ("crossmatch", "motions", "photometry") else ""
+        )
         facts |= {f"{name} {key}": source[key] for key in ("rows_read", "kept")}
         facts |= {f"{name} rejected {key}": count for key, count in source["rejected"].items()}
         for file in source["files"]:

@@ -22,6 +22,7 @@ from starcat.artifact.manifest import (
     MANIFEST_NAME,
     MANIFEST_VERSION,
     MOTIONS_VERSION,
+    PHOTOMETRY_VERSION,
     SourceFacts,
     manifest_digest,
     software_versions,
@@ -79,10 +80,12 @@ def write_manifest(
 ) -> dict[str, Any]:
     """Write the manifest of a folder whose other files are complete."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    has_motions = any(source.role == "motions" for source in sources)
+    roles = {source.role for source in sources}
+    version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
+    version = PHOTOMETRY_VERSION if "photometry" in roles else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": MOTIONS_VERSION if has_motions else MANIFEST_VERSION,
+        "manifest_version": version,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",

@@ -61,6 +61,10 @@ class Response:
         weight = self.photon_efficiency(at)
         return float(np.sum(weight * at) / np.sum(weight))
 
+    def named(self, title: str, zero_point: str) -> Response:
+        """Return the response with another title and zero point."""
+        return replace(self, title=title, zero_point=zero_point)
+
     def behind(self, optics: Response) -> Response:
         """Return the response behind optics of some transmission."""
         wavelength = np.union1d(self.wavelength_nm, optics.wavelength_nm)

@@ -40,10 +40,10 @@ def magnitudes(response: Response) -> Array:
     mean something.
     """
     weights = row_weights(response)
-    return np.asarray(-2.5 * np.log10(library().flux @ weights) - _zero_mag(response, weights))
+    return np.asarray(-2.5 * np.log10(library().flux @ weights) - zero_mag(response, weights))
 
 
-def _zero_mag(response: Response, weights: Array) -> float:
+def zero_mag(response: Response, weights: Array) -> float:
     """Return the magnitude, from a signal alone, of what has 0 mag in the band."""
     kind, _, said = response.zero_point.partition(" ")
     if kind == "vega":

@@ -33,6 +33,8 @@ from starcat.geometry.sphere import radec_from_directions
 from starcat.specs.build_spec import Doubles, Selection, Variables
 from starcat.storage.schema import product_schema
 
+_STEPS = {Reason.beyond_count: "count", Reason.density: "density"}
+
 MOST_PAIRS = 10_000_000
 """Close pairs that are looked at; they take half a gigabyte, and no camera has a tenth of them."""
 
@@ -103,7 +105,7 @@ def select_guide_stars(
     note("doubles")
     reject_variables(stars, selection.variables, verdicts)
     note("variables")
-    if selection.max_stars is not None:
+    if selection.max_stars is not None and selection.thinning == "brightest":
         verdicts.reject(
             beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count
         )
@@ -252,15 +254,17 @@ def beyond_brightest(stars: pa.Table, kept: Mask, count: int) -> Mask:
     return beyond
 
 
-def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
+def reject_dense(
+    selected: Selected, kept: NDArray[np.integer], reason: Reason = Reason.density
+) -> Selected:
     """Thin the guide stars to those that a tiling asks for, by row."""
     verdicts = Verdicts(len(selected.guide_stars))
-    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), Reason.density)
+    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), reason)
     stars, dense = split_by_verdict(selected.guide_stars, verdicts)
     rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
     return Selected(
         stars.combine_chunks(),
         sort_rows(rejected, product_schema("rejected").order),
-        (*selected.steps, Step("density", directions_of(stars))),
+        (*selected.steps, Step(_STEPS[reason], directions_of(stars))),
         selected.neighbours,
     )

@@ -324,6 +324,8 @@ def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
     if facts.get("role") == "crossmatch":
         rows.append(("guide stars with a counterpart", f"{facts['joined']:,}"))
+    if facts.get("role") == "photometry":
+        rows.append(("stars whose magnitude is partly from here", f"{facts['joined']:,}"))
     if facts.get("role") == "motions":
         rows.append(("guide stars whose motion is from here", f"{facts['joined']:,}"))
     for name, moved_arcsec in facts.get("moved_arcsec", {}).items():

@@ -46,6 +46,7 @@ from starcat.pipeline.report_data import (
     filter_coverages,
     report_content,
 )
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
@@ -138,6 +139,8 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
+    stars = in_band.stars
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)
@@ -154,11 +157,11 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
-    sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
+    sources = [star_source, *motion_sources(motions, products), *others]
+    sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(
-        spec, sources, products, facts, fields, filters, rates, selected.neighbours
-    )
+    own = (spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(*own, in_band=in_band.made, neighbours=selected.neighbours)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -166,6 +169,8 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *in_band.notes,
+            *spec.exposure_notes,
             *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
@@ -224,10 +229,11 @@ def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
     spec = results.spec
     counted = field_coverage(results.fields, spec.boresights.brightest)
-    coverage = coverage_report(counted, spec)
+    stars = next(each.table for each in results.products if each.name == "stars")
+    coverage = coverage_report(counted, results.fields, directions_of(stars), spec)
     content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", content, coverage)
+    write_report(folder / "report", content, coverage, results.in_band)
     for warning in content["warnings"]:
         _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
     return coverage

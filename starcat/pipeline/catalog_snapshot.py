@@ -15,6 +15,7 @@ from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
 from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 
@@ -70,15 +71,16 @@ def read_snapshot(
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
     catalog = joined.catalog
     return CatalogSnapshot(
-        stars.combine_chunks(),
+        in_band.stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
         round(len(catalog.rejected) * _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS))),
         catalog.stars.nbytes + catalog.rejected.nbytes,
         catalog.rows_read,
-        catalog.notes,
+        (*catalog.notes, *in_band.notes),
     )
 
 
@@ -90,7 +92,9 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
-    if spec.catalog.motions:
+    if spec.camera.response.name is not None:
+        wanted["response"] = content["camera"]["response"]
+    if spec.catalog.motions or spec.camera.response.photometry:
         model = content["products"]["crossmatch"]
         wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
     return wanted

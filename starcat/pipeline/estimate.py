@@ -192,7 +192,12 @@ def estimate(
         tuple((step.name, len(step.directions)) for step in choice.selected.steps),
         choice.rejected,
         tuple(refusals),
-        (*read.notes, *depth_notes(read.stars, spec), *coverage_warnings(summary, gap)),
+        (
+            *read.notes,
+            *spec.exposure_notes,
+            *depth_notes(read.stars, spec),
+            *coverage_warnings(summary, gap),
+        ),
     )
 
 

@@ -41,13 +41,16 @@ figure img { max-width: 100%; height: auto; background: var(--paper); }
 
 _ALT = {
     "coverage_map": "All-sky map in Mollweide's projection: guide stars in the field of view",
+    "attitude_error": "All-sky map in Mollweide's projection: attitude error across the boresight",
     "coverage_histogram": "Histogram: how many fields hold how many guide stars",
     "stars_by_magnitude": "Bar chart: records read and guide stars by magnitude",
 }
 
 
-def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page."""
+def report_page(
+    content: Mapping[str, Any], plots: Mapping[str, bytes], more: Sequence[str] = ()
+) -> str:
+    """Return the report of a build as an HTML page, with more sections after the selection."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -60,10 +63,13 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         _filters(content["filters"]),
         *([_neighbours(content["neighbours"])] if "neighbours" in content else []),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
+        *more,
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),
         figure(_ALT["coverage_histogram"], plots["coverage_histogram"]),
+        _evenness(content["coverage"]),
+        figure(_ALT["attitude_error"], plots["attitude_error"]),
         "<h2>Products</h2>",
         _products(content["products"], content["database_bytes"]),
         "<h2>Self-test</h2>",
@@ -150,7 +156,8 @@ def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        what = "motion" if source["role"] == "motions" else "amplitude"
+        kinds = {"motions": "motion", "photometry": "magnitude partly"}
+        what = kinds.get(source["role"], "amplitude")
         rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
     for name, moved_arcsec in source.get("moved_arcsec", {}).items():
         rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))
@@ -206,7 +213,25 @@ def _coverage(coverage: Mapping[str, Any]) -> str:
     )
 
 
-def _rounded(value: float) -> str:
+def _evenness(coverage: Mapping[str, Any]) -> str:
+    errors = coverage["attitude_error_arcsec_per_px"]
+    names = ("median", "one_percent", "worst")
+    rows = [
+        (f"{axis} the boresight", *(_rounded(errors[axis][name]) for name in names))
+        for axis in ("across", "about")
+    ]
+    heads = ("arcsec for 1 px of noise", "median", "worst 1 % of the fields", "worst")
+    return (
+        table("Attitude error that the stars of a field allow", heads, rows, range(1, 4))
+        + f"\n<p>The entropy of the stars is {coverage['entropy']:.4f} over "
+        f"{coverage['entropy_cells']:,} cells of the size of a field; it is 1 where all have as "
+        "many.</p>"
+    )
+
+
+def _rounded(value: float | None) -> str:
+    if value is None:
+        return "no attitude"
     return f"{value:,.1f}" if isinstance(value, float) else f"{value:,}"
 
 

@@ -11,6 +11,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
+from starcat.specs.camera_response import CameraResponse
 from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
     NAME_PATTERN,
@@ -25,7 +27,11 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions", "selection.neighbours")
+LATER_KEYS = (
+    *("products.levels", "catalog.motions", "selection.neighbours"),
+    "selection.thinning",
+    *("camera.response", "camera.exposure"),
+)
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
 
@@ -116,7 +122,10 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
+        None,
+        ge=1,
+        le=2_000_000_000,
+        description="number of stars that are kept, by default the brightest",
     )
     max_stars_per_field: int | None = Field(
         None,
@@ -124,6 +133,12 @@ class Selection(Section):
         le=10_000,
         description="thins to an even density: keeps the stars that are among this many brightest "
         "of any field of the tiling",
+    )
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
     )
     doubles: Doubles = Doubles()
     neighbours: NeighbourRule = NeighbourRule()
@@ -135,6 +150,15 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_thin(self) -> Selection:
+        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
+            raise ValueError(
+                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
+                "max_stars or max_stars_per_field"
             )
         return self
 
@@ -170,6 +194,8 @@ class CameraSpec(Section):
     pixel_um: float | None = Field(
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
     )
+    response: CameraResponse = CameraResponse()
+    exposure: CameraExposure = CameraExposure()
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
@@ -268,12 +294,35 @@ class BuildSpec(Section):
     products: Products = Products()
     self_test: SelfTest = SelfTest()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_of_the_exposure(cls, content: Any) -> Any:
+        return with_limits(content)
+
+    @model_validator(mode="after")
+    def _limits_said_once(self) -> BuildSpec:
+        wanted = self.camera.exposure.limits(self.camera.response.response())
+        problem = contradiction(wanted, {key: getattr(self.selection, key) for key in wanted})
+        if problem:
+            raise ValueError(problem)
+        return self
+
     @model_validator(mode="after")
     def _counterparts_in_other_catalogs(self) -> BuildSpec:
         if self.catalog.source in self.products.crossmatch.catalogs:
             raise ValueError(
                 f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
                 "themselves; name others"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _photometry_of_other_catalogs(self) -> BuildSpec:
+        named = self.camera.response.photometry
+        if self.catalog.source in named or len(set(named)) != len(named):
+            raise ValueError(
+                f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
+                f"{self.catalog.source}, that of the stars themselves"
             )
         return self
 
@@ -306,6 +355,13 @@ class BuildSpec(Section):
             )
         return self
 
+    @property
+    def exposure_notes(self) -> tuple[str, ...]:
+        """What the camera's exposure says of limits that are stated as magnitudes."""
+        selection, response = self.selection, self.camera.response.response()
+        limits = (selection.faint_limit_mag, selection.bright_limit_mag)
+        return exposure_notes(self.camera.exposure, response, *limits)
+
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
@@ -322,7 +378,8 @@ class BuildSpec(Section):
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.catalog.motions, *self.selection.variables.join]
+        joined = (*self.selection.variables.join, *self.camera.response.photometry)
+        names = [self.catalog.source, *self.catalog.motions, *joined]
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:

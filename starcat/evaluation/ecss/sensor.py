@@ -5,13 +5,13 @@ The optics, the size of the detector and the stars are those of a database.
 
 from __future__ import annotations
 
-import math
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
+from starcat.bands.exposure import PHOTONS_S_MM2, zero_point_e_s
 from starcat.specs.keys import toml_value
 from starcat.specs.product_sections import Mag, Section
 from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
@@ -52,7 +52,7 @@ class Sensor(Section):
         None, "electrons per photon, transmission of the optics included", 0.5
     )
     photons_s_mm2: Positive = _key(
-        38_200.0,
+        PHOTONS_S_MM2,
         "photons/s and mm2 of a star of magnitude 0; the default is Liebe's 19,100 electrons "
         "(2002) at a quantum efficiency of 0.5",
     )
@@ -149,9 +149,8 @@ class Sensor(Section):
         """Electrons of a star of magnitude 0 in a frame."""
         if self.zero_point_e_s is not None:
             return self.zero_point_e_s * self.exposure_s
-        area_mm2 = 0.25 * math.pi * (self.aperture_mm or 0.0) ** 2
-        electrons = area_mm2 * self.photons_s_mm2 * (self.quantum_efficiency or 0.0)
-        return electrons * self.exposure_s
+        optics = (self.aperture_mm or 0.0, self.quantum_efficiency or 0.0)
+        return zero_point_e_s(*optics, self.photons_s_mm2) * self.exposure_s
 
     @property
     def background_e(self) -> float:
