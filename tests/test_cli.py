@@ -69,7 +69,7 @@ def test_o_is_everywhere_where_the_result_goes(starcat, small_artifact, tmp_path
         for option in command.params
         if "-o" in option.opts
     }
-    assert len(outputs) == 12
+    assert len(outputs) == 13
     for name, option in outputs.items():
         assert option.opts == ["--output", "-o"], name
         assert option.metavar in ("FILE", "FOLDER", "FILE|FOLDER"), name

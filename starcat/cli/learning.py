@@ -26,7 +26,7 @@ def learn(
         typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
     ],
     output: Annotated[
-        Path | None, opt.to_file("Section of a spec (TOML) for a patch release, to write.")
+        Path | None, opt.to_file("Where the section of a spec for a patch release goes (TOML).")
     ] = None,
     stars: Annotated[
         Path | None,
