@@ -16,7 +16,7 @@ from scipy.stats import binom
 
 from starcat.arrays import Array, Mask
 from starcat.calibration.answers import Sightings, SkyStars
-from starcat.calibration.response import Depth, Terms, fit_depth, fit_terms
+from starcat.calibration.response import FEWEST_COLOURS, Depth, Terms, fit_depth, fit_terms
 from starcat.calibration.star_tests import Measurements, Noise, StarMeans
 from starcat.errors import CalibrationError
 
@@ -163,12 +163,16 @@ class _Round:
     def _fitted(self, before: Lesson | None) -> tuple[Mask, Terms]:
         """Return the magnitudes that are fair, and the terms fitted to those of trusted stars."""
         seen = self.seen
-        use, sigma = np.isfinite(seen.mag), np.full(len(seen), FIRST_NOISE_MAG)
+        measured, sigma = np.isfinite(seen.mag), np.full(len(seen), FIRST_NOISE_MAG)
+        use = measured
         if before is not None:
             expected_mag = self._expected(before.terms)
             sigma = np.hypot(before.mag_noise.at(expected_mag), before.mag_noise.of_stars)
-            use &= expected_mag < before.limit_mag - CLEAR * sigma
-        rows = use & self.is_trusted[seen.star]
+            use = measured & (expected_mag < before.limit_mag - CLEAR * sigma)
+        # Where frames are so shallow that hardly a star of known colour is left, all have to do.
+        known = np.isfinite(self.stars.colour)
+        is_enough = known[np.unique(seen.star[use])].sum() >= FEWEST_COLOURS
+        rows = (use if is_enough or not known.any() else measured) & self.is_trusted[seen.star]
         star = seen.star[rows]
         terms = fit_terms(
             seen.mag[rows] - self.stars.mag[star],
