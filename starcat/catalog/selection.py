@@ -1,7 +1,7 @@
 """Selection: which stars of a table become guide stars, and why the others do not.
 
-Filters are tried in a fixed order (magnitude, doubles, variables, count, density) and the first
-that applies is the verdict. Doubles are judged by separation and magnitude difference at the
+Filters are tried in a fixed order (magnitude, doubles, variables, distrust, count, density) and the
+first that applies is the verdict. Doubles are judged by separation and magnitude difference at the
 sensor's resolution, or by what neighbours do to their centroids (`blended.py`), and variables by
 amplitude; a bare flag of an archive is only one input.
 """
@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.blended import Judged, judge_neighbours
+from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
     directions_of,
@@ -32,6 +33,8 @@ from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
 from starcat.specs.build_spec import Doubles, Selection, Variables
 from starcat.storage.schema import product_schema
+
+_STEPS = {Reason.beyond_count: "count", Reason.density: "density"}
 
 MOST_PAIRS = 10_000_000
 """Close pairs that are looked at; they take half a gigabyte, and no camera has a tenth of them."""
@@ -103,7 +106,10 @@ def select_guide_stars(
     note("doubles")
     reject_variables(stars, selection.variables, verdicts)
     note("variables")
-    if selection.max_stars is not None:
+    if selection.observed.reject:
+        verdicts.reject(is_distrusted(stars, selection.observed), Reason.distrusted)
+        note("distrust")
+    if selection.max_stars is not None and selection.thinning == "brightest":
         verdicts.reject(
             beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count
         )
@@ -252,15 +258,17 @@ def beyond_brightest(stars: pa.Table, kept: Mask, count: int) -> Mask:
     return beyond
 
 
-def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
+def reject_dense(
+    selected: Selected, kept: NDArray[np.integer], reason: Reason = Reason.density
+) -> Selected:
     """Thin the guide stars to those that a tiling asks for, by row."""
     verdicts = Verdicts(len(selected.guide_stars))
-    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), Reason.density)
+    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), reason)
     stars, dense = split_by_verdict(selected.guide_stars, verdicts)
     rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
     return Selected(
         stars.combine_chunks(),
         sort_rows(rejected, product_schema("rejected").order),
-        (*selected.steps, Step("density", directions_of(stars))),
+        (*selected.steps, Step(_STEPS[reason], directions_of(stars))),
         selected.neighbours,
     )

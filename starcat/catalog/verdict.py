@@ -40,8 +40,11 @@ class Reason(Enum):
     flagged_double = "the archive flags an unresolved double"
     variable = "amplitude above max_amplitude_mag"
     flagged_variable = "flagged variable, amplitude unknown"
-    beyond_count = "fainter than the brightest max_stars"
-    density = "in no field among the brightest max_stars_per_field"
+    distrusted = "distrusted by what flew: [selection.observed] lists it"
+    beyond_count = "thinned to max_stars: fainter, or as selection.thinning says"
+    density = (
+        "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says"
+    )
 
 
 _CODES = {reason: code for code, reason in enumerate(Reason, start=1)}

@@ -246,10 +246,30 @@ def print_coverage_table(report: CoverageReport) -> None:
     }
     title = f"Coverage: {summary.fields:,} fields"
     print_things(title, spreads.items(), columns, numbers=(1, 2, 3, 4, 5))
+    print_things(
+        "Attitude error that the stars of a field allow, arcsec for 1 px of centroid noise",
+        [
+            (axis, *(_error_text(value) for value in vars(spread).values()))
+            for axis, spread in report.evenness.spreads.items()
+        ],
+        {
+            "error": "{0[0]} the boresight",
+            "median": "{0[1]}",
+            "worst 1 %": "{0[2]}",
+            "worst": "{0[3]}",
+        },
+        numbers=(1, 2, 3),
+    )
     worst = f"RA {summary.worst_ra_deg:.3f}, Dec {summary.worst_dec_deg:+.3f} deg"
     covering, tile = np.degrees([gap.covering_radius_rad, gap.tile_radius_rad])
     facts = {
         "fewest stars": f"boresight {summary.worst_boresight}, {worst}",
         "farthest from all boresights": f"{covering:.3f} deg; a field reaches {tile:.3f} deg",
+        "entropy of the stars": f"{report.evenness.entropy:.4f} over "
+        f"{report.evenness.cells:,} cells of the size of a field; 1 is even",
     }
     print_facts("", facts)
+
+
+def _error_text(error_arcsec: float) -> str:
+    return "no attitude" if error_arcsec == float("inf") else f"{error_arcsec:.1f}"

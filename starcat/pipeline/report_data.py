@@ -9,19 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from starcat.arrays import Directions
 from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
 from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
-from starcat.catalog.stars import floats_of
+from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
 from starcat.pipeline.counterparts import source_facts
-from starcat.pipeline.recipes import field_size
+from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
+from starcat.products.evenness import evenness_of
 from starcat.report.report import (
     CoverageReport,
     count_magnitudes,
@@ -63,10 +65,15 @@ def filter_coverages(
     return tuple(found)
 
 
-def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
-    """Return what a report says about coverage."""
+def coverage_report(
+    coverage: Coverage, fields: FieldStars, directions: Directions, spec: BuildSpec
+) -> CoverageReport:
+    """Return what a report says about coverage by the guide stars, whose directions are given."""
     size = field_size(spec)
-    return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
+    focal_length_px = spec.camera.camera().focal_length_px
+    evenness = evenness_of(fields, directions, size, spec.boresights.field, focal_length_px)
+    reach = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
+    return report_coverage(coverage, reach, evenness)
 
 
 def all_source_facts(
@@ -145,9 +152,11 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
 
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:
-    """Return the coverage of a database, from its own boresights."""
+    """Return the coverage of a database, from its own boresights and stars."""
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()
     coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
-    return coverage_report(coverage, artifact.spec)
+    stars = artifact.table("stars")
+    fields = tile_guide_stars(stars, artifact.spec)
+    return coverage_report(coverage, fields, directions_of(stars), artifact.spec)

@@ -41,6 +41,7 @@ figure img { max-width: 100%; height: auto; background: var(--paper); }
 
 _ALT = {
     "coverage_map": "All-sky map in Mollweide's projection: guide stars in the field of view",
+    "attitude_error": "All-sky map in Mollweide's projection: attitude error across the boresight",
     "coverage_histogram": "Histogram: how many fields hold how many guide stars",
     "stars_by_magnitude": "Bar chart: records read and guide stars by magnitude",
 }
@@ -67,6 +68,8 @@ def report_page(
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),
         figure(_ALT["coverage_histogram"], plots["coverage_histogram"]),
+        _evenness(content["coverage"]),
+        figure(_ALT["attitude_error"], plots["attitude_error"]),
         "<h2>Products</h2>",
         _products(content["products"], content["database_bytes"]),
         "<h2>Self-test</h2>",
@@ -210,7 +213,25 @@ def _coverage(coverage: Mapping[str, Any]) -> str:
     )
 
 
-def _rounded(value: float) -> str:
+def _evenness(coverage: Mapping[str, Any]) -> str:
+    errors = coverage["attitude_error_arcsec_per_px"]
+    names = ("median", "one_percent", "worst")
+    rows = [
+        (f"{axis} the boresight", *(_rounded(errors[axis][name]) for name in names))
+        for axis in ("across", "about")
+    ]
+    heads = ("arcsec for 1 px of noise", "median", "worst 1 % of the fields", "worst")
+    return (
+        table("Attitude error that the stars of a field allow", heads, rows, range(1, 4))
+        + f"\n<p>The entropy of the stars is {coverage['entropy']:.4f} over "
+        f"{coverage['entropy_cells']:,} cells of the size of a field; it is 1 where all have as "
+        "many.</p>"
+    )
+
+
+def _rounded(value: float | None) -> str:
+    if value is None:
+        return "no attitude"
     return f"{value:,.1f}" if isinstance(value, float) else f"{value:,}"
 
 

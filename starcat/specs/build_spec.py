@@ -6,9 +6,9 @@ spec travels in the manifest of the database. `starcat.specs.reading` reads one 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from starcat.geometry.camera import Camera
 from starcat.specs.camera_exposure import (
@@ -35,10 +35,15 @@ MOST_BINS = 10_000_000
 
 LATER_KEYS = (
     *("products.levels", "catalog.motions", "selection.neighbours"),
+    *("selection.thinning", "selection.observed"),
     *("camera.response", "camera.exposure"),
 )
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
+
+
+SHA256_PATTERN = r"^[0-9a-f]{64}$"
+Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
 
 class Catalog(Section):
@@ -119,6 +124,58 @@ class Variables(Section):
     )
 
 
+class Observed(Section):
+    """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
+
+    zero_point_mag: float | None = Field(
+        None,
+        ge=-100.0,
+        le=100.0,
+        description="measured magnitude of a star of colour 0 minus the catalog's; told, not "
+        "applied",
+        examples=[0.2],
+    )
+    colour_term: float = Field(
+        0.0,
+        ge=-5.0,
+        le=5.0,
+        description="mag becomes mag + colour_term x (colour_mag - reference_colour_mag)",
+    )
+    colour_bands: str | None = Field(
+        None, max_length=40, description="the colour that the term is for", examples=["BP-RP"]
+    )
+    reference_colour_mag: float = Field(
+        0.0,
+        ge=-20.0,
+        le=20.0,
+        description="stars of this colour keep their mag, as do those of unknown colour",
+    )
+    reject: tuple[int, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=4000,
+        description="star_id of the stars to distrust, which are rejected",
+        examples=[[3, 17]],
+    )
+    frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
+    database: str | None = Field(
+        None,
+        max_length=200,
+        description="database that they were identified with",
+        examples=["mycam-1.0.0"],
+    )
+    manifest_sha256: str | None = Field(
+        None, pattern=SHA256_PATTERN, description="digest of its manifest", examples=["0" * 64]
+    )
+    results_sha256: tuple[Sha256, ...] = Field(
+        (),
+        strict=False,
+        max_length=1000,
+        description="digests of the files of identified frames",
+        examples=[["0" * 64]],
+    )
+
+
 class Selection(Section):
     """Which stars become guide stars."""
 
@@ -127,7 +184,10 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
+        None,
+        ge=1,
+        le=2_000_000_000,
+        description="number of stars that are kept, by default the brightest",
     )
     max_stars_per_field: int | None = Field(
         None,
@@ -136,9 +196,16 @@ class Selection(Section):
         description="thins to an even density: keeps the stars that are among this many brightest "
         "of any field of the tiling",
     )
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
+    )
     doubles: Doubles = Doubles()
     neighbours: NeighbourRule = NeighbourRule()
     variables: Variables = Variables()
+    observed: Observed = Observed()
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Selection:
@@ -146,6 +213,15 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_thin(self) -> Selection:
+        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
+            raise ValueError(
+                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
+                "max_stars or max_stars_per_field"
             )
         return self
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.evaluation.ecss.bench import Bench, error_arcsec, random_day
-from starcat.geometry.attitude import quaternion_from_matrix, solve_wahba_svd
+from starcat.geometry.attitude import information, quaternion_from_matrix, solve_wahba_svd
 from starcat.images.background import load_sep
-from starcat.matcher.pose import information
 from starcat.matcher.stars import ARCSEC
 from starcat.products.blends import widths_px
 from starcat.sky.observer import aberrated
