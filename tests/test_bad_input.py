@@ -42,6 +42,8 @@ from starcat.errors import NotIdentifiedError, StarcatError
 from starcat.exchange.formats import format_of
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
+from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import check_blocks
@@ -50,6 +52,7 @@ from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.security.tokens import TokenStore
 from starcat.service.settings import Role
+from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
 from starcat.store.ingest import ingest_to_store
 from starcat.store.pixels import Pixel
@@ -360,6 +363,10 @@ SPECS: Cases = {
         "fov_x_deg = 40.0", "fov_x_deg = 40.0, focal_length_mm = 30, pixel_um = 5"
     ),
     "band unknown in a spec": with_catalog('source = "sao", band = "K"'),
+    "distrusted star of another catalog": with_keys("selection.observed.reject = [1, 999999]"),
+    "colour term of another catalog": with_keys(
+        'selection.observed = { colour_term = 0.3, colour_bands = "BP-RP" }'
+    ),
     "counterparts in no catalog": with_keys("products.crossmatch = { enabled = true }"),
     "counterparts in the stars' own catalog": with_keys(
         'products.crossmatch = { enabled = true, catalogs = ["sao"] }'
@@ -644,6 +651,30 @@ def write_cube(place: Place) -> None:
     fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(place.folder / "frame.fits")
 
 
+LEARN = "learn {artifact} {folder}/a.ndjson"
+
+
+def answers(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], Call]:
+    """Learn from the answer to a good frame, changed."""
+
+    def write(place: Place) -> None:
+        matcher = Matcher.open(place.artifact)
+        sky, eye = matcher.database, matcher.database.camera
+        [frame] = simulate_frames(sky.directions, eye, 1, Noise(0.1), 1, mag=sky.mag)
+        measured = MeasuredFrame("frame", frame.centroids_px, frame.mag)
+        result = matcher.identify(frame.centroids_px, eye, magnitudes=frame.mag)
+        content = FrameAnswer(measured, result).content()
+        change(content)
+        place.write("a.ndjson", json.dumps(content) + "\n")
+
+    return run(LEARN, write)
+
+
+def without_magnitudes(answer: dict[str, Any]) -> None:
+    for one in answer["stars"]:
+        one["observed_mag"] = None
+
+
 CALIBRATE = "calibrate {artifact} {frame} -o {out} "
 IDENTIFY_FITS = "identify {artifact} {folder}/frame.fits"
 
@@ -725,6 +756,19 @@ ARTIFACTS_AND_FRAMES: Cases = {
         {"camera.toml": "width_px = 9\nheight_px = 9\nfocal_length_px = 9.0\n"},
     ),
     "plot of residuals of a kind that is not drawn": run(f"{CALIBRATE} --plot left.pdf"),
+    "results that are not there": run(LEARN),
+    "results that are no lines of JSON": run(
+        LEARN, {"a.ndjson": '{"status": "no_match"}\nframe 2'}
+    ),
+    "results that are frames, not answers": run(LEARN, {"a.ndjson": '[{"centroids_px": []}]'}),
+    "results of frames that are not identified": run(
+        LEARN, {"a.ndjson": '{"frame": "a", "status": "no_match"}\n'}
+    ),
+    "results of another database": answers(lambda one: one.update(database="sao-6-1.0.0")),
+    "results of a database of the same name": answers(lambda one: one["stars"][0].update(mag=1.5)),
+    "results of an older starcat": answers(lambda one: one.pop("camera")),
+    "results without magnitudes": answers(without_magnitudes),
+    "results of too few stars": answers(lambda one: one.update(stars=one["stars"][:5])),
     "method whose product is missing": run(
         "identify {copy} {frame} --method grid", hdf5(lambda _, file: file.pop("grid"))
     ),

@@ -56,39 +56,60 @@ class Sight:
     def small(self) -> NDArray[np.bool_]:
         return np.asarray(np.hypot(*self.predicted.offset.T) < 0.5)
 
+    @property
+    def apart_px(self) -> Values:
+        """Between prediction and measurement."""
+        return np.asarray(np.hypot(*(self.measured - self.predicted.offset).T))
+
     def rms_px(self, offset: Values) -> float:
         """Of the length of the difference, where the offset is small."""
         apart = np.sum((self.measured - offset) ** 2, axis=1)
         return float(np.sqrt(apart[self.small].mean()))
 
 
-def rendered(count: int, companions: int, psf_sigma_px: float, seed: int) -> Sight:
-    """Render stars, each with companions 0 to 3 px apart and 0 to 5 mag fainter."""
-    generator = np.random.default_rng(seed)
+def around(count: int, most_px: float, generator: np.random.Generator) -> Values:
+    """Offsets of up to so many pixels, all of them as likely."""
+    apart, angle = generator.uniform(0.0, (most_px, 2.0 * np.pi), (count, 2)).T
+    return np.asarray(apart[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def measured(
+    offset: Values, fainter: Values, psf_sigma_px: float, generator: np.random.Generator
+) -> tuple[Values, Values, Values]:
+    """Render stars with companions, shape (N, M, 2), and find the spots.
+
+    Returns the places of the stars, of the spots and the magnitudes of these.
+    """
+    count = len(offset)
     side = int(np.ceil(np.sqrt(count)))
     cells = np.stack(np.divmod(np.arange(count), side), axis=1)
     place = (cells + 0.5) * CELL_PX + generator.uniform(-0.5, 0.5, (count, 2))
-    apart, angle = generator.uniform(0.0, (3.0, 2.0 * np.pi), (count * companions, 2)).T
-    fainter = generator.uniform(0.0, 5.0, count * companions)
-    offset = apart[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    star = np.repeat(np.arange(count), companions)
-    everything = np.concatenate([place, place[star] + offset])
-    mag = OWN_MAG + np.concatenate([np.zeros(count), fainter])
+    everything = np.concatenate([place, (place[:, None] + offset).reshape(-1, 2)])
+    mag = OWN_MAG + np.concatenate([np.zeros(count), fainter.ravel()])
     optics = Optics(psf_sigma_px=psf_sigma_px)
     size = (side * CELL_PX, side * CELL_PX)
-    image = render_image(everything, mag, size, optics, seed)
+    image = render_image(everything, mag, size, optics, seed=count)
     spots = find_spots(image, psf_sigma_px=psf_sigma_px, gain_e_per_adu=1.0)
-    _, nearest = cKDTree(spots.centroids_px).query(place)
-    light = 10.0 ** (-0.4 * fainter)
+    return place, spots.centroids_px, spots.mag + 2.5 * np.log10(optics.zero_point_e)
 
-    def sums(values: Values) -> Values:
-        return np.asarray(values.reshape(count, companions, -1).sum(axis=1))
 
+def rendered(count: int, companions: int, psf_sigma_px: float, seed: int) -> Sight:
+    """Render stars, each with companions 0 to 3 px apart and 0 to 5 mag fainter."""
+    generator = np.random.default_rng(seed)
+    offset = around(count * companions, 3.0, generator)
+    fainter = generator.uniform(0.0, 5.0, count * companions)
+    shape = (count, companions)
+    place, spots, mag = measured(
+        offset.reshape(*shape, 2), fainter.reshape(shape), psf_sigma_px, generator
+    )
+    _, nearest = cKDTree(spots).query(place)
+    light, star = 10.0 ** (-0.4 * fainter), np.repeat(np.arange(count), companions)
+    weighted = (offset * light[:, None]).reshape(*shape, 2).sum(axis=1)
     return Sight(
-        spots.centroids_px[nearest] - place,
-        blends(count, star, offset, light, widths_px(psf_sigma_px)),
-        spots.mag[nearest] + 2.5 * np.log10(optics.zero_point_e),
-        sums(offset * light[:, None]) / (1.0 + sums(light[:, None])),
+        spots[nearest] - place,
+        blends(count, star, offset, light, light > 1.0, widths_px(psf_sigma_px)),
+        mag[nearest],
+        weighted / (1.0 + light.reshape(shape).sum(axis=1))[:, None],
     )
 
 
@@ -97,10 +118,11 @@ def rendered(count: int, companions: int, psf_sigma_px: float, seed: int) -> Sig
     "count", [pytest.param(20, id="few"), pytest.param(668, id="all", marks=pytest.mark.slow)]
 )
 def test_pairs_are_seen_as_predicted(psf_sigma_px, count):
-    """More than 2,000 pairs where the offset is below 0.5 px; 0.03 px rms were asked for."""
+    """More than 2,000 pairs in all, where the offset is below 0.5 px."""
     sight = rendered(count, 1, psf_sigma_px, seed=11)
     assert sight.small.sum() > 0.7 * count
-    assert sight.rms_px(sight.predicted.offset) <= 0.015
+    assert sight.rms_px(sight.predicted.offset) <= 0.03
+    assert np.quantile(sight.apart_px[sight.small], 0.99) <= 0.04
     assert sight.rms_px(sight.photocentre) >= (0.05 if count > 100 else 0.02)
     assert np.hypot(*sight.measured[sight.small].T).max() > 0.2
     difference = (sight.mag - OWN_MAG + 2.5 * np.log10(sight.predicted.brightening))[sight.small]
@@ -112,9 +134,26 @@ def test_pairs_are_seen_as_predicted(psf_sigma_px, count):
 def test_crowds_are_seen_as_predicted(psf_sigma_px):
     sight = rendered(400, 3, psf_sigma_px, seed=12)
     assert sight.small.sum() > 150
-    apart = np.hypot(*(sight.measured - sight.predicted.offset).T)[sight.small]
-    # One in 400 of the narrowest spots rests elsewhere: sep parted it, or not.
-    assert np.quantile(apart, 0.99) <= 0.05
+    assert np.quantile(sight.apart_px[sight.small], 0.99) <= 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("psf_sigma_px", [0.6, 1.0, 1.5])
+def test_a_fainter_star_is_found_where_it_is_not_lost(psf_sigma_px):
+    """Up to 4 mag fainter and so far apart that about half are found by themselves."""
+    generator, widths = np.random.default_rng(13), widths_px(psf_sigma_px)
+    offset = around(600, 6.0 * widths.smoothed, generator)
+    fainter = generator.uniform(0.0, 4.0, 600)
+    place, spots, _ = measured(offset[:, None], fainter[:, None], psf_sigma_px, generator)
+    tree = cKDTree(spots)
+    (_, of_star), (apart, of_other) = tree.query(place), tree.query(place + offset)
+    is_found = (of_star != of_other) & (apart < 1.0)
+    light = 10.0 ** (0.4 * fainter)
+    other = blends(600, np.arange(600), -offset, light, light > 1.0, widths)
+    assert 0.2 < other.is_lost.mean() < 0.8
+    assert np.mean(is_found != other.is_lost) >= 0.93
+    moved = (place + offset + other.offset - spots[of_star])[other.is_lost & ~is_found]
+    assert np.median(np.hypot(*moved.T)) < 0.03
 
 
 # --- Properties
@@ -126,15 +165,15 @@ WIDTHS = widths_px(1.0)
 def pair(apart_px: float, delta_mag: float, angle_rad: float = 0.0) -> Blends:
     offset = apart_px * np.array([[np.cos(angle_rad), np.sin(angle_rad)]])
     light = np.array([10.0 ** (-0.4 * delta_mag)])
-    return blends(1, np.zeros(1, dtype=np.int64), offset, light, WIDTHS)
+    return blends(1, np.zeros(1, dtype=np.int64), offset, light, light > 1.0, WIDTHS)
 
 
 def test_no_neighbours():
     nobody = np.zeros(0, dtype=np.int64)
-    found = blends(2, nobody, np.zeros((0, 2)), np.zeros(0), WIDTHS)
+    found = blends(2, nobody, np.zeros((0, 2)), np.zeros(0), nobody > 0, WIDTHS)
     assert found.offset.tolist() == [[0.0, 0.0]] * 2
     assert (found.brightening.tolist(), found.contamination.tolist()) == ([1.0] * 2, [0.0] * 2)
-    none = blends(0, nobody, np.zeros((0, 2)), np.zeros(0), WIDTHS)
+    none = blends(0, nobody, np.zeros((0, 2)), np.zeros(0), nobody > 0, WIDTHS)
     assert (none.offset.shape, none.brightening.shape) == ((0, 2), (0,))
 
 
@@ -174,7 +213,7 @@ def test_a_star_in_the_light_of_a_bright_one_has_no_centroid_of_its_own():
 def test_the_centroid_is_where_the_moments_cancel():
     """By sums over a fine grid, without the closed form."""
     offset, light = np.array([[1.3, 0.4], [-0.8, 1.9]]), np.array([0.3, 0.5])
-    found = blends(1, np.zeros(2, dtype=np.int64), offset, light, WIDTHS)
+    found = blends(1, np.zeros(2, dtype=np.int64), offset, light, light > 1.0, WIDTHS)
     x, y = np.mgrid[-9.0:9.0:0.02, -9.0:9.0:0.02]
     image = np.zeros_like(x)
     for (a, b), f in zip([(0.0, 0.0), *offset], [1.0, *light], strict=True):
@@ -263,7 +302,7 @@ def test_close_stars(x_px, mag, rule, expected, dec_deg):
 def test_columns_say_what_was_predicted():
     selected = judged(sky([0.0, 1.2, 1.0], [4.0, 5.0, 8.0], 60.0, [0.0, 0.9, 0.0]), action="keep")
     offset, light = np.array([[1.2, 0.9], [1.0, 0.0]]), 10.0 ** (-0.4 * np.array([1.0, 4.0]))
-    expected = blends(1, np.zeros(2, dtype=np.int64), offset, light, WIDTHS)
+    expected = blends(1, np.zeros(2, dtype=np.int64), offset, light, light > 1.0, WIDTHS)
     star = selected.guide_stars.to_pylist()[0]
     moved = float(np.hypot(*expected.offset[0])) * PIXEL_ARCSEC
     assert star["centroid_offset_arcsec"] == pytest.approx(moved, rel=1e-6)

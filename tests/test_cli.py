@@ -367,7 +367,7 @@ def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
 def test_identify_as_json(starcat, frame, small_artifact):
     [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
-        "frame", "status", "origin", "n_matched", "remarks",
+        "frame", "status", "origin", "n_matched", "remarks", "database", "camera",
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec",
         "reduced_chi_square", "false_match_probability",
@@ -379,8 +379,8 @@ def test_identify_as_json(starcat, frame, small_artifact):
     assert sum(part**2 for part in answer["q_body_from_icrs"]) == pytest.approx(1.0)
     one = next(star for star in answer["stars"] if star["star"])
     assert list(one) == [
-        "x_px", "y_px", "star", "mag", "star_id", "ra_deg", "dec_deg", "dx_px", "dy_px",
-        "separation_arcsec", "difference_mag",
+        "x_px", "y_px", "observed_mag", "star", "mag", "star_id", "ra_deg", "dec_deg",
+        "dx_px", "dy_px", "separation_arcsec", "difference_mag",
     ]  # fmt: skip
     assert one["star"] == f"SAO {one['star_id']}"
     assert all(value > 0.0 for value in np.diagonal(answer["covariance_arcsec2"]))

@@ -31,7 +31,7 @@ MOST_PAIRS = 10_000_000
 FAINTER_MAG = 2.0
 """Stars up to so much beyond the faint limit may be one guide star together."""
 
-_SAME_SPOT = 0.1  # of a spot's width: centroids as close are of one spot
+_SAME_SPOT = 0.5  # of a spot's width: nothing tells apart centroids that are as close
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def judge_neighbours(stars: pa.Table, selection: Selection, pixel_arcsec: float)
     if rule.action != "merge":
         return Judged(judged, is_blended, absorbed)
     may_merge = is_blended.copy()
-    may_merge[rows] &= blend_mag <= selection.faint_limit_mag
+    may_merge[rows] &= ~seen.is_lost & (blend_mag <= selection.faint_limit_mag)
     heads, absorbed = _spots(sky, rows, pairs, seen, may_merge)
     place = np.searchsorted(rows, heads)
     centre = _moved(sky.directions[heads], seen.offset[place])
@@ -121,8 +121,11 @@ def _seen(sky: _Sky, rows: Rows, pairs: tuple[Rows, Rows]) -> Blends:
     own, theirs = sky.directions[rows], sky.directions[other]
     axes = tangent_axes(*radec_from_directions(own))
     offset = [np.einsum("ij,ij->i", theirs, axis[place]) for axis in axes]
-    light = 10.0 ** (0.4 * (sky.mag[rows][place] - sky.mag[other]))
-    return blends(len(rows), place, np.stack(offset, axis=1), light, sky.widths)
+    own_mag, mag = sky.mag[rows][place], sky.mag[other]
+    light = 10.0 ** (0.4 * (own_mag - mag))
+    is_first = sky.number[other] < sky.number[rows][place]
+    is_brighter = (mag < own_mag) | ((mag == own_mag) & is_first)
+    return blends(len(rows), place, np.stack(offset, axis=1), light, is_brighter, sky.widths)
 
 
 def _moved(directions: Directions, offset: Array) -> Directions:

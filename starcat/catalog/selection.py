@@ -1,7 +1,7 @@
 """Selection: which stars of a table become guide stars, and why the others do not.
 
-Filters are tried in a fixed order (magnitude, doubles, variables, count, density) and the first
-that applies is the verdict. Doubles are judged by separation and magnitude difference at the
+Filters are tried in a fixed order (magnitude, doubles, variables, distrust, count, density) and the
+first that applies is the verdict. Doubles are judged by separation and magnitude difference at the
 sensor's resolution, or by what neighbours do to their centroids (`blended.py`), and variables by
 amplitude; a bare flag of an archive is only one input.
 """
@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.blended import Judged, judge_neighbours
+from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
     directions_of,
@@ -105,6 +106,9 @@ def select_guide_stars(
     note("doubles")
     reject_variables(stars, selection.variables, verdicts)
     note("variables")
+    if selection.observed.reject:
+        verdicts.reject(is_distrusted(stars, selection.observed), Reason.distrusted)
+        note("distrust")
     if selection.max_stars is not None and selection.thinning == "brightest":
         verdicts.reject(
             beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count

@@ -40,6 +40,7 @@ class Reason(Enum):
     flagged_double = "the archive flags an unresolved double"
     variable = "amplitude above max_amplitude_mag"
     flagged_variable = "flagged variable, amplitude unknown"
+    distrusted = "distrusted by what flew: [selection.observed] lists it"
     beyond_count = "thinned to max_stars: fainter, or as selection.thinning says"
     density = (
         "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says"

@@ -25,6 +25,7 @@ from starcat.cli import (
     evaluation,
     exchange,
     interrupts,
+    learning,
     matching,
     releases,
     serving,
@@ -51,7 +52,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, bands, specs, builds, artifacts, sql, exchange),
-    *(releases, matching, evaluation, serving),
+    *(releases, matching, learning, evaluation, serving),
 ):
     app.add_typer(part.app)
 

@@ -10,7 +10,7 @@ PANELS = {
     "Design a database": ("sources", "bands", "presets", "init", "estimate"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
-    "Use it": ("simulate", "identify", "calibrate", "methods", "sql"),
+    "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),
     "Ship it": ("export", "publish", "pull", "releases"),
     "Serve it": ("serve", "token"),
 }

@@ -19,6 +19,7 @@ import pyarrow as pa
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.ingest import Ingested
+from starcat.catalog.observed import with_observed
 from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, sort_rows
@@ -140,7 +141,7 @@ def _make(
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
     in_band = in_band_of(stars, spec, inputs, workers, progress)
-    stars = in_band.stars
+    stars = with_observed(in_band.stars, spec.selection.observed)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)

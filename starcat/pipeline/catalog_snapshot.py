@@ -11,13 +11,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.catalog.observed import with_observed
 from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
 from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
 from starcat.pipeline.sensor_band import in_band_of
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import BuildSpec, Observed
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and to place it."""
@@ -72,9 +73,10 @@ def read_snapshot(
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
     in_band = in_band_of(stars, spec, inputs, workers, progress)
+    stars = with_observed(in_band.stars, spec.selection.observed)
     catalog = joined.catalog
     return CatalogSnapshot(
-        in_band.stars.combine_chunks(),
+        stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
         round(len(catalog.rejected) * _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS))),
@@ -92,6 +94,8 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
+    if spec.selection.observed != Observed():
+        wanted["observed"] = content["selection"]["observed"]
     if spec.camera.response.name is not None:
         wanted["response"] = content["camera"]["response"]
     if spec.catalog.motions or spec.camera.response.photometry:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chndtr
 
-from starcat.arrays import Array, Rows
+from starcat.arrays import Array, Mask, Rows
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise."""
@@ -29,12 +29,18 @@ _STEP = 1e-6  # widths; a shorter step is the last one
 _MOST_STEPS = 200  # only two equal stars that are just one spot need more
 
 
+_PARTED = (2.75, 0.61)
+"""Two equal stars are found apart from so many widths of a smoothed spot on, and from so many more
+for each magnitude that one is fainter: measured of our own detection (docs/algorithms.md)."""
+
+
 @dataclass(frozen=True)
 class Widths:
-    """Standard deviations of a spot and of the window around it; both in pixels or in an angle."""
+    """Standard deviations of a spot and of the window around it; all in pixels or in an angle."""
 
     spot: float  # of the spot as the pixels show it
     window: float  # of the Gaussian that weights the pixels of a centroid
+    smoothed: float  # of the spot in the filtered image that stars are found in
 
     @property
     def both(self) -> float:
@@ -48,7 +54,7 @@ class Widths:
 
     def times(self, scale: float) -> Widths:
         """Return the same widths in another unit."""
-        return Widths(self.spot * scale, self.window * scale)
+        return Widths(self.spot * scale, self.window * scale, self.smoothed * scale)
 
 
 def widths_px(psf_sigma_px: float, window_px: float | None = None) -> Widths:
@@ -58,7 +64,8 @@ def widths_px(psf_sigma_px: float, window_px: float | None = None) -> Widths:
     (True, 1.0)
     """
     spot = float(np.sqrt(psf_sigma_px**2 + PIXEL_VARIANCE))
-    return Widths(spot, max(spot, NARROWEST_WINDOW_PX) if window_px is None else window_px)
+    window = max(spot, NARROWEST_WINDOW_PX) if window_px is None else window_px
+    return Widths(spot, window, float(np.hypot(spot, psf_sigma_px)))
 
 
 @dataclass(frozen=True)
@@ -68,17 +75,23 @@ class Blends:
     offset: Array  # shape (N, 2): of the centroid from the star, in the unit of the widths
     brightening: Array  # shape (N,): light in the aperture over that of the star alone
     contamination: Array  # shape (N,): share of the light in the aperture that is of other stars
+    is_lost: (
+        Mask  # shape (N,): not found beside a brighter star, so that its centroid is that one's
+    )
 
 
-def blends(count: int, star: Rows, offset: Array, light: Array, widths: Widths) -> Blends:
+def blends(
+    count: int, star: Rows, offset: Array, light: Array, is_brighter: Mask, widths: Widths
+) -> Blends:
     """Return where the centroids of stars settle among their neighbours.
 
     A Gaussian spot at ``d`` from the middle of a Gaussian window has there the moment
     ``f d exp(-d^2 / 2 (s^2 + w^2))``, but for a factor that is the same for all spots. The
     centroid is where the moments of the star and its neighbours add up to nothing: at a maximum
-    of the image smoothed by the window. It is looked for uphill from the star itself, by steps to
-    the mean of the places weighted by ``f exp(...)``. The aperture's share of a spot is that of
-    the noncentral chi-squared distribution.
+    of the image smoothed by the window. It is looked for uphill from the star itself, or from the
+    brightest neighbour that it is not told apart from, by steps to the mean of the places weighted
+    by ``f exp(...)``. The aperture's share of a spot is that of the noncentral chi-squared
+    distribution.
 
     Parameters
     ----------
@@ -90,6 +103,8 @@ def blends(count: int, star: Rows, offset: Array, light: Array, widths: Widths) 
         Place of each neighbour from its star, in the unit of ``widths``.
     light : ndarray of float64, shape (M,)
         Light of each neighbour over that of its star.
+    is_brighter : ndarray of bool, shape (M,)
+        Whether the neighbour is the brighter of the two; of equal stars one is.
     widths : Widths
         Of the spots and of the window.
 
@@ -97,14 +112,29 @@ def blends(count: int, star: Rows, offset: Array, light: Array, widths: Widths) 
     ----------
     Fukunaga and Hostetler 1975, IEEE Transactions on Information Theory 21 (1), 32-40.
     """
+    start, is_lost = _starts(count, star, offset, light, is_brighter, widths)
     star, offset, light = _with_the_stars(count, star, offset, light)
-    centroid = _settled(count, star, offset, light, widths.both)
+    centroid = _settled(start, star, offset, light, widths.both)
     apart = np.sum(((offset - centroid[star]) / widths.spot) ** 2, axis=1)
     alone = -np.expm1(-0.5 * APERTURE_SIGMA**2)
     part = light * chndtr(APERTURE_SIGMA**2, 2.0, apart) / alone
     total = np.bincount(star, part, count).astype(np.float64)  # whole numbers of no stars
     own = part[:count]  # the stars themselves are first
-    return Blends(centroid, total, 1.0 - own / total)
+    return Blends(centroid, total, 1.0 - own / total, is_lost)
+
+
+def _starts(
+    count: int, star: Rows, offset: Array, light: Array, is_brighter: Mask, widths: Widths
+) -> tuple[Array, Mask]:
+    """Return where the centroiding of each star begins, and whether that is at another star."""
+    start, is_lost = np.zeros((count, 2)), np.zeros(count, dtype=bool)
+    equal, for_each_mag = _PARTED
+    rows = np.flatnonzero(is_brighter)
+    limit = equal + for_each_mag * 2.5 * np.log10(np.maximum(light[rows], 1.0))
+    rows = rows[np.hypot(*offset[rows].T) < limit * widths.smoothed]
+    rows = rows[np.argsort(light[rows], kind="stable")]  # the brightest is last, and stays
+    start[star[rows]], is_lost[star[rows]] = offset[rows], True
+    return start, is_lost
 
 
 def _with_the_stars(
@@ -118,9 +148,9 @@ def _with_the_stars(
     )
 
 
-def _settled(count: int, star: Rows, offset: Array, light: Array, width: float) -> Array:
-    """Return where steps uphill from the stars end."""
-    centroid = np.zeros((count, 2))
+def _settled(start: Array, star: Rows, offset: Array, light: Array, width: float) -> Array:
+    """Return where steps uphill end."""
+    count, centroid = len(start), start.copy()
     moving = np.bincount(star, minlength=count) > 1
     rows = np.arange(len(star))
     for _ in range(_MOST_STEPS):

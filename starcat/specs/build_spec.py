@@ -6,12 +6,18 @@ spec travels in the manifest of the database. `starcat.specs.reading` reads one 
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from starcat.geometry.camera import Camera
-from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
+from starcat.specs.camera_exposure import (
+    CameraExposure,
+    contradiction,
+    exposure_notes,
+    exposure_proposal,
+    with_limits,
+)
 from starcat.specs.camera_response import CameraResponse
 from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
@@ -29,11 +35,15 @@ MOST_BINS = 10_000_000
 
 LATER_KEYS = (
     *("products.levels", "catalog.motions", "selection.neighbours"),
-    "selection.thinning",
+    *("selection.thinning", "selection.observed"),
     *("camera.response", "camera.exposure"),
 )
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
+
+
+SHA256_PATTERN = r"^[0-9a-f]{64}$"
+Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
 
 class Catalog(Section):
@@ -114,6 +124,58 @@ class Variables(Section):
     )
 
 
+class Observed(Section):
+    """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
+
+    zero_point_mag: float | None = Field(
+        None,
+        ge=-100.0,
+        le=100.0,
+        description="measured magnitude of a star of colour 0 minus the catalog's; told, not "
+        "applied",
+        examples=[0.2],
+    )
+    colour_term: float = Field(
+        0.0,
+        ge=-5.0,
+        le=5.0,
+        description="mag becomes mag + colour_term x (colour_mag - reference_colour_mag)",
+    )
+    colour_bands: str | None = Field(
+        None, max_length=40, description="the colour that the term is for", examples=["BP-RP"]
+    )
+    reference_colour_mag: float = Field(
+        0.0,
+        ge=-20.0,
+        le=20.0,
+        description="stars of this colour keep their mag, as do those of unknown colour",
+    )
+    reject: tuple[int, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=4000,
+        description="star_id of the stars to distrust, which are rejected",
+        examples=[[3, 17]],
+    )
+    frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
+    database: str | None = Field(
+        None,
+        max_length=200,
+        description="database that they were identified with",
+        examples=["mycam-1.0.0"],
+    )
+    manifest_sha256: str | None = Field(
+        None, pattern=SHA256_PATTERN, description="digest of its manifest", examples=["0" * 64]
+    )
+    results_sha256: tuple[Sha256, ...] = Field(
+        (),
+        strict=False,
+        max_length=1000,
+        description="digests of the files of identified frames",
+        examples=[["0" * 64]],
+    )
+
+
 class Selection(Section):
     """Which stars become guide stars."""
 
@@ -143,6 +205,7 @@ class Selection(Section):
     doubles: Doubles = Doubles()
     neighbours: NeighbourRule = NeighbourRule()
     variables: Variables = Variables()
+    observed: Observed = Observed()
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Selection:
@@ -356,11 +419,15 @@ class BuildSpec(Section):
         return self
 
     @property
+    def exposure_proposal(self) -> tuple[str, ...]:
+        """The limits that the camera's exposure proposes."""
+        return exposure_proposal(self.camera.exposure, self.camera.response.response())
+
+    @property
     def exposure_notes(self) -> tuple[str, ...]:
-        """What the camera's exposure says of limits that are stated as magnitudes."""
-        selection, response = self.selection, self.camera.response.response()
-        limits = (selection.faint_limit_mag, selection.bright_limit_mag)
-        return exposure_notes(self.camera.exposure, response, *limits)
+        """What the camera's exposure says of a limit that is beyond it."""
+        response = self.camera.response.response()
+        return exposure_notes(self.camera.exposure, response, self.selection.faint_limit_mag)
 
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""
