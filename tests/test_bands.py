@@ -32,12 +32,15 @@ from starcat.bands.spectra import library, parsed_type
 from starcat.bands.synthetic import checked_zero_point, magnitudes
 from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.catalog.stars import table_from_columns
+from starcat.cli.specs import with_sensor
 from starcat.errors import ConfigError, FileMissing
+from starcat.evaluation.ecss.sensor import example_toml
 from starcat.images.render import Optics, star_electrons
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
+from starcat.pipeline.starter import advice, starter_spec
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_file import read_camera
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import read_spec, spec_from_dict
@@ -335,8 +338,8 @@ def test_limits_follow_from_an_exposure(tmp_path):
 
 def test_an_exposure_that_contradicts_the_limits_is_told(tmp_path):
     plain = spec_of(tmp_path, EXPOSURE)
-    assert [note.split(" ")[0] for note in plain.exposure_notes] == ["stars"]
-    assert "reject_saturated" in plain.exposure_notes[0]
+    assert plain.exposure_notes == ()
+    assert "has a signal-to-noise of 5, and one of" in plain.exposure_proposal[0]
     deep = read_spec(tmp_path / "spec.toml", {"selection.faint_limit_mag": "12"})
     assert "selection.faint_limit_mag 12 is beyond the sensor" in deep.exposure_notes[0]
     with pytest.raises(ConfigError, match="full_well_e, psf_sigma_px missing or 0"):
@@ -464,6 +467,33 @@ def test_hp_from_gaia_without_a_fit():
         assert band_pairs.pair(stars, "G, BP-RP", band).rms_mag <= 0.03
     red = found.of(2.0, 6.0)
     assert red.rms_mag <= 0.05
+
+
+@pytest.mark.slow
+def test_a_first_spec_is_in_the_band_of_its_sensor(tmp_path):
+    path = tmp_path / "sensor.toml"
+    path.write_text(example_toml(), encoding="utf-8")
+    plain = CameraSpec(width_px=1024, height_px=1024, fov_x_deg=20.0)
+    camera = with_sensor(plain, "red-ccd", path)
+    starter = starter_spec("own", camera)
+    assert starter.band == "red-ccd"
+    assert "a signal-to-noise of 5" in advice(starter)[0]
+    # A sensor that sees less than enough stars gets the limit that it sees.
+    dim = camera.model_copy(
+        update={"exposure": camera.exposure.model_copy(update={"aperture_mm": 2.0})}
+    )
+    limit = dim.exposure.exposure(shipped("red-ccd")).limit_mag(5.0)
+    found = starter_spec("own", dim).spec.selection.faint_limit_mag
+    assert found == round(limit, 2) < starter.spec.selection.faint_limit_mag
+    path.write_text(
+        example_toml()
+        .replace("# zero_point_e_s", "zero_point_e_s")
+        .replace("aperture_mm = ", "# a = ")
+        .replace("quantum_efficiency = ", "# q = "),
+        encoding="utf-8",
+    )
+    with pytest.raises(ConfigError, match="zero_point_e_s says nothing of the band"):
+        with_sensor(plain, None, path)
 
 
 @pytest.mark.slow

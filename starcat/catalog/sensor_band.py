@@ -24,6 +24,9 @@ from starcat.catalog.stars import floats_of, with_columns
 from starcat.catalog.verdict import Quality
 from starcat.errors import ConfigError
 
+ALONE = " alone"
+"""How the origin of a magnitude ends that is the mean of all stars of the band."""
+
 
 @dataclass(frozen=True)
 class InBand:
@@ -44,7 +47,8 @@ class Other:
     source: str
     rows: NDArray[np.int64]  # of the stars
     prediction: Prediction
-    told: NDArray[np.str_]  # how each magnitude was made
+    code: NDArray[np.int32]  # how each magnitude was made: a place in ``told``
+    told: tuple[str, ...]
 
 
 def in_sensor_band(
@@ -63,16 +67,16 @@ def in_sensor_band(
         "mag": predicted.mag,
         "band": response.name,
         "mag_error": np.hypot(predicted.error, variable),
-        "mag_source": pc.if_else(
-            pa.array(np.isnan(predicted.mag)), None, pa.array(predicted.source.astype(object))
+        "mag_source": pa.array(predicted.told).take(
+            pa.array(predicted.code, mask=np.isnan(predicted.mag))
         ),
         "catalog_mag": floats_of(stars, "mag"),
         "catalog_band": band,
-        "quality_flags": stars["quality_flags"].to_numpy() | predicted.flags(f"{band} alone"),
+        "quality_flags": stars["quality_flags"].to_numpy() | predicted.flags(),
     }
     known = np.isfinite(predicted.mag)
-    names, numbers = np.unique(predicted.source[known], return_counts=True)
-    counts = {str(name): int(number) for name, number in zip(names, numbers, strict=True)}
+    numbers = np.bincount(predicted.code[known], minlength=len(predicted.told)).tolist()
+    counts = {name: n for name, n in sorted(zip(predicted.told, numbers, strict=True)) if n}
     outside = int(np.count_nonzero(predicted.is_outside & known))
     return InBand(with_columns(stars, columns), response, band, counts, outside, best)
 
@@ -82,7 +86,7 @@ def other_of(
 ) -> Other:
     """Return what the counterparts of stars, in the order of ``rows``, say of their magnitudes."""
     found, _ = _predicted(counterparts, source, response)
-    return Other(source, rows, found.prediction, found.source)
+    return Other(source, rows, found.prediction, found.code, tuple(found.told))
 
 
 def _predicted(
@@ -110,9 +114,9 @@ def _predicted(
         took = predicted.take(found, f"{made.base}, {text}", found.has_colour)
         best = best or (made if took else None)
     mag, error = mags[band], _error(stars, band, mags[band], source, is_own=True)
-    types = stars["spectral_type"].to_pylist()
-    if predicted.is_open.any() and any(types):
-        found = predict_by_type(band, response, mag, [text or "" for text in types], error)
+    if predicted.is_open.any() and stars["spectral_type"].null_count < len(stars):
+        types = [text or "" for text in stars["spectral_type"].to_pylist()]
+        found = predict_by_type(band, response, mag, types, error)
         predicted.take(found, f"{band}, spectral type", found.has_colour)
     if predicted.is_open.all():
         raise ConfigError(
@@ -123,7 +127,7 @@ def _predicted(
             value=source,
         )
     found = predict_by_type(band, response, mag, [""] * len(stars), error)
-    predicted.take(found, f"{band} alone", np.ones(len(stars), dtype=bool))
+    predicted.take(found, f"{band}{ALONE}", np.ones(len(stars), dtype=bool))
     return predicted, best
 
 
@@ -132,49 +136,66 @@ class _Predicted:
 
     def __init__(self, count: int) -> None:
         self.mag, self.error = np.full(count, np.nan), np.full(count, np.nan)
-        self.source = np.full(count, "", dtype="<U128")
         self.is_outside = np.zeros(count, dtype=bool)
-
-    @property
-    def prediction(self) -> Prediction:
-        """The same as a prediction."""
-        has_colour = ~np.char.endswith(self.source, " alone") & (self.source != "")
-        return Prediction(self.mag, self.error, self.is_outside, has_colour)
+        # How each was made, as a place in a list: a text a star would take half a kilobyte.
+        self.code, self.told = np.zeros(count, dtype=np.int32), [""]
 
     @property
     def is_open(self) -> Mask:
         """Whether a star has no magnitude yet."""
-        return np.asarray(self.source == "")
+        return np.asarray(self.code == 0)
+
+    @property
+    def is_alone(self) -> Mask:
+        """Whether a star has its magnitude without a colour or a type."""
+        parts = (text.split(" + ") for text in self.told)
+        return np.array([all(part.endswith(ALONE) for part in own) for own in parts])[self.code]
+
+    @property
+    def prediction(self) -> Prediction:
+        """The same as a prediction."""
+        has_colour = ~self.is_open & ~self.is_alone
+        return Prediction(self.mag, self.error, self.is_outside, has_colour)
+
+    def _code_of(self, text: str) -> int:
+        if text not in self.told:
+            self.told.append(text)
+        return self.told.index(text)
 
     def take(self, found: Prediction, source: str, where: Mask) -> bool:
         """Fill in the stars that have no magnitude yet; whether there were any."""
         rows = self.is_open & where & np.isfinite(found.mag)
+        if not rows.any():
+            return False
         self.mag[rows], self.error[rows] = found.mag[rows], found.error_mag[rows]
-        self.source[rows], self.is_outside[rows] = source, found.is_outside[rows]
-        return bool(rows.any())
+        self.code[rows], self.is_outside[rows] = self._code_of(source), found.is_outside[rows]
+        return True
 
     def mix(self, other: Other) -> None:
         """Average with what another catalog says of some stars."""
-        rows, its = other.rows, other.prediction
-        own = self.prediction
-        own = Prediction(*(one[rows] for one in vars(own).values()))
+        rows, its, whole = other.rows, other.prediction, self.prediction
+        own = Prediction(*(one[rows] for one in vars(whole).values()))
         both = combined([own, its])
         ours, theirs = np.isfinite(own.mag), np.isfinite(its.mag)
-        told = np.char.add(f"{other.source} ", other.told)
-        mixed = np.char.add(np.char.add(self.source[rows], " + "), told)
         # One that is outside of its relation does not count beside one that is inside.
         only_theirs = theirs & (~ours | (own.is_outside & ~its.is_outside))
         only_ours = ~theirs | (ours & its.is_outside & ~own.is_outside)
-        kept = np.where(only_ours, self.source[rows], mixed)
-        self.source[rows] = np.where(only_theirs, told, kept)
+        ways = np.stack([self.code[rows], other.code, only_theirs, only_ours])
+        found, place = np.unique(ways, axis=1, return_inverse=True)
+        codes = []
+        for mine, its_code, is_theirs, is_ours in found.T.tolist():
+            told = f"{other.source} {other.told[its_code]}"
+            mixed = self.told[mine] if is_ours else f"{self.told[mine]} + {told}"
+            codes.append(self._code_of(told if is_theirs else mixed))
+        self.code[rows] = np.array(codes, dtype=np.int32)[place.ravel()] if codes else 0
         self.mag[rows], self.error[rows] = both.mag, both.error_mag
         self.is_outside[rows] = both.is_outside
 
-    def flags(self, alone: str) -> Array:
+    def flags(self) -> Array:
         """Return the quality bits that the magnitudes deserve."""
-        bits = np.where(self.is_outside, np.int32(Quality.COLOUR_OUT_OF_RANGE), np.int32(0))
-        estimated = np.int32(Quality.ESTIMATED_MAGNITUDE)
-        return np.asarray(bits | np.where(self.source == alone, estimated, np.int32(0)))
+        outside, estimated = int(Quality.COLOUR_OUT_OF_RANGE), int(Quality.ESTIMATED_MAGNITUDE)
+        bits = np.where(self.is_outside, outside, 0) | np.where(self.is_alone, estimated, 0)
+        return np.asarray(bits, dtype=np.int32)
 
 
 def _only(stars: pa.Table, name: str) -> str | None:

@@ -195,6 +195,7 @@ def estimate(
         (
             *read.notes,
             *spec.exposure_notes,
+            *spec.exposure_proposal,
             *depth_notes(read.stars, spec),
             *coverage_warnings(summary, gap),
         ),

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 
 from starcat.artifact.manifest import SourceFacts
 from starcat.bands.response import Response
-from starcat.catalog.sensor_band import InBand, Other, in_sensor_band, other_of
+from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import add_nearest_neighbours
 from starcat.pipeline.counterparts import match_tables, source_facts
@@ -93,7 +93,7 @@ def _photometry(
 
 def _notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
     notes = []
-    alone = made.counts.get(f"{made.band} alone", 0)
+    alone = made.counts.get(f"{made.band}{ALONE}", 0)
     if alone:
         notes.append(
             f"{spec.catalog.source}: {alone:,} of {len(made.stars):,} stars have neither colour "

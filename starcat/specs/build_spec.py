@@ -11,7 +11,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints, model_validator
 
 from starcat.geometry.camera import Camera
-from starcat.specs.camera_exposure import CameraExposure, contradiction, exposure_notes, with_limits
+from starcat.specs.camera_exposure import (
+    CameraExposure,
+    contradiction,
+    exposure_notes,
+    exposure_proposal,
+    with_limits,
+)
 from starcat.specs.camera_response import CameraResponse
 from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
@@ -413,11 +419,15 @@ class BuildSpec(Section):
         return self
 
     @property
+    def exposure_proposal(self) -> tuple[str, ...]:
+        """The limits that the camera's exposure proposes."""
+        return exposure_proposal(self.camera.exposure, self.camera.response.response())
+
+    @property
     def exposure_notes(self) -> tuple[str, ...]:
-        """What the camera's exposure says of limits that are stated as magnitudes."""
-        selection, response = self.selection, self.camera.response.response()
-        limits = (selection.faint_limit_mag, selection.bright_limit_mag)
-        return exposure_notes(self.camera.exposure, response, *limits)
+        """What the camera's exposure says of a limit that is beyond it."""
+        response = self.camera.response.response()
+        return exposure_notes(self.camera.exposure, response, self.selection.faint_limit_mag)
 
     def recorded(self) -> dict[str, Any]:
         """Return what a database says of its spec."""

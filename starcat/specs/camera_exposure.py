@@ -119,26 +119,30 @@ def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | N
     return None
 
 
-def exposure_notes(
-    section: CameraExposure, response: Response | None, faint_limit_mag: float, bright: float
-) -> tuple[str, ...]:
-    """Return what the exposure says of limits that are stated as magnitudes."""
+def exposure_proposal(section: CameraExposure, response: Response | None) -> tuple[str, ...]:
+    """Return the limits that an exposure proposes, where the spec does not ask for them."""
     exposure = section.exposure(response)
-    if exposure is None:
+    if exposure is None or (section.min_snr is not None and section.reject_saturated):
+        return ()
+    return (
+        f"in this exposure a star of {exposure.limit_mag(USUAL_SIGNAL_TO_NOISE):.2f} mag has a "
+        f"signal-to-noise of {USUAL_SIGNAL_TO_NOISE:g}, and one of {exposure.saturation_mag:.2f} "
+        "mag fills a pixel; camera.exposure.min_snr and reject_saturated make them the limits",
+    )
+
+
+def exposure_notes(
+    section: CameraExposure, response: Response | None, faint_limit_mag: float
+) -> tuple[str, ...]:
+    """Return what the exposure says of a limit that is stated as a magnitude and beyond it."""
+    exposure = section.exposure(response)
+    if exposure is None or section.min_snr is not None:
         return ()
     reach = exposure.limit_mag(USUAL_SIGNAL_TO_NOISE)
-    notes = []
-    if section.min_snr is None and faint_limit_mag > reach:
-        notes.append(
-            f"selection.faint_limit_mag {faint_limit_mag:g} is beyond the sensor: a star of "
-            f"{reach:.2f} mag has a signal-to-noise of {USUAL_SIGNAL_TO_NOISE:g}. "
-            f"camera.exposure.min_snr = {USUAL_SIGNAL_TO_NOISE:g} instead of the limit makes it "
-            "that"
-        )
-    full = exposure.saturation_mag
-    if not section.reject_saturated and bright < full:
-        notes.append(
-            f"stars brighter than {full:.2f} mag fill a pixel; camera.exposure.reject_saturated = "
-            "true leaves them out"
-        )
-    return tuple(notes)
+    if faint_limit_mag <= reach:
+        return ()
+    return (
+        f"selection.faint_limit_mag {faint_limit_mag:g} is beyond the sensor: a star of "
+        f"{reach:.2f} mag has a signal-to-noise of {USUAL_SIGNAL_TO_NOISE:g}. "
+        f"camera.exposure.min_snr = {USUAL_SIGNAL_TO_NOISE:g} instead of the limit makes it that",
+    )

@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcat.bands.photometry import band_error
-from starcat.bands.relation import Prediction, relation
+from starcat.bands.relation import Prediction, predict_by_type, relation
 from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.stars import directions_of, floats_of
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 SOURCES = {
     "G, BP-RP": ("G", ("BP", "RP")),
     "V, B-V": ("V", ("B", "V")),
+    "V, V-I": ("V", ("V", "I")),
+    "V, type": ("V", ("", "")),
     "VT, BT-VT": ("VT", ("BT", "VT")),
     "Hp, B-V": ("Hp", ("B", "V")),
     "J, J-Ks": ("J", ("J", "Ks")),
@@ -38,6 +41,7 @@ SOURCES = {
 TARGETS = ("Hp", "V", "BT", "VT", "G", "J", "H", "Ks")
 
 WITHIN_ARCSEC = 1.5
+FEWEST = 30
 
 NOT_SOUND = Quality.SATURATED | Quality.BLENDED | Quality.POOR_PHOTOMETRY | Quality.CONTAMINATED
 
@@ -65,8 +69,8 @@ class Pair:
 
 
 @cache
-def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Array]:
-    """Return the magnitudes of single, constant stars in every band, NaN where none.
+def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
+    """Return the magnitudes of single, constant stars in every band, and their spectral types.
 
     They are stars of Hipparcos to V 6.6. Few of them are faint enough for 2MASS: what is measured
     there is compared for stars of Tycho-1 to V 8.
@@ -77,6 +81,8 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Array]:
         stars = _read(source, catalogs / name, band, 2016.0)
         found[band] = floats_of(stars, "mag")
     found["B"] = floats_of(stars, "colour_mag") + found["V"]
+    found["I"] = found["V"] - floats_of(stars, "second_colour_mag")
+    types = np.array([text or "" for text in stars["spectral_type"].to_pylist()])
     if infrared:
         found["Hp"] = np.full(len(stars), np.nan)
         kept = ~(stars["is_flagged_double"].to_numpy() | stars["is_flagged_variable"].to_numpy())
@@ -89,7 +95,7 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Array]:
     found["BP"] = np.where(near, floats_of(gaia, "second_mag")[place], np.nan)
     found["RP"] = found["BP"] - floats_of(gaia, "colour_mag")[place]
     found |= _infrared(catalogs, directions_of(_read(source, catalogs / name, "V", 1999.5)))
-    return {band: mag[kept] for band, mag in found.items()}
+    return {band: mag[kept] for band, mag in {**found, "type": types}.items()}
 
 
 def _infrared(catalogs: Path, u: Array) -> dict[str, Array]:
@@ -128,9 +134,13 @@ def _nearest(u: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.boo
     return place, distance < np.radians(WITHIN_ARCSEC / 3600.0)
 
 
-def predictions(stars: dict[str, Array], source: str, target: str) -> tuple[Prediction, Array]:
+def predictions(stars: dict[str, Any], source: str, target: str) -> tuple[Prediction, Array]:
     """Return what one source predicts in a band, and the colours that it does so by."""
     base, (first, second) = SOURCES[source]
+    if not first:
+        mag = np.where(stars["type"] == "", np.nan, stars[base])
+        types, error = stars["type"].tolist(), band_error(base, mag)
+        return predict_by_type(base, shipped(target), mag, types, error), np.zeros(len(mag))
     colour = stars[first] - stars[second]
     colour_error = np.hypot(*(band_error(band, stars[base]) for band in (first, second)))
     made = relation(base, (first, second), shipped(target))
@@ -138,7 +148,7 @@ def predictions(stars: dict[str, Array], source: str, target: str) -> tuple[Pred
     return made.predict(stars[base], colour, error, colour_error), colour
 
 
-def pair(stars: dict[str, Array], source: str, target: str) -> Pair:
+def pair(stars: dict[str, Any], source: str, target: str) -> Pair:
     """Return how a source's predictions agree with a band, within the colours of the relation."""
     found, colour = predictions(stars, source, target)
     residual = stars[target] - found.mag
@@ -159,7 +169,7 @@ def table(catalogs: Path) -> str:
                 continue
             is_infrared = {target, base} & {"J", "H", "Ks"}
             found = pair(infrared if is_infrared else optical, source, target)
-            if not len(found.residual_mag):
+            if len(found.residual_mag) < FEWEST:
                 cells.append("")
                 continue
             bias = float(np.median(found.residual_mag))

@@ -142,7 +142,9 @@ and prints the stars of a field for limits around it. It must not be fainter tha
 sees; where it would be, the field is too small for that camera's stars. Much fainter than needed is
 no gain: the triangles are of each field's `boresights.brightest` stars, the others only make the
 database larger and the search longer. `selection.max_stars_per_field` thins the Milky Way and
-leaves the poles of the galaxy as they are.
+leaves the poles of the galaxy as they are. Where as many stars have to do as a tracker has room for
+(`selection.max_stars`), `selection.thinning = "information"` keeps those that make the sky even:
+[an even sky](algorithms.md#an-even-sky).
 """
 
 
