@@ -162,7 +162,7 @@ class Client:
         return list(self._answer("GET", f"databases/{database}/files").json())
 
     def report(self, database: str) -> Content:
-        """Return the report of a build, ``report/report.json`` of the artifact."""
+        """Return the report of a build, ``report/report.json`` of the database."""
         return self._json("GET", f"databases/{database}/report")
 
     def publish(self, database: str, note: str = "") -> Content:

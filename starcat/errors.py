@@ -157,7 +157,7 @@ class OutputError(StarcatError):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class SchemaError(StarcatError):
-    """A table or artifact that does not follow the schema of its product."""
+    """A table or database that does not follow the schema of its product."""
 
     exit_code = 4
     product: str | None = None
@@ -172,7 +172,7 @@ class SchemaVersionError(SchemaError):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class ProductError(StarcatError):
-    """A product or artifact that is corrupt, incomplete or does not match its manifest."""
+    """A product or database that is corrupt, incomplete or does not match its manifest."""
 
     exit_code = 5
     product: str | None = None
@@ -180,7 +180,7 @@ class ProductError(StarcatError):
 
 
 class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
-    """No artifact, or no database, at the place that was named."""
+    """No database at the place that was named."""
 
     exit_code = 3
 
@@ -215,7 +215,7 @@ class QueryError(StarcatError):
 
 
 class TargetMissing(QueryError):  # noqa: N818
-    """A query about an artifact or a file that is not there."""
+    """A query about a database or a file that is not there."""
 
     exit_code = 3
 

@@ -125,16 +125,9 @@ self_test = { frames = 5, min_identified = 0.8 }
 @pytest.fixture(scope="session")
 def sao_lines() -> list[bytes]:
     """600 records in the layout of SAO, of stars that do not exist, V 2.0 to 6.4."""
-    generator = np.random.default_rng(600)
-    ra_rad = generator.uniform(0.0, 2.0 * np.pi, 600)
-    dec_rad = np.arcsin(generator.uniform(-1.0, 1.0, 600))
-    lines = []
-    for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
-        mag = 2.0 + 4.4 * number / 600
-        front = f"{number:6d}".ljust(80) + f"{mag:4.1f}A0V"
-        motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
-        lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
-    return lines
+    from archives import plain_sao
+
+    return plain_sao(600)
 
 
 @pytest.fixture
@@ -207,7 +200,7 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
-    """The artifact of `small_spec`; to be copied by who changes it."""
+    """The database of `small_spec`; to be copied by who changes it."""
     from starcat.pipeline.build import build
     from starcat.specs.reading import spec_from_dict
 
@@ -234,7 +227,7 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    """A registry with the release of the small artifact; to be copied by who uses it."""
+    """A registry with the release of the small database; to be copied by who uses it."""
     from starcat.releases.publishing import publish_artifact
 
     folder = tmp_path_factory.mktemp("published") / "registry"
@@ -244,7 +237,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) ->
 
 @pytest.fixture
 def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
-    """The small artifact as a copy that may be changed; `artifact_copies.seal` puts it right."""
+    """The small database as a copy that may be changed; `artifact_copies.seal` puts it right."""
     from artifact_copies import copied
 
     return copied(small_artifact, tmp_path)
@@ -273,7 +266,7 @@ def client(root: Path, request: pytest.FixtureRequest) -> Iterator[TestClient]:
 def artifact_version(
     tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
 ) -> Callable[[str], Path]:
-    """The small artifact as another version: a sound artifact without the time of a build.
+    """The small database as another version: a sound database without the time of a build.
 
     The database, the manifest and the report differ from those of other versions, as they do
     when it is built; the tables are the same files.

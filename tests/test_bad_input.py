@@ -42,6 +42,8 @@ from starcat.errors import NotIdentifiedError, StarcatError
 from starcat.exchange.formats import format_of
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
+from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import check_blocks
@@ -50,6 +52,7 @@ from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.security.tokens import TokenStore
 from starcat.service.settings import Role
+from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
 from starcat.store.ingest import ingest_to_store
 from starcat.store.pixels import Pixel
@@ -113,7 +116,7 @@ class Place:
 
     @cached_property
     def copy(self) -> Path:
-        """A copy of the good artifact, to be damaged."""
+        """A copy of the good database, to be damaged."""
         return copied(self.artifact, self.folder)
 
     @cached_property
@@ -360,6 +363,10 @@ SPECS: Cases = {
         "fov_x_deg = 40.0", "fov_x_deg = 40.0, focal_length_mm = 30, pixel_um = 5"
     ),
     "band unknown in a spec": with_catalog('source = "sao", band = "K"'),
+    "distrusted star of another catalog": with_keys("selection.observed.reject = [1, 999999]"),
+    "colour term of another catalog": with_keys(
+        'selection.observed = { colour_term = 0.3, colour_bands = "BP-RP" }'
+    ),
     "counterparts in no catalog": with_keys("products.crossmatch = { enabled = true }"),
     "counterparts in the stars' own catalog": with_keys(
         'products.crossmatch = { enabled = true, catalogs = ["sao"] }'
@@ -401,7 +408,7 @@ def off_the_sky(place: Place) -> None:
 
 
 def matched_store(change: Callable[[Path, pa.Table], object]) -> Callable[[Place], Call]:
-    """Find the stars of a good artifact in a store, one of whose partitions is changed."""
+    """Find the stars of a good database in a store, one of whose partitions is changed."""
 
     def damage(place: Place) -> None:
         store = place.folder / "store"
@@ -565,7 +572,7 @@ BUILDS: Cases = {
         lambda place: (place.out / "stars.parquet").mkdir(parents=True),
     ),
     "frame below a file": run("simulate {artifact} -o {file}/frame.csv"),
-    "another artifact of that name": other_artifact,
+    "another database of that name": other_artifact,
     "disk full while building": run(GOOD_BUILD, disk_of(1 << 14)),
     "disk full while writing the database": run(GOOD_BUILD, disk_of(300_000)),
     "disk full while ingesting": run(
@@ -574,11 +581,11 @@ BUILDS: Cases = {
 }
 
 
-# Artifacts and frames ----------------------------------------------------------------------
+# Databases and frames ----------------------------------------------------------------------
 
 
 def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], None]:
-    """Change the manifest of a copy of the good artifact."""
+    """Change the manifest of a copy of the good database."""
 
     def rewrite(place: Place) -> None:
         path = place.copy / "manifest.json"
@@ -590,7 +597,7 @@ def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], No
 
 
 def hdf5(change: Callable[[Place, h5py.File], object]) -> Callable[[Place], None]:
-    """Change the database of a copy of the good artifact."""
+    """Change the database of a copy of the good database."""
 
     def rewrite(place: Place) -> None:
         with h5py.File(place.copy / "database.h5", "r+") as file:
@@ -609,7 +616,7 @@ def set_index(_: Place, file: h5py.File) -> None:
 
 
 def checked(name: str, change: Callable[[Path], object]) -> Callable[[Place], Call]:
-    """Check a copy of the good artifact, to a file of which something was done."""
+    """Check a copy of the good database, to a file of which something was done."""
 
     def call(place: Place) -> Call:
         change(place.copy / name)
@@ -644,12 +651,36 @@ def write_cube(place: Place) -> None:
     fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(place.folder / "frame.fits")
 
 
+LEARN = "learn {artifact} {folder}/a.ndjson"
+
+
+def answers(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], Call]:
+    """Learn from the answer to a good frame, changed."""
+
+    def write(place: Place) -> None:
+        matcher = Matcher.open(place.artifact)
+        sky, eye = matcher.database, matcher.database.camera
+        [frame] = simulate_frames(sky.directions, eye, 1, Noise(0.1), 1, mag=sky.mag)
+        measured = MeasuredFrame("frame", frame.centroids_px, frame.mag)
+        result = matcher.identify(frame.centroids_px, eye, magnitudes=frame.mag)
+        content = FrameAnswer(measured, result).content()
+        change(content)
+        place.write("a.ndjson", json.dumps(content) + "\n")
+
+    return run(LEARN, write)
+
+
+def without_magnitudes(answer: dict[str, Any]) -> None:
+    for one in answer["stars"]:
+        one["observed_mag"] = None
+
+
 CALIBRATE = "calibrate {artifact} {frame} -o {out} "
 IDENTIFY_FITS = "identify {artifact} {folder}/frame.fits"
 
 ARTIFACTS_AND_FRAMES: Cases = {
-    "not an artifact": run("inspect {folder}"),
-    "artifact to verify missing": run("verify {folder}/small-1.0.0"),
+    "not a database": run("inspect {folder}"),
+    "database to verify missing": run("verify {folder}/small-1.0.0"),
     "manifest not JSON": run(
         "inspect {copy}", lambda place: os.truncate(place.copy / "manifest.json", 500)
     ),
@@ -665,7 +696,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "product of a newer schema": newer_schema,
     "Parquet file damaged": checked("pairs.parquet", flip),
     "one byte of the database changed": checked("database.h5", flip),
-    "file of an artifact missing": checked("rejected.parquet", Path.unlink),
+    "file of a database missing": checked("rejected.parquet", Path.unlink),
     "database cut off": run(
         "selftest {copy}", lambda place: os.truncate(place.copy / "database.h5", 20_000)
     ),
@@ -725,6 +756,19 @@ ARTIFACTS_AND_FRAMES: Cases = {
         {"camera.toml": "width_px = 9\nheight_px = 9\nfocal_length_px = 9.0\n"},
     ),
     "plot of residuals of a kind that is not drawn": run(f"{CALIBRATE} --plot left.pdf"),
+    "results that are not there": run(LEARN),
+    "results that are no lines of JSON": run(
+        LEARN, {"a.ndjson": '{"status": "no_match"}\nframe 2'}
+    ),
+    "results that are frames, not answers": run(LEARN, {"a.ndjson": '[{"centroids_px": []}]'}),
+    "results of frames that are not identified": run(
+        LEARN, {"a.ndjson": '{"frame": "a", "status": "no_match"}\n'}
+    ),
+    "results of another database": answers(lambda one: one.update(database="sao-6-1.0.0")),
+    "results of a database of the same name": answers(lambda one: one["stars"][0].update(mag=1.5)),
+    "results of an older starcat": answers(lambda one: one.pop("camera")),
+    "results without magnitudes": answers(without_magnitudes),
+    "results of too few stars": answers(lambda one: one.update(stars=one["stars"][:5])),
     "method whose product is missing": run(
         "identify {copy} {frame} --method grid", hdf5(lambda _, file: file.pop("grid"))
     ),
@@ -735,7 +779,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
 
 
 def sql(query: str, more: str = "") -> Callable[[Place], Call]:
-    """Ask about the good artifact."""
+    """Ask about the good database."""
     return run(f"sql {{artifact}} {shlex.quote(query)} {more}")
 
 
@@ -981,11 +1025,11 @@ REGISTRIES: Cases = {
     "publishing into a folder with other things": run(
         "publish {artifact} {folder}/home", {"home/thesis.tex": "text"}
     ),
-    "publishing a damaged artifact": run(
+    "publishing a damaged database": run(
         "publish {copy} {folder}/registry", lambda place: flip(place.copy / "pairs.parquet")
     ),
     "no registry there": run("releases {folder}/registry"),
-    "artifact that a registry does not have": pull("smaller"),
+    "database that a registry does not have": pull("smaller"),
     "version that a registry does not have": pull("small@1.2.3"),
     "name and version of another form": pull("small@1.0"),
     "pull of nothing": run("pull -o {out}"),
@@ -995,7 +1039,7 @@ REGISTRIES: Cases = {
     "lock file damaged": pinned("small", "starcat-lock", "starcat-luck"),
     "lock file of a newer starcat": pinned("small", '"lock_version": "1', '"lock_version": "2'),
     "published version that is not the pinned one": pinned("small", '"bytes": ', '"bytes": 1'),
-    "another artifact at the name of a pull": run(
+    "another database at the name of a pull": run(
         PULL.format("small", ""), {"out/small-1.0.0/manifest.json": "{}"}
     ),
     "index of a registry damaged": pull_damaged(
@@ -1096,11 +1140,11 @@ ONBOARD_IMAGES: Cases = {
     "option of an onboard image for tables": run(f"{EXPORT} --to fits --max-bytes 9000"),
     "option of tables for an onboard image": run(f"{ONBOARD} --product stars"),
     "option of HATS for another format": run(f"{EXPORT} --to csv --max-partition-rows 9"),
-    "onboard image of an artifact without triangles": run(
+    "onboard image of a database without triangles": run(
         "export {copy} --to onboard -o {out}/db.img",
         manifest(lambda content: content["products"].pop("triangles")),
     ),
-    "onboard image of a damaged artifact": run(
+    "onboard image of a damaged database": run(
         "export {copy} --to onboard -o {out}/db.img",
         lambda place: flip(place.copy / "triangles.parquet"),
     ),
@@ -1122,7 +1166,7 @@ ONBOARD_IMAGES: Cases = {
     "onboard image of another version": image(with_word(12, 2)),
     "onboard image with a number that cannot be": image(with_word(28, 7)),
     "onboard image with a section that cannot be": image(with_word(256 + 8, 24)),
-    "artifact held against an artifact": run("verify {artifact} --against {artifact}"),
+    "database held against a database": run("verify {artifact} --against {artifact}"),
 }
 
 
@@ -1264,9 +1308,7 @@ def test_the_page_lists_exactly_these_kinds():
     assert len(CASES) == sum(map(len, GROUPS)) >= 20
 
 
-@pytest.mark.parametrize(
-    "kind", ["file missing", "key unknown", "not an artifact", "no stars left"]
-)
+@pytest.mark.parametrize("kind", ["file missing", "key unknown", "not a database", "no stars left"])
 def test_exit_codes_reach_the_shell(kind, place):
     code, text = run_apart(place, CASES[kind](place))
     assert code == page_rows()[kind][1]

@@ -1,4 +1,4 @@
-"""Pictures by cameras of 5 to 30 deg, identified in one artifact that is told nothing else."""
+"""Pictures by cameras of 5 to 30 deg, identified in one database that is told nothing else."""
 
 from __future__ import annotations
 

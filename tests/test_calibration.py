@@ -348,7 +348,7 @@ def test_what_is_known_of_a_camera_must_not_contradict_itself():
 
 @pytest.fixture(scope="module")
 def small_frames(small_artifact, tmp_path_factory):
-    """Files of centroids of a lens with k1 = -0.15, of the small artifact's sky."""
+    """Files of centroids of a lens with k1 = -0.15, of the small database's sky."""
     folder = tmp_path_factory.mktemp("frames")
     database = open_database(small_artifact)
     focal_px = 1.03 * database.camera.focal_length_px

@@ -17,7 +17,7 @@ from genuine_records import PSC, SAO, SUPPL_1, TYC2, TYC_MAIN
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR
 from starcat.catalog.ingest import Ingested, StarTables, ingest
-from starcat.catalog.proper_motion import Motion, propagate
+from starcat.catalog.proper_motion import Motion, propagate_in_space
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.verdict import Quality
@@ -193,7 +193,8 @@ def test_epoch_moves_every_star_by_its_own_years(catalogs, ingested, source, nam
     own = ingested(source, name).stars
     moved = ingest(source, [catalogs / name], epoch_jyear=2026.5).stars
     start = Motion(*(floats_of(own, field.name) for field in fields(Motion)))
-    end = propagate(start, 2026.5 - floats_of(own, "epoch_jyear"))
+    in_space = [floats_of(own, name) for name in ("parallax_mas", "radial_velocity_km_s")]
+    end, _ = propagate_in_space(start, *in_space, floats_of(own, "epoch_jyear"), np.array(2026.5))
     assert moved["star_id"].equals(own["star_id"])
     for column, values in vars(end).items():
         np.testing.assert_allclose(floats_of(moved, column), values, rtol=0, atol=1e-11)

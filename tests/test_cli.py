@@ -62,6 +62,29 @@ def test_each_option_says_what_it_does(name):
         assert getattr(parameter, "help", None), f"{name} {parameter.name}"
 
 
+def test_o_is_everywhere_where_the_result_goes(starcat, small_artifact, tmp_path):
+    outputs = {
+        name: option
+        for name, command in every_command().items()
+        for option in command.params
+        if "-o" in option.opts
+    }
+    assert len(outputs) == 13
+    for name, option in outputs.items():
+        assert option.opts == ["--output", "-o"], name
+        assert option.metavar in ("FILE", "FOLDER", "FILE|FOLDER"), name
+        assert option.help.startswith("Where "), name
+    file = tmp_path / "file"
+    file.write_text("")
+    for arguments in (["coverage", small_artifact, "-o", file], ["pull", "a", "-o", file]):
+        run = starcat(arguments)
+        assert (run.code, run.err) == (
+            1, f"starcat: error: {file}: is a file; choose a folder with --output\n"
+        )  # fmt: skip
+    run = starcat(["simulate", small_artifact, "-o", tmp_path])
+    assert "is a folder; choose a file with --output" in run.err
+
+
 def test_help_lists_every_command(starcat):
     run = starcat(["--help"])
     assert run.code == 0
@@ -344,7 +367,7 @@ def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
 def test_identify_as_json(starcat, frame, small_artifact):
     [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
-        "frame", "status", "origin", "n_matched", "remarks",
+        "frame", "status", "origin", "n_matched", "remarks", "database", "camera",
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec",
         "reduced_chi_square", "false_match_probability",
@@ -356,8 +379,8 @@ def test_identify_as_json(starcat, frame, small_artifact):
     assert sum(part**2 for part in answer["q_body_from_icrs"]) == pytest.approx(1.0)
     one = next(star for star in answer["stars"] if star["star"])
     assert list(one) == [
-        "x_px", "y_px", "star", "mag", "star_id", "ra_deg", "dec_deg", "dx_px", "dy_px",
-        "separation_arcsec", "difference_mag",
+        "x_px", "y_px", "observed_mag", "star", "mag", "star_id", "ra_deg", "dec_deg",
+        "dx_px", "dy_px", "separation_arcsec", "difference_mag",
     ]  # fmt: skip
     assert one["star"] == f"SAO {one['star_id']}"
     assert all(value > 0.0 for value in np.diagonal(answer["covariance_arcsec2"]))

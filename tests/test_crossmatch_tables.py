@@ -1,4 +1,4 @@
-"""Cross-identification in artifacts and files: built, checked, rebuilt, compared, and printed."""
+"""Cross-identification in databases and files: built, checked, rebuilt, compared, and printed."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def spec_of(text: str, **crossmatch: object) -> BuildSpec:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
-    """SAO as the small artifact has it, and 500 of the 600 stars as Gaia would: at J2016."""
+    """SAO as the small database has it, and 500 of the 600 stars as Gaia would: at J2016."""
     folder = tmp_path_factory.mktemp("crossmatch")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     stars = ingest("sao", [folder / "sao.dat"]).stars
@@ -84,7 +84,7 @@ def copy(artifact: Path, tmp_path: Path) -> Path:
     return copied(artifact, tmp_path)
 
 
-# In an artifact ------------------------------------------------------------------------------
+# In a database ------------------------------------------------------------------------------
 
 
 def test_an_artifact_names_the_counterparts(artifact):
@@ -126,7 +126,7 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     dumped = json.loads((small_artifact / "manifest.json").read_bytes())["spec"]
     assert dumped == plain.recorded()
     assert dumped.keys() == BuildSpec.model_fields.keys()
-    # What an artifact has no part of since before there was such a product is not mentioned.
+    # What a database has no part of since before there was such a product is not mentioned.
     assert dumped["products"].keys() == Products.model_fields.keys() - {"levels"}
     named = spec_of(small_spec, catalogs=["gaia"], radius_arcsec=5.0)
     assert named.sources == ("sao",)

@@ -1,4 +1,4 @@
-"""The difference between artifacts: which stars came, went and moved, and why."""
+"""The difference between databases: which stars came, went and moved, and why."""
 
 from __future__ import annotations
 

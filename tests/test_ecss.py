@@ -301,4 +301,4 @@ def test_the_options_of_a_sweep_do_not_go_with_a_sensor(tmp_path):
     for wrong in ([*command, "--noise-px", "1"], ["evaluate", "--paper", "S1", *command[2:]]):
         done = CliRunner().invoke(app, wrong, standalone_mode=False)
         assert isinstance(done.exception, ConfigError)
-        assert "--ecss goes with an artifact" in str(done.exception)
+        assert "--ecss goes with a database" in str(done.exception)

@@ -49,7 +49,7 @@ def read(small, small_spec: str) -> CatalogSnapshot:
 
 
 def check(found: Estimate, folder: Path, least_bytes: int = 0, *, is_small: bool = False) -> None:
-    """Compare an estimate with an artifact: stars to the last one, files within 20 %."""
+    """Compare an estimate with a database: stars to the last one, files within 20 %."""
     manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
     [stars, *_] = manifest["sources"]
     assert found.cost.stars == stars["kept"] == manifest["products"]["stars"]["rows"]

@@ -390,7 +390,7 @@ def test_values_out_of_range_are_refused(name, value):
 
 def test_a_sweep_varies_one_quantity_at_a_time(small_artifact, monkeypatch):
     other = Method(METHODS["triangle"].propose, ("moons",))
-    monkeypatch.setitem(METHODS, "other", other)  # the artifact has none
+    monkeypatch.setitem(METHODS, "other", other)  # the database has none
     given = {"noise_px": (0.4,), "false_stars": (3.0, 0.0), "scale": (1.0, 1.01)}
     paper = sweep_paper(plan_sweep(small_artifact, given, method="all", camera=LENS, frames=7))
     made = paper.rows(False)
@@ -714,7 +714,7 @@ def test_artifacts_are_built_from_presets(monkeypatch, small_spec, sao_lines, tm
     manifest = made["a"] / "manifest.json"
     before = manifest.stat()
     evaluate.prepare_artifacts(["a"], *arguments[1:])
-    assert manifest.stat().st_mtime_ns == before.st_mtime_ns  # the same artifact is left alone
+    assert manifest.stat().st_mtime_ns == before.st_mtime_ns  # the same database is left alone
     changed = spec.model_copy(update={"name": "a", "description": "another"})
     monkeypatch.setattr(evaluate, "preset", lambda name: changed)
     evaluate.prepare_artifacts(["a"], *arguments[1:])

@@ -1,4 +1,4 @@
-"""starcat export: files of every format, existing outputs, artifacts, Parquet files and peers."""
+"""starcat export: files of every format, existing outputs, databases, Parquet files and peers."""
 
 from __future__ import annotations
 

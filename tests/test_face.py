@@ -166,7 +166,7 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, w
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "<Artifact gaia-12deg-1.0.0: " in done.stdout
+    assert "<Database gaia-12deg-1.0.0: " in done.stdout
     assert "<MatchResult" in done.stdout
     *_, place, is_compiled = done.stdout.splitlines()
     assert place.startswith(str(site))

@@ -310,7 +310,7 @@ def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
     export_image(small_artifact, "onboard", path, endian="big")
     with pytest.raises(ProductError, match="the other byte order"):
         Matcher.open(path)
-    with pytest.raises(ConfigError, match="needs an artifact"):
+    with pytest.raises(ConfigError, match="needs a database"):
         Matcher.open(path, engine="numpy")
 
 

@@ -1,4 +1,4 @@
-"""Artifacts that somebody damaged or made up: starcat's own errors, or an answer, and no more."""
+"""Databases that somebody damaged or made up: starcat's own errors, or an answer, and no more."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def copy(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture(scope="module")
 def frame(small_artifact: Path) -> Any:
-    """A frame that the sound artifact identifies, with false stars in it."""
+    """A frame that the sound database identifies, with false stars in it."""
     database = open_database(small_artifact)
     noise = Noise(0.3, false_stars=2)
     (made,) = simulate_frames(database.directions, database.camera, 1, noise, 8)
@@ -47,7 +47,7 @@ def frame(small_artifact: Path) -> Any:
 
 
 def identify(artifact: Path, method: str, frame: Any) -> bool:
-    """Return whether a frame got an answer; an answer makes sense, whatever the artifact holds."""
+    """Return whether a frame got an answer; an answer makes sense, whatever the database holds."""
     try:
         matcher = Matcher.open(artifact, method)
     except StarcatError:

@@ -1,6 +1,6 @@
 """The examples that the commands' help prints run as they are printed.
 
-Each runs in a folder with what a user would have there: an archive file, and the artifacts that
+Each runs in a folder with what a user would have there: an archive file, and the databases that
 the other examples speak of, built from a small sky so that most of this takes no time.
 """
 
@@ -19,6 +19,7 @@ import pytest
 from every_command import every_command
 
 from starcat.cli.options import chosen_spec
+from starcat.images.solve_files import identify_file
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -66,9 +67,16 @@ def workplace(
             folder / "dist",
         )
     database = open_database(folder / "dist" / "gaia-12deg-1.0.0")
-    frames = simulate_frames(database.directions, database.camera, 6, Noise(0.2), 1)
-    content = [{"centroids_px": frame.centroids_px.tolist()} for frame in frames]
+    frames = simulate_frames(
+        database.directions, database.camera, 6, Noise(0.2), 1, mag=database.mag
+    )
+    content = [
+        {"centroids_px": frame.centroids_px.tolist(), "mag": frame.mag.tolist()} for frame in frames
+    ]
     (folder / "frames.json").write_text(json.dumps(content))
+    answers = identify_file(folder / "frames.json", folder / "dist" / "gaia-12deg-1.0.0")
+    lines = [json.dumps(answer.content()) for answer in answers]
+    (folder / "answers.ndjson").write_text("\n".join(lines))
     return folder
 
 

@@ -323,7 +323,7 @@ def test_an_artifact_of_a_range_is_asked_from_the_command_line(
     assert (run.code, "--size is the size of frames with --fov" in run.err) == (2, True)
     run = starcat(["identify", built, tmp_path / "frame.png", "--fov", "32:70", "--size", "8x8"])
     assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
-    # An artifact without levels does not mention them, as before there was such a product.
+    # A database without levels does not mention them, as before there was such a product.
     plain = json.loads((small_artifact / "manifest.json").read_bytes())
     assert "levels" not in plain["spec"]["products"]
     assert "levels" in manifest["spec"]["products"]

@@ -50,7 +50,7 @@ RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angul
 
 @dataclass(frozen=True)
 class Ground:
-    """A sky to be tried on: an artifact and how many frames of each kind."""
+    """A sky to be tried on: a database and how many frames of each kind."""
 
     artifact: Path
     frames: int

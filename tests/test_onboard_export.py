@@ -22,7 +22,7 @@ from starcat.onboard.reading import read_image
 
 @pytest.fixture
 def path(starcat, small_artifact, tmp_path) -> Path:
-    """The image of the small artifact."""
+    """The image of the small database."""
     path = tmp_path / "db.img"
     starcat(["export", small_artifact, "--to", "onboard", "-o", path])
     return path
@@ -150,7 +150,7 @@ def test_verify_holds_an_image_against_another_artifact(artifact_version, starca
     problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
     assert len(problems) == 2
     assert problems[0].startswith("the sha256 of its manifest begins with ")
-    assert problems[1] == "name is small-1.0.0; the artifact says small-1.0.1"
+    assert problems[1] == "name is small-1.0.0; the database says small-1.0.1"
     assert starcat(["verify", path]).code == 0
 
 

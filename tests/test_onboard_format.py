@@ -95,7 +95,7 @@ def parsed(image: tuple[bytes, str, str]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def artifact(small_artifact: Path) -> Callable[[str], dict[str, list[Any]]]:
-    """The products of the artifact that the images are of."""
+    """The products of the database that the images are of."""
     return lambda name: pq.read_table(small_artifact / f"{name}.parquet").to_pydict()
 
 

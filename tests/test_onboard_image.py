@@ -330,16 +330,16 @@ def test_an_image_of_another_artifact_is_found(real):
         return " ".join(artifact_problems(image, replace(contents, **changes)))  # type: ignore[arg-type]
 
     assert "the sha256 of its manifest begins with 000102" in said(manifest_sha256=bytes(32))
-    assert "epoch is 2026.5; the artifact says 2000.0" in said(epoch_jyear=2000.0)
+    assert "epoch is 2026.5; the database says 2000.0" in said(epoch_jyear=2000.0)
     assert "name is sky-1.0.0" in said(name="sky-2.0.0")
     assert "camera is (1024, 768," in said(camera=Camera(1024, 768, 4000.0))
-    assert "1500 stars are not in the artifact: " in said(star_id=contents.star_id + 10**9)
+    assert "1500 stars are not in the database: " in said(star_id=contents.star_id + 10**9)
     moved = contents.directions + 1e-8
     moved /= np.linalg.norm(moved, axis=1)[:, None]
-    assert "stars lie elsewhere than in the artifact, by up to 0.00" in said(directions=moved)
+    assert "stars lie elsewhere than in the database, by up to 0.00" in said(directions=moved)
     assert "magnitudes: 1285 stars have another one" in said(mag=contents.mag + 0.002)
     fewer = contents.features[1:]
-    assert "section triangles: not all of them are in the artifact" in said(features=fewer)
+    assert "section triangles: not all of them are in the database" in said(features=fewer)
 
 
 def test_the_grid_covers_the_sky_and_knows_its_corners():

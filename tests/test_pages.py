@@ -10,7 +10,7 @@ from urllib.parse import urljoin
 
 import pytest
 from fastapi.testclient import TestClient
-from services import DATABASE, add_database, client_of
+from services import DATABASE, SPEC, add_database, client_of
 
 from starcat.service.jobs.job import Attempt, Outcome, begin_next
 from starcat.service.pages.draft import draft_of_form, draft_of_text
@@ -28,26 +28,6 @@ PAGES = [
 """Pages of databases."""
 
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
-
-SPEC = """\
-name = "small"
-version = "1.0.0"
-epoch_jyear = 2016.0
-
-[catalog]
-source = "gaia"
-
-[selection]
-faint_limit_mag = 4.5
-
-[camera]
-width_px = 512
-height_px = 512
-fov_x_deg = 30.0
-
-[boresights]
-count = 300
-"""
 
 
 @pytest.fixture(scope="module")

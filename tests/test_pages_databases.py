@@ -1,4 +1,4 @@
-"""The pages of databases, their console, releases and the start, on a small artifact."""
+"""The pages of databases, their console, releases and the start, on a small database."""
 
 from __future__ import annotations
 

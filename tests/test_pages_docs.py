@@ -77,3 +77,9 @@ def test_tables_of_the_documentation_are_tables(name):
     assert body.count('<table class="grid">') > 1
     assert "style=" not in body
     assert "|---" not in body
+
+
+def test_formulas_of_the_documentation_are_formulas():
+    bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", read_page(name).body) for name in NAMES]
+    assert sum(body.count("<math ") for body in bodies) > 100
+    assert not [found for body in bodies for found in re.findall(r"\$.*|\\(?:frac|sigma).*", body)]

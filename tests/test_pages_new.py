@@ -6,6 +6,7 @@ import re
 
 import pytest
 from fastapi.testclient import TestClient
+from services import SPEC as SMALL
 from services import client_of, token_of
 
 from starcat.errors import ConfigError
@@ -15,25 +16,7 @@ from starcat.specs.reading import preset_names
 
 SETTINGS = {"anonymous": "builder"}
 
-SPEC = """\
-name = "mine"
-version = "1.0.0"
-epoch_jyear = 2016.0
-
-[catalog]
-source = "gaia"
-
-[selection]
-faint_limit_mag = 4.5
-
-[camera]
-width_px = 512
-height_px = 512
-fov_x_deg = 20.0
-
-[boresights]
-count = 300
-"""
+SPEC = SMALL.replace('"small"', '"mine"').replace("30.0", "20.0")
 
 
 def _sent(client: TestClient, address: str, text: str, **more: str):

@@ -1,4 +1,4 @@
-"""The view of the sky, downloads, tables and notebooks of the pages, on a small artifact."""
+"""The view of the sky, downloads, tables and notebooks of the pages, on a small database."""
 
 from __future__ import annotations
 

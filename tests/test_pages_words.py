@@ -11,7 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 from PIL import Image
 from services import DATABASE, client_of
+from services import SPEC as SMALL
 
+from starcat.matcher.refusal import HINTS
 from starcat.service.jobs.job import Attempt, Outcome, begin_next
 from starcat.service.jobs.submission import submit_ingest
 from starcat.service.pages.wording import in_page_words
@@ -19,14 +21,7 @@ from starcat.service.pages.wording import in_page_words
 SETTINGS = {"anonymous": "publisher", "upload_mib": 1.0}
 PAGE = f"/databases/{DATABASE}"
 
-SPEC = """\
-name = "small"
-version = "9.0.0"
-epoch_jyear = 2016.0
-catalog.source = "gaia"
-selection.faint_limit_mag = 4.5
-camera = { width_px = 512, height_px = 512, fov_x_deg = 30.0 }
-"""
+SPEC = SMALL.replace('"1.0.0"', '"9.0.0"')
 
 
 def picture(width: int, height: int, *, has_stars: bool = True) -> bytes:
@@ -160,3 +155,11 @@ def test_empty_pages_say_what_to_do_first(tmp_path):
             main = page.partition("<main")[2].partition("</main>")[0]
             assert 'href="/new"' in main, address
             assert "Every database is published" not in page
+
+
+def test_advice_of_a_refusal_names_fields_of_the_page():
+    said = {reason: in_page_words(hint) for reason, hint in HINTS.items()}
+    assert not [text for text in said.values() if re.search(r"_|--|\(flip\)|[;,] *$|,,", text)]
+    assert said["scale"].endswith("allow a larger error of it (“Error of the field”)")
+    assert said["mirrored"] == "turn the frame over (“y counts up”)"
+    assert said["chance"].startswith("give magnitudes, or find more stars; check the field")

@@ -29,7 +29,7 @@ FILES = {
     "database.h5", "manifest.json", "report/index.html", "rejected.parquet",
     "report/self_test.json", "stars.parquet",
 }  # fmt: skip
-"""Every artifact has these; each other product adds a Parquet file."""
+"""Every database has these; each other product adds a Parquet file."""
 
 LOG = "small-1.0.0.build.json"
 
@@ -53,7 +53,7 @@ def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., B
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Every file but the logs beside artifacts: their times differ."""
+    """Every file but the logs beside databases: their times differ."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOG)
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
@@ -89,7 +89,7 @@ def first(tmp_path_factory, sao_lines, small_spec):
 
 @pytest.fixture
 def dist(first: tuple[Built, list[Event]], tmp_path: Path) -> Path:
-    """A folder that `build_small` builds into, with the artifact in it."""
+    """A folder that `build_small` builds into, with the database in it."""
     return Path(shutil.copytree(first[0].folder.parent, tmp_path / "dist"))
 
 

@@ -36,7 +36,7 @@ from starcat.query.worker import BESIDE_BYTES
 
 @pytest.fixture(scope="module")
 def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the artifact, with a file beside it that nobody named."""
+    """A copy of the database, with a file beside it that nobody named."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
     shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")

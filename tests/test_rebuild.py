@@ -94,12 +94,12 @@ def test_what_was_changed_afterwards_is_named(copy, sao_file):
     assert [(change.file, change.what) for change in rebuilt.changes] == [
         ("notes.txt", "not made by the rebuild"),
         ("pairs.parquet", "changed since it was built"),
-        ("triangles.parquet", "missing in the artifact"),
+        ("triangles.parquet", "missing in the database"),
     ]
 
 
 def test_columns_that_came_out_differently_are_named(copy, sao_file):
-    """An artifact that is sound by its own manifest, and still not what the inputs give."""
+    """A database that is sound by its own manifest, and still not what the inputs give."""
     path = copy / "stars.parquet"
     table = read_parquet(path)
     place = table.schema.get_field_index("mag")

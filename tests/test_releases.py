@@ -498,9 +498,9 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
         of_manifest(lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
         "files.pairs.parquet.bytes is '1e\\+99'",
     ),
-    "no whole artifact": (
+    "no whole database": (
         of_manifest(lambda content: content["files"].pop("pairs.parquet")),
-        "not a whole artifact: .*pairs.parquet is not among the files",
+        "not a whole database: .*pairs.parquet is not among the files",
     ),
     "index not JSON": (index_of("<html>"), "not what starcat writes"),
     "index empty": (index_of(""), "not what starcat writes"),
@@ -558,7 +558,7 @@ def test_a_damaged_address_is_refused(kind, registry, tmp_path):
 def test_file_names_that_lead_out(registry, name):
     add_file(registry, name)
     before = bytes_of(Path())
-    with pytest.raises(ProductError, match="no plain path within an artifact; nothing was"):
+    with pytest.raises(ProductError, match="no plain path within a database; nothing was"):
         pull("small", registry)
     assert bytes_of(Path()) == before
     assert not Path("/tmp/starcat-x").exists()

@@ -185,7 +185,7 @@ class Reader:
 
 
 def check_output(output: Path, artifact: Path) -> bool:
-    """Return whether the artifact is at its final name; it is whole or not there at all."""
+    """Return whether the database is at its final name; it is whole or not there at all."""
     final = output / artifact.name
     if not final.exists():
         return False

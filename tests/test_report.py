@@ -26,6 +26,7 @@ from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
+from starcat.products.evenness import Evenness
 from starcat.report.coverage_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
@@ -33,13 +34,15 @@ from starcat.report.report import count_magnitudes, report_coverage
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 
-PLOTS = ["coverage_histogram", "coverage_map", "stars_by_magnitude"]
+PLOTS = ["attitude_error", "coverage_histogram", "coverage_map", "stars_by_magnitude"]
 FILES = {
     *(f"{name}.{kind}" for name in PLOTS for kind in ("png", "svg")),
-    *(f"{name}.csv" for name in ("coverage", "coverage_histogram", "stars_by_magnitude")),
+    *(f"{name}.csv" for name in PLOTS if name != "coverage_map"),
+    "coverage.csv",
     *(f"{name}.json" for name in ("coverage", "report", "self_test")),
     "index.html",
 }
+EVEN = Evenness(np.ones(4), np.ones(4), 1.0, 4)
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 
@@ -236,7 +239,7 @@ def test_the_page_needs_nothing_else(page, artifact):
     assert page.open == []
     assert not [word for word in ("http:", "https:", "url(", "@import") if word in text]
     kind = "data:image/svg+xml;base64,"
-    assert [source[: len(kind)] for source in page.loads] == [kind] * 3
+    assert [source[: len(kind)] for source in page.loads] == [kind] * len(PLOTS)
     drawn = {b64decode(source[len(kind) :]) for source in page.loads}
     assert drawn == {(artifact.folder / "report" / f"{name}.svg").read_bytes() for name in PLOTS}
 
@@ -341,7 +344,7 @@ def test_the_poles_have_a_place_on_the_map():
 @pytest.mark.parametrize("counts", [[0, 0, 0, 0], [3, 3, 3, 3], [1, 900, 4, 250]])
 def test_histograms_of_any_counts_are_drawn(counts, tmp_path):
     coverage = coverage_from_counts(saff_kuijlaars(4), np.array(counts), 6)
-    made = report_coverage(coverage, 0.1)
+    made = report_coverage(coverage, 0.1, EVEN)
     rows = histogram_rows(made)
     assert sum(int(row[1].replace(",", "")) for row in rows) == 4
     assert len(rows) <= 20
@@ -354,7 +357,7 @@ def test_histograms_of_any_counts_are_drawn(counts, tmp_path):
 def test_drawing_leaves_the_users_settings_alone(tmp_path):
     with matplotlib.rc_context({"font.size": 23.0}):
         before = dict(matplotlib.rcParams)
-        made = report_coverage(coverage_from_counts(saff_kuijlaars(4), np.arange(4), 6), 0.1)
+        made = report_coverage(coverage_from_counts(saff_kuijlaars(4), np.arange(4), 6), 0.1, EVEN)
         save_plot(draw_histogram("any", made.summary), tmp_path, "any")
         assert dict(matplotlib.rcParams) == before
 
@@ -380,7 +383,7 @@ def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
     run = starcat(["coverage", artifact.folder, "-o", tmp_path / "new" / "folder"])
     assert run.code == 0
     made = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
-    assert made == {name for name in FILES if name.startswith("coverage")}
+    assert made == {name for name in FILES if name.startswith(("attitude", "coverage"))}
     for name in made:
         again = (tmp_path / "new" / "folder" / name).read_bytes()
         assert again == (artifact.folder / "report" / name).read_bytes(), name
@@ -406,7 +409,7 @@ def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
     assert "leaves holes" in run.err
 
 
-# Beside the artifact ------------------------------------------------------------------------
+# Beside the database ------------------------------------------------------------------------
 
 
 def test_times_stand_beside_the_artifact(artifact):

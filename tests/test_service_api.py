@@ -1,4 +1,4 @@
-"""The REST interface about databases, the registry and releases, on a small artifact."""
+"""The REST interface about databases, the registry and releases, on a small database."""
 
 from __future__ import annotations
 

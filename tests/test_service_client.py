@@ -113,8 +113,14 @@ def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact,
     [mine], [theirs] = json.loads(here.out), json.loads(there.out)
     assert {**theirs, "time_s": 0} == {**mine, "time_s": 0}
     assert "<svg" in picture.read_text()
-    lines = remote("identify", "small-1.0.0", frame)
-    assert mine["stars"][0]["star"] in lines.out
+    at = [frame, "--tolerance-px", 1, "--time", "2026-11-22T10:00:00"]
+    there, here = remote("identify", "small-1.0.0", *at), starcat(["identify", small_artifact, *at])
+    shown, mine = (
+        [line.split() for line in run.out.splitlines() if "time_s" not in line]
+        for run in (there, here)
+    )
+    assert [row for row in shown if row] == [row for row in mine if row]
+    assert "corrected boresight_ra_deg" in there.out
     frame.write_text("x_px,y_px\n1,1\n2,2\n3,3\n")
     ran = remote("identify", DATABASE, frame, "--fail-on-no-match", "--json")
     assert ran.code == 6

@@ -126,7 +126,7 @@ PATHS = [
     get("backslashes", f"{DB}/files/..%5c..%5c..%5crecords.sqlite", 400),
     get("overlong UTF-8", f"{DB}/files/%c0%ae%c0%ae/records.sqlite", 404),
     get("a NUL byte behind a name", f"{DB}/files/manifest.json%00.png", 400),
-    get("a file of the artifact's folder that is not of it", f"{DB}/files/.partial", 404),
+    get("a file of the database's folder that is not of it", f"{DB}/files/.partial", 404),
     get("another place as the other database", f"{DB}/diff/{UP}etc", 400),
     get("an id that is none", "/api/v1/databases/0123456789abcdeg", 404),
     get("an id with a pattern", "/api/v1/databases/*/files", 404),

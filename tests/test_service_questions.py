@@ -1,4 +1,4 @@
-"""SQL and identification over REST, on a small artifact: the same answers as the commands give."""
+"""SQL and identification over REST, on a small database: the same answers as the commands give."""
 
 from __future__ import annotations
 

@@ -172,9 +172,11 @@ def test_sections_are_no_values_and_what_is_required_has_to_be_there():
 
 
 def test_every_key_has_its_unit_in_its_name():
-    units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec", "_mas_yr")
+    units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec", "_mas_yr",
+             "_s", "_e")  # fmt: skip
     plain = {"min_identified", "outlier_share", "completeness", "ambiguous_odds", "min_probability",
-             "max_ratio"}  # fmt: skip
+             "max_ratio", "quantum_efficiency", "min_snr", "max_contamination",
+             "colour_term"}  # fmt: skip
     for path, entry in KEYS.items():
         if entry["type"] == "number" and path.rpartition(".")[2] not in plain:
             assert path.endswith(units), path

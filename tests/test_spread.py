@@ -9,14 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.attitude import information, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
 from starcat.matcher.pose import (
     Pose,
     corner_deviation,
     explained_fraction,
-    information,
     is_scaled,
     weighted_share,
 )

@@ -34,6 +34,7 @@ SAME_IN_SQL = (
 )
 
 EXPLAINED = {
+    "CAP-CULF": "what goes beyond ADQL is declared under a type of starcat's own, as allowed",
     "UPL-TMDA": "texts come back as unicodeChar, which holds every text that SQL has",
     "CAP-SVR0": "the service does not tell which software it is",
     "LOC-NOTP": "there is no table of ObsLocTAP, and none is declared",

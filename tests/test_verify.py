@@ -1,4 +1,4 @@
-"""Verification: a good artifact passes, and nothing that is done to one goes unnoticed."""
+"""Verification: a good database passes, and nothing that is done to one goes unnoticed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def product_of(file: str) -> str:
 
 
 def seal(folder: Path, change: Change = lambda manifest: None) -> None:
-    """Make all digests right, those of the contents too, whatever the artifact holds."""
+    """Make all digests right, those of the contents too, whatever the database holds."""
     artifact = open_artifact(folder)
 
     def contents(manifest: dict[str, Any]) -> None:
@@ -283,7 +283,7 @@ def test_a_senseless_manifest_with_a_right_digest_is_found(key, value, copy):
     ],
 )
 def test_a_manifest_of_another_shape_is_refused(change, words, copy):
-    """Whoever opens the artifact hears it, before anything relies on it."""
+    """Whoever opens the database hears it, before anything relies on it."""
     seal(copy, change)
     with pytest.raises(ProductError) as caught:
         open_artifact(copy)

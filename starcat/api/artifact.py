@@ -1,4 +1,4 @@
-"""An artifact as a program holds it, and SQL over artifacts and catalogs."""
+"""A database as a program holds it, and SQL over databases and catalogs."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def open_artifact(folder: PathLike) -> Artifact:
     Raises
     ------
     ProductError
-        If the folder is not an artifact.
+        If the folder is not a database.
     SchemaVersionError
         If another version of starcat wrote it.
     """
@@ -149,12 +149,12 @@ class Connection:
 
 
 def connect(*targets: PathLike, limits: Limits | None = None) -> Connection:
-    """Open artifacts, star tables and catalogs for questions in SQL.
+    """Open databases, star tables and catalogs for questions in SQL.
 
     Parameters
     ----------
     *targets : str or path-like
-        Folders of artifacts, Parquet files, archive files, or names of sources.
+        Folders of databases, Parquet files, archive files, or names of sources.
     limits : Limits, optional
         Time, memory and disk of a query.
 

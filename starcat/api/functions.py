@@ -52,9 +52,9 @@ def build(
     inputs : mapping of str to path or paths, optional
         Files or folders by source; what is not named is looked for, as the command line does.
     replace : bool, default False
-        Whether a different artifact of the same name and version may be replaced.
+        Whether a different database of the same name and version may be replaced.
     workers : int, default 2
-        Threads; the artifact is the same for any number.
+        Threads; the database is the same for any number.
     progress : callable, optional
         Called with (stage, done, total).
 
@@ -164,7 +164,7 @@ def calibrate(
         Smallest and largest field across the width, degrees; by default that of the camera, with
         a focal length that may be wrong by a tenth.
     method : str, optional
-        A way to identify; the best that the artifact's products allow by default.
+        A way to identify; the best that the database's products allow by default.
     flip : bool, optional
         Whether the first row of an image is its bottom; the file's own word by default.
     progress : callable, optional
@@ -199,7 +199,7 @@ def calibrate(
 
 
 def verify(artifact: PathLike) -> Verification:
-    """Check an artifact: digests, schemas, rows, orders, indices, references, counts.
+    """Check a database: digests, schemas, rows, orders, indices, references, counts.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def verify(artifact: PathLike) -> Verification:
     Raises
     ------
     ProductError
-        If the folder is not an artifact.
+        If the folder is not a database.
     """
     from starcat.artifact.verify import verify_artifact
 
@@ -257,8 +257,10 @@ def init(
     from starcat.pipeline.starter import starter_spec, write_starter
     from starcat.specs.build_spec import CameraSpec
 
-    size = {"width_px": camera.width_px, "height_px": camera.height_px}
-    made = starter_spec(name, CameraSpec(**size, fov_x_deg=camera.fov_x_deg), faint_limit_mag)
+    wanted = CameraSpec(
+        width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
+    )
+    made = starter_spec(name, wanted, faint_limit_mag)
     if output is not None:
         write_starter(made, Path(output), replace=replace)
     return made

@@ -1,4 +1,4 @@
-"""What must hold of an artifact: of each product's table, and of its group in the HDF5 file.
+"""What must hold of a database: of each product's table, and of its group in the HDF5 file.
 
 Each check is a generator of problems: it yields nothing for a sound table or file.
 """
@@ -39,9 +39,9 @@ class HeldProduct:
     table: pa.Table  # the product
     schema: ProductSchema  # its contract
     facts: Mapping[str, Any]  # its entry in the manifest
-    # shape (N, 3): directions of the artifact's stars, ICRS; no rows where they are not known
+    # shape (N, 3): directions of the database's stars, ICRS; no rows where they are not known
     directions: NDArray[np.float64]
-    stars: pa.Table | None = None  # the artifact's stars; None where they are not known
+    stars: pa.Table | None = None  # the database's stars; None where they are not known
 
 
 Check = Callable[[HeldProduct], Iterator[str]]
@@ -95,7 +95,7 @@ def _with_nulls(column: pa.ChunkedArray) -> tuple[NDArray[Any], NDArray[np.bool_
 
 
 def star_rows_exist(held: HeldProduct) -> Iterator[str]:
-    """Yield the columns that refer to stars which the artifact does not have."""
+    """Yield the columns that refer to stars which the database does not have."""
     count = len(held.directions)
     for column in held.schema.columns:
         if column.refers_to != "stars":

@@ -1,4 +1,4 @@
-"""The HDF5 file of an artifact: contiguous little-endian datasets that a matcher maps.
+"""The HDF5 file of a database: contiguous little-endian datasets that a matcher maps.
 
 A product is a group; each column that its schema marks ``in_database`` is a dataset with its
 unit and meaning as attributes. A list column ``name`` is two datasets: ``name_offsets`` (rows

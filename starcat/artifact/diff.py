@@ -1,4 +1,4 @@
-"""What differs between two artifacts: spec, sources, software, stars and products.
+"""What differs between two databases: spec, sources, software, stars and products.
 
 Stars are matched by their permanent number, so that the answer says which star of the sky came,
 went or moved, and why, and not which row.
@@ -39,17 +39,17 @@ class Change:
 
 @dataclass(frozen=True)
 class OneSided:
-    """A guide star of one artifact that is none of the other."""
+    """A guide star of one database that is none of the other."""
 
     star_id: int  # permanent number
     designation: str
     mag: float | None  # magnitude, where it is a guide star
-    reason: str  # why the other artifact rejected it, or that it never read it
+    reason: str  # why the other database rejected it, or that it never read it
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A guide star of both artifacts whose position or magnitude differs."""
+    """A guide star of both databases whose position or magnitude differs."""
 
     star_id: int  # permanent number
     designation: str
@@ -60,10 +60,10 @@ class Moved:
 
 @dataclass(frozen=True)
 class ProductChange:
-    """A product in both artifacts."""
+    """A product in both databases."""
 
     product: str
-    rows_a: int | None  # records; None where an artifact does not have it
+    rows_a: int | None  # records; None where a database does not have it
     rows_b: int | None
     is_same: bool  # whether schema and content digest are equal
     content: str  # "same", "differs", or which columns another schema brought
@@ -71,7 +71,7 @@ class ProductChange:
 
 @dataclass(frozen=True)
 class Difference:
-    """What differs between artifact A and artifact B."""
+    """What differs between database A and database B."""
 
     spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
     sources: tuple[Change, ...]
@@ -92,7 +92,7 @@ class Difference:
 
 
 def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
-    """Compare two artifacts."""
+    """Compare two databases."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
     # A number means the same star only within one catalog.
@@ -112,7 +112,7 @@ def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
 
 
 def _read_limit_mag(artifact: Artifact, other: Artifact) -> float:
-    """Return the magnitude beyond which an artifact lists no star of the other's catalog."""
+    """Return the magnitude beyond which a database lists no star of the other's catalog."""
     mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
     limit_mag = mine.get("read_limit_mag")
     is_same = all(mine.get(key) == theirs.get(key) for key in ("source", "band"))
@@ -146,7 +146,9 @@ def _source_facts(artifact: Artifact) -> dict[str, Any]:
     for source in artifact.manifest["sources"]:
         # A catalog may be read again: for amplitudes, motions and counterparts.
         role = source["role"]
-        name = source["source"] + (f" {role}" if role in ("crossmatch", "motions") else "")
+        name = source["source"] + (
+            f" {role}" if role in ("crossmatch", "motions", "photometry") else ""
+        )
         facts |= {f"{name} {key}": source[key] for key in ("rows_read", "kept")}
         facts |= {f"{name} rejected {key}": count for key, count in source["rejected"].items()}
         for file in source["files"]:

@@ -1,4 +1,4 @@
-"""The manifest: what an artifact is made of, with a digest for every part.
+"""The manifest: what a database is made of, with a digest for every part.
 
 Nothing in it depends on the clock, the host or a path, so the same inputs and the same spec
 give the same manifest.
@@ -24,7 +24,9 @@ if TYPE_CHECKING:  # reading a manifest needs none of these
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.1.0"
 MOTIONS_VERSION = "1.2.0"
-"""The version of manifests with motions of another catalog; all others are `MANIFEST_VERSION`."""
+PHOTOMETRY_VERSION = "1.3.0"
+"""The versions of manifests with motions, and with magnitudes, of another catalog; all others are
+`MANIFEST_VERSION`."""
 
 DATABASE_NAME = "database.h5"
 
@@ -65,7 +67,8 @@ LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplot
 class SourceFacts:
     """One source of a build as the manifest records it."""
 
-    # name of the data source; ``stars``, ``motions``, ``variability`` or ``crossmatch``
+    # name of the data source; ``stars``, ``motions``, ``variability``, ``photometry`` or
+    # ``crossmatch``
     source: str
     role: str
     files: Sequence[FileFacts]  # its input files
@@ -73,7 +76,8 @@ class SourceFacts:
     rows_read: int
     kept: int
     rejected: dict[str, int]  # the others, by reason
-    # stars whose amplitude or motion came from this source, or whose counterpart is in it
+    # stars whose amplitude, motion or magnitude came from this source, or whose counterpart is
+    # in it
     joined: int | None = None
     # ``median`` and ``largest`` way of the stars whose motion came from this source
     moved_arcsec: dict[str, float] | None = None
@@ -99,7 +103,7 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of an artifact."""
+    """Read the manifest of a database."""
     path = folder / MANIFEST_NAME
     try:
         data = path.read_bytes()
@@ -109,7 +113,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise ProductError(
             f"{folder}: {MANIFEST_NAME} cannot be read ({error.strerror})", path=folder
         ) from error
-    return parse_manifest(data, str(path), "rebuild the artifact", path)
+    return parse_manifest(data, str(path), "rebuild the database", path)
 
 
 def parse_manifest(

@@ -1,4 +1,4 @@
-"""What an artifact holds of other catalogs: counterparts, and where motions are from.
+"""What a database holds of other catalogs: counterparts, and where motions are from.
 
 A star table becomes moving stars, matches become rows of the ``crossmatch`` schema, and the rows of
 both products are checked against the stars that they belong to.

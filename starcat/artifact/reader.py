@@ -1,4 +1,4 @@
-"""Reading an artifact: its manifest at once, a table when it is asked for.
+"""Reading a database: its manifest at once, a table when it is asked for.
 
 Nothing here needs more than the standard library until a table is read.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Artifact:
-    """An artifact on disk."""
+    """A database on disk."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
         self.folder = folder
@@ -39,7 +39,7 @@ class Artifact:
 
     @cached_property
     def spec(self) -> BuildSpec:
-        """The spec that the artifact was built from."""
+        """The spec that the database was built from."""
         from starcat.specs.reading import spec_from_dict
 
         return spec_from_dict(self.manifest["spec"], f"{self.folder.name}/{MANIFEST_NAME}")
@@ -66,7 +66,7 @@ class Artifact:
             return read_parquet(path)
         except (OSError, pa.ArrowException) as error:
             raise ProductError(
-                f"{path}: cannot be read ({error}); rebuild or fetch the artifact again",
+                f"{path}: cannot be read ({error}); rebuild or fetch the database again",
                 product=product,
                 path=path,
             ) from error
@@ -75,11 +75,11 @@ class Artifact:
         stars = self.manifest["products"]["stars"]["rows"]
         name = f"{self.manifest['name']}-{self.manifest['version']}"
         epoch, count = self.manifest["epoch_jyear"], len(self.products)
-        return f"<Artifact {name}: {stars:,} guide stars at J{epoch:g}, {count} products>"
+        return f"<Database {name}: {stars:,} guide stars at J{epoch:g}, {count} products>"
 
 
 class Products(Mapping[str, "pa.Table"]):
-    """The tables of an artifact by name, in the order of the manifest; each is read when used."""
+    """The tables of a database by name, in the order of the manifest; each is read when used."""
 
     def __init__(self, artifact: Artifact) -> None:
         self._artifact = artifact
@@ -105,5 +105,5 @@ class Products(Mapping[str, "pa.Table"]):
 
 
 def open_artifact(folder: Path) -> Artifact:
-    """Open an artifact."""
+    """Open a database."""
     return Artifact(folder, read_manifest(folder))

@@ -1,4 +1,4 @@
-"""Verification of an artifact: every file, every product, and what they say of each other.
+"""Verification of a database: every file, every product, and what they say of each other.
 
 All problems are collected. Content is read only from files whose digest is that of the
 manifest, since a damaged file is not to be trusted to the libraries that would parse it.
@@ -32,6 +32,7 @@ from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of
 from starcat.catalog.verdict import Reason
 from starcat.errors import ProductError, StarcatError, no_database
+from starcat.specs.epoch import middle_of
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.hdf5 import own_group
 
@@ -45,9 +46,9 @@ MAX_NAMED = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem of an artifact."""
+    """One problem of a database."""
 
-    file: str  # path within the artifact
+    file: str  # path within the database
     # product that the file holds; ``database`` for the HDF5 file as a whole, empty where there is
     # none
     product: str
@@ -62,9 +63,9 @@ class Finding:
 class Verification:
     """What a verification found."""
 
-    folder: Path  # the artifact
+    folder: Path  # the database
     checks: int  # number of checks that were done
-    findings: tuple[Finding, ...]  # every problem; none for a sound artifact
+    findings: tuple[Finding, ...]  # every problem; none for a sound database
 
     def __repr__(self) -> str:
         found = len(self.findings)
@@ -77,7 +78,7 @@ class Verification:
 
 
 def verify_artifact(folder: Path) -> Verification:
-    """Check files, schemas, contents, orders, indices, references and counts of an artifact."""
+    """Check files, schemas, contents, orders, indices, references and counts of a database."""
     if not folder.is_dir():
         raise no_database(folder)
     log = _Log()
@@ -90,11 +91,11 @@ def verify_artifact(folder: Path) -> Verification:
 
 
 def check_artifact(folder: Path) -> Artifact:
-    """Check that an artifact is whole."""
+    """Check that a database is whole."""
     found = verify_artifact(folder).findings
     if found:
         raise ProductError(
-            f"{folder}: {first_of(found)}. Build the artifact again, or fetch it again",
+            f"{folder}: {first_of(found)}. Build the database again, or fetch it again",
             product=found[0].product or None,
             path=folder / found[0].file,
         )
@@ -227,8 +228,9 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
     """Yield where the counts of sources, products and spec do not add up."""
     spec, products = manifest["spec"], manifest["products"]
     for key in ("name", "version", "epoch_jyear"):
-        if manifest[key] != spec[key]:
-            yield f"{key} is {manifest[key]!r}; its spec says {spec[key]!r}"
+        said = middle_of(spec[key]) if key == "epoch_jyear" else spec[key]
+        if manifest[key] != said:
+            yield f"{key} is {manifest[key]!r}; its spec says {said!r}"
     if [source["role"] for source in manifest["sources"]][:1] != ["stars"]:
         yield "sources: no star catalog"
     for source in manifest["sources"]:

@@ -1,4 +1,4 @@
-"""Writing the files of an artifact: its database, its tables, and the manifest last.
+"""Writing the files of a database: its HDF5 file, its tables, and the manifest last.
 
 The content digest of a table covers the values of its columns in a fixed little-endian layout, so
 it does not change with the version of the library that wrote the file.
@@ -22,11 +22,13 @@ from starcat.artifact.manifest import (
     MANIFEST_NAME,
     MANIFEST_VERSION,
     MOTIONS_VERSION,
+    PHOTOMETRY_VERSION,
     SourceFacts,
     manifest_digest,
     software_versions,
 )
 from starcat.products.index import Index
+from starcat.specs.epoch import middle_of
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import ProductSchema, product_schema
@@ -34,7 +36,7 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 @dataclass(frozen=True)
 class Product:
-    """A product on its way into an artifact."""
+    """A product on its way into a database."""
 
     name: str  # name of the product, which is that of its schema
     table: pa.Table  # with the columns of the schema, in the schema's order of rows
@@ -45,7 +47,7 @@ class Product:
 def write_products(
     folder: Path, products: Sequence[Product], facts: Mapping[str, str | float]
 ) -> dict[str, dict[str, Any]]:
-    """Write the products of an artifact; return what the manifest records of each.
+    """Write the products of a database; return what the manifest records of each.
 
     ``records`` of the triangles is the sum over all boresights, which the papers count.
     """
@@ -79,14 +81,16 @@ def write_manifest(
 ) -> dict[str, Any]:
     """Write the manifest of a folder whose other files are complete."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    has_motions = any(source.role == "motions" for source in sources)
+    roles = {source.role for source in sources}
+    version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
+    version = PHOTOMETRY_VERSION if "photometry" in roles else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": MOTIONS_VERSION if has_motions else MANIFEST_VERSION,
+        "manifest_version": version,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",
-        "epoch_jyear": spec["epoch_jyear"],
+        "epoch_jyear": middle_of(spec["epoch_jyear"]),
         "spec": spec,
         "sources": [source.as_dict() for source in sources],
         "products": products,

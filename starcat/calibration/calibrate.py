@@ -186,7 +186,7 @@ def _too_few(
         f"{len(identified.found)} of {len(frames)} frames are identified with fields of "
         f"{fields[0]:.4g} to {fields[1]:.4g} deg across the width; a calibration needs "
         f"{MIN_FRAMES}. Not identified: {named}. Give more frames, a wider --fov, the other of "
-        "--flip and --no-flip, or an artifact that was built for about this field and these stars"
+        "--flip and --no-flip, or a database that was built for about this field and these stars"
     )
 
 

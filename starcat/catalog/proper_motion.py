@@ -8,12 +8,15 @@ the poles too.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
+import erfa
 import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arrays import Array
+from starcat.geometry.sphere import directions_from_radec
 
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
 
@@ -81,6 +84,45 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
         np.where(unknown, motion.pm_dec_mas_yr, pm_dec_end),
     )
     return end, u
+
+
+def propagate_in_space(
+    motion: Motion, parallax_mas: Array, velocity_km_s: Array, from_jyear: Array, to_jyear: Array
+) -> tuple[Motion, Array]:
+    """Move positions, those of stars with a parallax in space, and return the directions too.
+
+    The radial velocity is 0 where it is not known. Without a parallax above 0 a star moves as
+    `propagate` has it.
+
+    References
+    ----------
+    IAU SOFA, routine iauPmsafe: a straight line in space, with light time.
+    """
+    moved, u = propagate_directions(motion, to_jyear - from_jyear)
+    motions = motion.pm_ra_cosdec_mas_yr, motion.pm_dec_mas_yr
+    rows = np.flatnonzero((parallax_mas > 0.0) & ~np.isnan(motions[0] + motions[1]))
+    if not len(rows):
+        return moved, u
+    ra, dec = np.radians(motion.ra_deg[rows]), np.radians(motion.dec_deg[rows])
+    begin, end = (np.broadcast_to(year, len(u))[rows] for year in (from_jyear, to_jyear))
+    with warnings.catch_warnings():  # of stars whose parallax is too small for their motion
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        ra, dec, pm_ra, pm_dec, _, _ = erfa.pmsafe(
+            ra,
+            dec,
+            motions[0][rows] * MAS / np.cos(dec),
+            motions[1][rows] * MAS,
+            parallax_mas[rows] / 1000.0,
+            np.nan_to_num(velocity_km_s[rows]),
+            *erfa.epj2jd(begin),
+            *erfa.epj2jd(end),
+        )
+    u[rows] = directions_from_radec(np.degrees(ra), np.degrees(dec))
+    columns = [np.array(getattr(moved, name)) for name in Motion.__dataclass_fields__]
+    values = np.degrees(ra) % 360.0, np.degrees(dec), pm_ra * np.cos(dec) / MAS, pm_dec / MAS
+    for column, value in zip(columns, values, strict=True):
+        column[rows] = value
+    return Motion(*columns), u
 
 
 def central_error(

@@ -1,8 +1,9 @@
 """Selection: which stars of a table become guide stars, and why the others do not.
 
-Filters are tried in a fixed order (magnitude, doubles, variables, count, density) and the first
-that applies is the verdict. Doubles are judged by separation and magnitude difference at the
-sensor's resolution and variables by amplitude; a bare flag of an archive is only one input.
+Filters are tried in a fixed order (magnitude, doubles, variables, distrust, count, density) and the
+first that applies is the verdict. Doubles are judged by separation and magnitude difference at the
+sensor's resolution, or by what neighbours do to their centroids (`blended.py`), and variables by
+amplitude; a bare flag of an archive is only one input.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
+from starcat.catalog.blended import Judged, judge_neighbours
+from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
     directions_of,
@@ -31,6 +34,8 @@ from starcat.geometry.sphere import radec_from_directions
 from starcat.specs.build_spec import Doubles, Selection, Variables
 from starcat.storage.schema import product_schema
 
+_STEPS = {Reason.beyond_count: "count", Reason.density: "density"}
+
 MOST_PAIRS = 10_000_000
 """Close pairs that are looked at; they take half a gigabyte, and no camera has a tenth of them."""
 
@@ -44,45 +49,86 @@ class Step:
 
 
 @dataclass(frozen=True)
+class NeighbourTally:
+    """What [selection.neighbours] decided otherwise than the separation rule of the same spec."""
+
+    regained: int  # stars that it keeps, and the separation rule would leave out
+    lost: int  # the other way round
+    absorbed: int  # stars whose light is in a merged star's
+
+
+@dataclass(frozen=True)
 class Selected:
     """Guide stars, and every other star with its reason."""
 
     guide_stars: pa.Table  # of the stars schema, by star_id
     rejected: pa.Table  # of the rejected schema, by star_id
     steps: tuple[Step, ...]  # what was left after each filter, in order
+    neighbours: NeighbourTally | None = None  # where the spec has [selection.neighbours]
 
 
-def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
-    """Select guide stars from a star table."""
+def select_guide_stars(
+    stars: pa.Table, selection: Selection, pixel_arcsec: float | None = None
+) -> Selected:
+    """Select guide stars from a star table.
+
+    ``pixel_arcsec`` is the side of a pixel at the camera's axis, for [selection.neighbours].
+    """
     verdicts = Verdicts(len(stars))
     steps: list[Step] = []
 
     def note(name: str) -> None:
         steps.append(Step(name, directions_of(stars)[verdicts.is_kept]))
 
-    mag = floats_of(stars, "mag")
-    verdicts.reject(np.isnan(mag), Reason.no_magnitude)
-    if selection.doubles.action == "merge":
+    verdicts.reject(np.isnan(floats_of(stars, "mag")), Reason.no_magnitude)
+    catalog, judged, tally = stars, None, None
+    if selection.neighbours.is_on:
+        if pixel_arcsec is None:
+            raise ValueError("pixel_arcsec is None; [selection.neighbours] needs the camera's")
+        judged = judge_neighbours(stars, selection, pixel_arcsec)
+        stars = judged.stars
+        verdicts.reject(judged.is_absorbed, Reason.merged)
+    elif selection.doubles.action == "merge":
         stars = merge_doubles(stars, selection, verdicts)
-        mag = floats_of(stars, "mag")
+    mag = floats_of(stars, "mag")
     with np.errstate(invalid="ignore"):
         verdicts.reject(mag < selection.bright_limit_mag, Reason.too_bright)
         verdicts.reject(mag > selection.faint_limit_mag, Reason.too_faint)
     note("magnitude")
-    if selection.doubles.action == "remove":
+    if judged is not None:
+        if selection.neighbours.action != "keep":
+            verdicts.reject(judged.is_blended, Reason.blended)
+        tally = _tally(catalog, selection, judged, verdicts.is_kept)
+    elif selection.doubles.action == "remove":
         verdicts.reject(has_companion(stars, selection), Reason.double)
     is_flagged = is_unresolved_double(stars, selection.doubles)
     verdicts.reject(is_flagged, Reason.flagged_double)
     note("doubles")
     reject_variables(stars, selection.variables, verdicts)
     note("variables")
-    if selection.max_stars is not None:
+    if selection.max_drift_arcsec is not None:
+        with np.errstate(invalid="ignore"):
+            too_far = floats_of(stars, "drift_arcsec") > selection.max_drift_arcsec
+        verdicts.reject(too_far, Reason.drifts)
+        note("drift")
+    if selection.observed.reject:
+        verdicts.reject(is_distrusted(stars, selection.observed), Reason.distrusted)
+        note("distrust")
+    if selection.max_stars is not None and selection.thinning == "brightest":
         verdicts.reject(
             beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count
         )
         note("count")
     kept, rejected = split_by_verdict(stars, verdicts)
-    return Selected(kept.combine_chunks(), rejected, tuple(steps))
+    return Selected(kept.combine_chunks(), rejected, tuple(steps), tally)
+
+
+def _tally(catalog: pa.Table, selection: Selection, judged: Judged, kept: Mask) -> NeighbourTally:
+    plain, mag = has_companion(catalog, selection), floats_of(catalog, "mag")
+    with np.errstate(invalid="ignore"):
+        in_limits = (mag >= selection.bright_limit_mag) & (mag <= selection.faint_limit_mag)
+    masks = (kept & plain, in_limits & ~plain & ~kept, judged.is_absorbed)
+    return NeighbourTally(*(int(np.count_nonzero(mask)) for mask in masks))
 
 
 def _companion_pairs(stars: pa.Table, selection: Selection) -> tuple[NDArray[np.int64], Array]:
@@ -217,14 +263,17 @@ def beyond_brightest(stars: pa.Table, kept: Mask, count: int) -> Mask:
     return beyond
 
 
-def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
+def reject_dense(
+    selected: Selected, kept: NDArray[np.integer], reason: Reason = Reason.density
+) -> Selected:
     """Thin the guide stars to those that a tiling asks for, by row."""
     verdicts = Verdicts(len(selected.guide_stars))
-    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), Reason.density)
+    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), reason)
     stars, dense = split_by_verdict(selected.guide_stars, verdicts)
     rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
     return Selected(
         stars.combine_chunks(),
         sort_rows(rejected, product_schema("rejected").order),
-        (*selected.steps, Step("density", directions_of(stars))),
+        (*selected.steps, Step(_STEPS[reason], directions_of(stars))),
+        selected.neighbours,
     )

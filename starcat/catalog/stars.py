@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.proper_motion import Motion, propagate_directions
+from starcat.catalog.proper_motion import Motion, propagate_in_space
 from starcat.catalog.verdict import Quality, Verdicts
 from starcat.geometry.proximity import nearest_neighbours
 from starcat.geometry.sphere import directions_from_radec
@@ -44,7 +44,12 @@ def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> C
     if epoch_jyear is None:
         u = directions_from_radec(ra, dec)
     else:
-        motion, u = propagate_directions(motion, epoch_jyear - epoch)
+        parallax, velocity = (
+            np.asarray(columns.get(name, blank), dtype=np.float64)
+            for name in ("parallax_mas", "radial_velocity_km_s")
+        )
+        target = np.full(len(ra), epoch_jyear)
+        motion, u = propagate_in_space(motion, parallax, velocity, epoch, target)
         epoch = np.where(unknown, epoch, epoch_jyear)
     flags = np.where(unknown, np.int32(Quality.NO_PROPER_MOTION), np.int32(0))
     return {

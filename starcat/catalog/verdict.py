@@ -33,12 +33,19 @@ class Reason(Enum):
     too_bright = "brighter than bright_limit_mag"
     too_faint = "fainter than faint_limit_mag"
     double = "a companion within min_separation_deg"
+    blended = (
+        "neighbours move its centroid or add to its light more than [selection.neighbours] allows"
+    )
     merged = "merged into the brighter star of a close group"
     flagged_double = "the archive flags an unresolved double"
     variable = "amplitude above max_amplitude_mag"
     flagged_variable = "flagged variable, amplitude unknown"
-    beyond_count = "fainter than the brightest max_stars"
-    density = "in no field among the brightest max_stars_per_field"
+    drifts = "further from its place at an end of the span than max_drift_arcsec"
+    distrusted = "distrusted by what flew: [selection.observed] lists it"
+    beyond_count = "thinned to max_stars: fainter, or as selection.thinning says"
+    density = (
+        "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says"
+    )
 
 
 _CODES = {reason: code for code, reason in enumerate(Reason, start=1)}

@@ -1,4 +1,4 @@
-"""Commands about artifacts: inspect, coverage, verify, diff, rebuild, and their tables."""
+"""Commands about databases: inspect, coverage, verify, diff, rebuild, and their tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from starcat.cli.console import (
     show,
     warn,
 )
-from starcat.cli.options import Input, Json, inputs_by_source
+from starcat.cli.options import Input, Json, inputs_by_source, to_folder
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
@@ -34,11 +34,14 @@ app = typer.Typer()
 @app.command()
 def inspect(
     artifact: Annotated[
-        Path, typer.Argument(help="The folder <name>-<version>, or an onboard image.")
+        Path,
+        typer.Argument(
+            metavar="DATABASE", help="The folder <name>-<version>, or an onboard image."
+        ),
     ],
     json: Json = False,
 ) -> None:
-    """Say what an artifact or an onboard image holds and what it was made from.
+    """Say what a database or an onboard image holds and what it was made from.
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
@@ -57,13 +60,13 @@ def inspect(
 
 @app.command()
 def coverage(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for CSV, JSON, PNG and SVG.")
-    ] = None,
+    artifact: Annotated[
+        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
+    ],
+    output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
     json: Json = False,
 ) -> None:
-    """Say how many stars, pairs and triangles the fields of an artifact hold.
+    """Say how many stars, pairs and triangles the fields of a database hold.
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
@@ -75,14 +78,17 @@ def coverage(
 @app.command()
 def verify(
     artifact: Annotated[
-        Path, typer.Argument(help="The folder <name>-<version>, or an onboard image.")
+        Path,
+        typer.Argument(
+            metavar="DATABASE", help="The folder <name>-<version>, or an onboard image."
+        ),
     ],
     against: Annotated[
-        Path | None, typer.Option(help="The artifact that an onboard image should be of.")
+        Path | None, typer.Option(help="The database that an onboard image should be of.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Check an artifact or an onboard image: digests, contents, orders, indices, references.
+    """Check a database or an onboard image: digests, contents, orders, indices, references.
 
     Exits with 5 if anything is wrong.
 
@@ -105,11 +111,11 @@ def verify(
 
 @app.command()
 def diff(
-    a: Annotated[Path, typer.Argument(metavar="A", help="The earlier artifact's folder.")],
+    a: Annotated[Path, typer.Argument(metavar="A", help="The earlier database's folder.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The later one's.")],
     json: Json = False,
 ) -> None:
-    """Say what differs between two artifacts: spec, sources, stars and why, products.
+    """Say what differs between two databases: spec, sources, stars and why, products.
 
     Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
     """
@@ -123,14 +129,16 @@ def diff(
 
 @app.command()
 def rebuild(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Annotated[
+        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
+    ],
     inputs: Input = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the new artifact.")
+        Path | None, to_folder("Where the new database goes; default: it is not kept.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Build an artifact again from its manifest and compare every byte.
+    """Build a database again from its manifest and compare every byte.
 
     Exits with 5 if a file differs.
 
@@ -162,7 +170,7 @@ def print_verification(found: Verification) -> None:
 
 
 def print_difference(found: Difference, name_a: str, name_b: str) -> None:
-    """Print what differs between two artifacts."""
+    """Print what differs between two databases."""
     if found.is_same and not found.software:
         typer.echo(f"{name_a} and {name_b} are identical: spec, sources, stars and products")
         return
@@ -228,7 +236,7 @@ _BARS, _BAR_WIDTH = 20, 50
 
 
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
-    """Print the coverage of an artifact, and write its tables and plots where asked to."""
+    """Print the coverage of a database, and write its tables and plots where asked to."""
     from starcat.pipeline.report_data import artifact_coverage
     from starcat.report.report import coverage_warnings, write_coverage
 

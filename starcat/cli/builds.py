@@ -26,6 +26,7 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
+    to_folder,
 )
 from starcat.cli.remote import service_of
 from starcat.errors import BuildError
@@ -47,14 +48,12 @@ def build(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
-    ] = Path("dist"),
+    output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a different artifact of that name.")
+        bool, typer.Option("--replace", help="Replace a different database of that name.")
     ] = False,
     workers: Annotated[
-        int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
+        int, typer.Option(min=1, max=64, help="Threads; the database is the same for any number.")
     ] = 2,
     max_memory: Annotated[
         float | None,
@@ -173,7 +172,7 @@ def _print_records(title: str, source: dict[str, Any]) -> None:
 
 
 def print_products(manifest: dict[str, Any]) -> None:
-    """Print the products of an artifact."""
+    """Print the products of a database."""
     files = manifest["files"]
     rows = [
         (
@@ -212,7 +211,7 @@ def print_rates(rates: Sequence[Rates]) -> None:
 
 
 def print_artifact(artifact: Artifact) -> None:
-    """Print what an artifact holds."""
+    """Print what a database holds."""
     from starcat.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest
@@ -247,10 +246,30 @@ def print_coverage_table(report: CoverageReport) -> None:
     }
     title = f"Coverage: {summary.fields:,} fields"
     print_things(title, spreads.items(), columns, numbers=(1, 2, 3, 4, 5))
+    print_things(
+        "Attitude error that the stars of a field allow, arcsec for 1 px of centroid noise",
+        [
+            (axis, *(_error_text(value) for value in vars(spread).values()))
+            for axis, spread in report.evenness.spreads.items()
+        ],
+        {
+            "error": "{0[0]} the boresight",
+            "median": "{0[1]}",
+            "worst 1 %": "{0[2]}",
+            "worst": "{0[3]}",
+        },
+        numbers=(1, 2, 3),
+    )
     worst = f"RA {summary.worst_ra_deg:.3f}, Dec {summary.worst_dec_deg:+.3f} deg"
     covering, tile = np.degrees([gap.covering_radius_rad, gap.tile_radius_rad])
     facts = {
         "fewest stars": f"boresight {summary.worst_boresight}, {worst}",
         "farthest from all boresights": f"{covering:.3f} deg; a field reaches {tile:.3f} deg",
+        "entropy of the stars": f"{report.evenness.entropy:.4f} over "
+        f"{report.evenness.cells:,} cells of the size of a field; 1 is even",
     }
     print_facts("", facts)
+
+
+def _error_text(error_arcsec: float) -> str:
+    return "no attitude" if error_arcsec == float("inf") else f"{error_arcsec:.1f}"

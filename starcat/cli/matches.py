@@ -15,12 +15,14 @@ from starcat.cli.console import print_json, print_json_line, print_table, print_
 from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
-from starcat.images.solve_files import FrameAnswer, facts
+from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame
-from starcat.sky.in_time import SkyInTime
 
 NAMED = 3  # frames that are named where some were not identified
+
+CORRECTED = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg", "q_body_from_icrs")
+"""What the main table has without and with the correction for aberration."""
 
 
 @dataclass
@@ -81,10 +83,9 @@ def print_answers(
         print_json([answer.content() for answer in kept])
         return tally
     if len(kept) == 1:
-        _print_one(kept[0], database)
+        _print_one(kept[0].content(), database.name)
     elif kept:
         _print_many(kept, database)
-    print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
     return tally
 
 
@@ -109,7 +110,6 @@ def print_batch(
     kept = [] if as_lines else [answer for item in done for answer in item.answers]
     if kept:
         _print_many(kept, database)
-    print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
     for note, count in notes.items():
         say(f"{note} ({count} of {tally.files} files)")
     return tally, done
@@ -125,22 +125,43 @@ def print_contents(
         if as_lines:
             print_json_line(one)
         elif not as_json:
-            _print_content(one, database)
+            _print_one(one, database)
     if as_json and not as_lines:
         print_json(list(contents))
     return tally
 
 
-def _print_content(content: dict[str, Any], database: str) -> None:
-    rows = [row for name, value in content.items() for row in _rows_of_fact(name, value)]
+def _print_one(content: dict[str, Any], database: str) -> None:
+    facts = {name: value for name, value in content.items() if name != "frame"}
+    rows = [row for name, value in facts.items() for row in _rows_of_fact(name, value)]
+    reasons = Counter(star["dropped"] for star in content["stars"] if "dropped" in star)
+    rows += [(f"dropped, {why.replace('_', ' ')}", count) for why, count in sorted(reasons.items())]
     print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
     if content["status"] == "identified":
         _print_stars(content["stars"])
+    if content.get("in_time"):
+        print_sky_in_time([(content["frame"], content["in_time"])])
 
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
         return [("because", value["words"]), ("try", as_options(value["advice"]))]
+    if name == "remarks":
+        return [("remark", remark) for remark in value]
+    if name == "covariance_arcsec2":
+        sigma = np.sqrt([_number(value[axis][axis]) for axis in range(3)])
+        return [("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma))]
+    if name == "q_body_from_icrs":
+        return [(name, ", ".join(f"{one:+.7f}" for one in value))]
+    if name == "in_time":
+        given = {key: value[key] for key in CORRECTED} if value else {}
+        return [
+            (f"corrected {key}", told)
+            for key in given
+            for _, told in _rows_of_fact(key, given[key])
+        ]
+    if name.endswith("_deg"):
+        return [(name, f"{value:.4f}")]
     if value is None or isinstance(value, list):
         return []
     return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
@@ -159,28 +180,6 @@ def as_options(text: str) -> str:
     )
 
 
-def _print_one(answer: FrameAnswer, database: Database) -> None:
-    frame, result = answer.frame, answer.result
-    rows: list[tuple[str, Any]] = []
-    for name, value in facts(result).items():
-        if name == "covariance_arcsec2":
-            sigma = np.sqrt(result.covariance_arcsec2.diagonal())
-            rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
-        elif name == "q_body_from_icrs":
-            rows.append((name, ", ".join(f"{one:+.7f}" for one in value)))
-        elif name.endswith("_deg"):
-            rows.append((name, f"{value:.4f}"))
-        elif name == "remarks":
-            rows += [("remark", remark) for remark in value]
-        else:
-            rows += _rows_of_fact(name, value)
-    for reason, count in sorted(Counter(reason for _, reason in result.dropped).items()):
-        rows.append((f"dropped, {reason.replace('_', ' ')}", count))
-    print_table(f"{len(frame.centroids_px)} centroids, {database.name}", ("", ""), rows)
-    if result.ok:
-        _print_stars(answer.content()["stars"])
-
-
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
     heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
     lines = [
@@ -194,6 +193,10 @@ def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
     print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
 
 
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
 def _shown(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
@@ -204,7 +207,8 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
     for answer in answers:
         frame, result = answer.frame, answer.result
         origin = (result.origin.replace("_", " "),) if is_tracked else ()
-        angles = (result.boresight_ra_deg, result.boresight_dec_deg, result.roll_deg)
+        attitude = result if answer.sky is None else answer.sky
+        angles = (attitude.boresight_ra_deg, attitude.boresight_dec_deg, attitude.roll_deg)
         why = result.refusal
         rows.append(
             (
@@ -217,43 +221,43 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
                 *origin,
             )
         )
-    names = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
+    known = [(answer.frame.name, sky.content()) for answer in answers if (sky := answer.sky)]
+    ra = "corrected RA deg" if known else "RA deg"
+    names = ("frame", "status", "stars", ra, "Dec deg", "roll deg", "rms arcsec", "chance")
     heads = (*names, "origin") if is_tracked else names
     counted = f"{len(answers)} frames" if len(answers) > 1 else "1 frame"
     print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    print_sky_in_time(known)
 
 
-def print_sky_in_time(known: Sequence[tuple[str, SkyInTime]]) -> None:
-    """Print true attitudes, exclusion angles and the bodies of frames by name."""
+def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Print what a time adds to the answers to frames, by their names: `SkyInTime.content`."""
     if not known:
         return
     columns = {
         "frame": "{0[0]}",
-        "RA deg": "{0[1].boresight_ra_deg:.5f}",
-        "Dec deg": "{0[1].boresight_dec_deg:.5f}",
-        "roll deg": "{0[1].roll_deg:.5f}",
-        "corrected arcsec": "{0[1].correction_arcsec:.2f}",
-        "rms arcsec": "{0[1].residual_arcsec:.2f}",
-        "Sun deg": "{0[1].sun_angle_deg:.2f}",
-        "Moon deg": "{0[1].moon_angle_deg:.2f}",
-        "Earth limb deg": "{0[1].earth_limb_angle_deg:.2f}",
+        "corrected arcsec": "{0[1][correction_arcsec]:.2f}",
+        "rms arcsec": "{0[1][residual_arcsec]:.2f}",
+        "Sun deg": "{0[1][sun_angle_deg]:.2f}",
+        "Moon deg": "{0[1][moon_angle_deg]:.2f}",
+        "Earth limb deg": "{0[1][earth_limb_angle_deg]:.2f}",
     }
-    title = f"With aberration, at {known[0][1].time}"
-    print_things(title, known, columns, numbers=range(1, 9))
+    title = f"With aberration, at {known[0][1]['time']}"
+    print_things(title, known, columns, numbers=range(1, 6))
     bodies = [
-        (name, body, "no" if body.row is None else "yes")
+        (name, body, "no" if body["row"] is None else "yes")
         for name, sky in known
-        for body in sky.bodies
+        for body in sky["bodies"]
     ]
     if bodies:
         columns = {
             "frame": "{0[0]}",
-            "body": "{0[1].name}",
-            "x px": "{0[1].x_px:.1f}",
-            "y px": "{0[1].y_px:.1f}",
-            "mag": "{0[1].mag:.1f}",
-            "from boresight deg": "{0[1].from_boresight_deg:.2f}",
-            "spot": "{0[2]}",
+            "body": "{0[1][name]}",
+            "x px": "{0[1][x_px]:.1f}",
+            "y px": "{0[1][y_px]:.1f}",
+            "mag": "{0[1][mag]:.1f}",
+            "from boresight deg": "{0[1][from_boresight_deg]:.2f}",
+            "centroid": "{0[2]}",
         }
         print_things("Planets in the frame", bodies, columns, numbers=(2, 3, 4, 5))
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Folder = Annotated[Path, typer.Argument(help="The folder <name>-<version>.")]
+Folder = Annotated[Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")]
 FrameFiles = Annotated[
     list[str],
     typer.Argument(
@@ -81,10 +81,10 @@ def methods(json: opt.Json = False) -> None:
 @app.command()
 def simulate(
     artifact: Folder,
-    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
+    output: Annotated[Path, opt.to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
-    false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
+    false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are no stars.")] = 0,
     json: opt.Json = False,
 ) -> None:
     """Write one simulated frame, centroids or image, to try 'starcat identify' with.
@@ -254,7 +254,7 @@ def calibrate(
     files: Annotated[
         list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Camera file (TOML) to write.")],
+    output: Annotated[Path, opt.to_file("Where the camera (TOML) goes.")],
     camera: Annotated[
         Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
     ] = None,

@@ -9,11 +9,40 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
     from starcat.specs.build_spec import BuildSpec, CameraSpec
+
+
+def _no_file(path: Path | None) -> Path | None:
+    if path is not None and path.is_file():
+        raise OutputError(f"{path}: is a file; choose a folder with --output", path=path)
+    return path
+
+
+def _no_folder(path: Path | None) -> Path | None:
+    if path is not None and path.is_dir():
+        raise OutputError(f"{path}: is a folder; choose a file with --output", path=path)
+    return path
+
+
+# ``-o`` is everywhere where the result goes: a file where a command makes one, else a folder.
+def to_folder(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes into a folder."""
+    return typer.Option("--output", "-o", metavar="FOLDER", callback=_no_file, help=what)
+
+
+def to_file(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes a file."""
+    return typer.Option("--output", "-o", metavar="FILE", callback=_no_folder, help=what)
+
+
+def to_either(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes a file or a folder, by the format."""
+    return typer.Option("--output", "-o", metavar="FILE|FOLDER", help=what)
+
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[

@@ -7,10 +7,10 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 PANELS = {
-    "Design a database": ("sources", "presets", "init", "estimate"),
+    "Design a database": ("sources", "bands", "presets", "init", "estimate"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
-    "Use it": ("simulate", "identify", "calibrate", "methods", "sql"),
+    "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),
     "Ship it": ("export", "publish", "pull", "releases"),
     "Serve it": ("serve", "token"),
 }

@@ -79,7 +79,7 @@ def format_of_answer(question: Question) -> str:
 def _query(question: Question, targets: int) -> tuple[str | None, Mapping[str, Any]]:
     if not targets:
         raise QueryError(
-            "name what the query is about: an artifact's folder, a Parquet file or an archive "
+            "name what the query is about: a database's folder, a Parquet file or an archive "
             'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"'
         )
     if question.named is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_things, progress_bars, say, show
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_folder
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,11 +23,13 @@ Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an ad
 
 @app.command()
 def publish(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Annotated[
+        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
+    ],
     registry: Annotated[str, typer.Argument(help="Folder of the registry; made if need be.")],
     json: Json = False,
 ) -> None:
-    """Check an artifact and put it into a registry, where it will never change.
+    """Check a database and put it into a registry, where it will never change.
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
@@ -47,20 +49,18 @@ def pull(
     registry: Annotated[
         str | None, typer.Option(help="Folder or http(s) address; default: that of the lock file.")
     ] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
-    ] = Path("dist"),
+    output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     locked: Annotated[
         bool,
         typer.Option(
-            "--locked", help="Pull the versions pinned in the lock file: one artifact, or all."
+            "--locked", help="Pull the versions pinned in the lock file: one database, or all."
         ),
     ] = False,
     lock: Annotated[Path, typer.Option(help="File that pins versions by digest.")] = Path(
         "starcat.lock"
     ),
     max_bytes: Annotated[
-        int | None, typer.Option(min=0, help="Refuse an artifact with more bytes than this.")
+        int | None, typer.Option(min=0, help="Refuse a database with more bytes than this.")
     ] = None,
     retries: Retries = 3,
     json: Json = False,
@@ -105,7 +105,7 @@ def releases(
 def print_published(published: Published) -> None:
     """Print what became of a publication."""
     columns = {
-        "artifact": "{0.release.name}",
+        "database": "{0.release.name}",
         "version": "{0.release.version}",
         "files": "{0.release.files}",
         "bytes": "{0.release.bytes:,}",
@@ -120,7 +120,7 @@ def print_published(published: Published) -> None:
 def print_pulled(pulled: Sequence[Pulled]) -> None:
     """Print what became of pulls."""
     columns = {
-        "artifact": "{0.release.name}",
+        "database": "{0.release.name}",
         "version": "{0.release.version}",
         "manifest": "{0.release.manifest.sha256:.16}",
         "folder": "{0.folder}",
@@ -133,7 +133,7 @@ def print_pulled(pulled: Sequence[Pulled]) -> None:
 def print_releases(listed: Sequence[dict[str, Any]]) -> None:
     """Print what a registry lists."""
     columns = {
-        "artifact": "{0[name]}",
+        "database": "{0[name]}",
         "version": "{0[version]}",
         "": "{0[mark]}",
         "files": "{0[files]}",

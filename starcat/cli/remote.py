@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LOCAL_OPTIONS = {
     "build": ("inputs", "replace", "workers", "max_memory"),
     "sql": ("show_views", "preamble", "memory_limit_gb"),
-    "identify": ("dark", "mask", "time", "velocity", "orbit", "wcs", "track"),
+    "identify": ("dark", "mask", "velocity", "orbit", "wcs", "track"),
 }
 """Options that a service does not take."""
 

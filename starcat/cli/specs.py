@@ -34,7 +34,7 @@ from starcat.errors import ConfigError
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
     from starcat.pipeline.starter import Starter
-    from starcat.specs.build_spec import BuildSpec
+    from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 app = typer.Typer()
 
@@ -110,7 +110,18 @@ def init(
     ] = None,
     faint_limit: Annotated[
         float | None,
-        typer.Option(min=-30, max=40, help="Magnitude G that the camera sees; default: enough."),
+        typer.Option(
+            min=-30, max=40, help="Faintest magnitude that the camera sees; default: enough."
+        ),
+    ] = None,
+    response: Annotated[
+        str | None, typer.Option(help="Response of the sensor, as 'starcat bands' lists them.")
+    ] = None,
+    sensor: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Star sensor (TOML) as for 'evaluate --ecss': its limit."
+        ),
     ] = None,
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a file of that name.")
@@ -130,9 +141,36 @@ def init(
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
+        camera = with_sensor(camera, response, sensor)
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
+
+
+def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -> CameraSpec:
+    """Return a camera with the band of its sensor, and with the light and noise of a frame."""
+    if response is None and sensor is None:
+        return camera
+    from starcat.bands.response import shipped
+    from starcat.evaluation.ecss.sensor import read_sensor
+    from starcat.specs.camera_exposure import NEEDED, CameraExposure
+    from starcat.specs.camera_response import CameraResponse
+
+    content = camera.model_dump()
+    if response is not None:
+        shipped(response)
+        content["response"] = CameraResponse(name=response).model_dump()
+    if sensor is not None:
+        found = read_sensor(sensor).model_dump()
+        if found["aperture_mm"] is None:
+            raise ConfigError(
+                f"{sensor}: zero_point_e_s says nothing of the band; give aperture_mm and "
+                "quantum_efficiency instead",
+                key="aperture_mm",
+            )
+        names = (*NEEDED, "dark_e_s", "sky_e_s")
+        content["exposure"] = CameraExposure(**{name: found[name] for name in names}).model_dump()
+    return type(camera).model_validate(content)
 
 
 def print_preset(spec: BuildSpec) -> None:
@@ -145,7 +183,7 @@ def print_preset(spec: BuildSpec) -> None:
         "camera": f"{camera.width_px} x {camera.height_px} px",
         "field": f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg",
         "boresights": f"{spec.boresights.count:,}",
-        "epoch": f"J{spec.epoch_jyear:g}",
+        "epoch": f"J{spec.middle_jyear:g}",
         "every key": f"starcat presets {spec.name} --toml",
     }
     print_facts(f"{spec.name} {spec.version}", facts)
@@ -170,7 +208,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         return
     camera = starter.spec.camera.camera()
     columns = {
-        "faint limit, G": "{0[0]:g}{0[1]}",
+        f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",
         "guide stars": "{0[2].guide_stars:,}",
         "fewest": "{0[2].stars.minimum:,}",
         "1 %": "{0[2].stars.one_percent:,}",
@@ -187,7 +225,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
         f"{thinned.stars.median:,} in the middle one."
         "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
-        f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
+        f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
     )
     warn(told)
     say(starter.cost.in_words)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.cli.options import Json
+from starcat.cli.options import Json, to_file
 from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS
 
@@ -22,7 +22,7 @@ Arguments = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="TARGET... [QUERY]",
-        help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
+        help="Databases, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
         "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
     ),
 ]
@@ -31,7 +31,7 @@ Values = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
 ]
 OutputFile = Annotated[
-    Path | None, typer.Option("--output", "-o", help="File; its suffix selects the format.")
+    Path | None, to_file("Where the answer goes; the suffix selects the format.")
 ]
 FormatName = Annotated[
     str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
@@ -57,7 +57,7 @@ def sql(
     memory_limit_gb: Annotated[float, typer.Option(min=0.1, help="Memory it may take.")] = 2.0,
     json: Json = False,
 ) -> None:
-    """Ask questions about artifacts and catalogs in SQL; nothing is written but -o FILE.
+    """Ask questions about databases and catalogs in SQL; nothing is written but -o FILE.
 
     Every product is a view: stars, rejected, pairs, triangles ... With several targets each has
     a schema of its name, and they are a, b, c ... too. The folder of a store may be any HATS

@@ -208,13 +208,13 @@ def attitude_of(
 
 
 def sky_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of an artifact as a camera would see it."""
+    """Return the whole catalog of a database as a camera would see it."""
     doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
     return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
 
 
 def catalog_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of an artifact."""
+    """Return the whole catalog of a database."""
     artifact = open_artifact(folder)
     stars, rejected = artifact.table("stars"), artifact.table("rejected")
     # A merged star's companion is in the guide star already.
@@ -260,7 +260,7 @@ class Row:
 
     group: str  # title of the table or curve
     label: str  # name of the line
-    preset: str  # the artifact that is used, by its preset
+    preset: str  # the database that is used, by its preset
     experiment: Experiment  # the frames and the method
     rule: str  # what the paper counts as a success: a key of `RULES`
     published_percent: float | None = None  # what the paper prints
@@ -296,9 +296,9 @@ class Paper:
     name: str  # ``S1`` to ``S5``
     title: str  # what it is about; who, where, when
     citation: str
-    presets: tuple[str, ...]  # artifacts that it needs
+    presets: tuple[str, ...]  # databases that it needs
     rows: Callable[[bool], list[Row]] = lambda quick: []  # for a quick run (True) with fewer frames
-    # from the artifacts' folders by preset
+    # from the databases' folders by preset
     statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
     deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead
 

@@ -1,7 +1,7 @@
-"""The work of ``starcat evaluate``: artifacts, experiments, report.
+"""The work of ``starcat evaluate``: databases, experiments, report.
 
 An output folder holds ``artifacts/``, ``records/`` with a Parquet file for each experiment, and a
-folder for each report, named after the papers or the artifact. Sweeps of one artifact into the same
+folder for each report, named after the papers or the database. Sweeps of one database into the same
 folder stand beside each other; a point that is measured again takes the place of the old one, as
 its record does.
 """
@@ -61,7 +61,7 @@ def prepare_artifacts(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> dict[str, Path]:
-    """Build the artifacts that papers need."""
+    """Build the databases that papers need."""
     artifacts = {}
     for name in dict.fromkeys(presets):
 
@@ -105,7 +105,7 @@ def evaluate_papers(
 def evaluate_artifact(
     sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
 ) -> Evaluation:
-    """Measure how often an artifact identifies, and add it to the report."""
+    """Measure how often a database identifies, and add it to the report."""
     paper = sweep_paper(sweep)
     outcome = run_paper(
         paper,

@@ -1,4 +1,4 @@
-"""An evaluation of any artifact with any camera: one quantity varied at a time.
+"""An evaluation of any database with any camera: one quantity varied at a time.
 
 It is laid out as a paper's rows are, so the same experiments, tables and plots serve.
 """
@@ -105,7 +105,7 @@ PARAMETERS: dict[str, Parameter] = {
     "noise_mag": _noise("noise_mag", "magnitude noise, mag", (0.0, 0.25, 0.5, 1.0), 0.0, 10.0),
     "false_stars": _noise("false_stars", "false stars", (0.0, 2.0, 5.0, 10.0), 0.0, 1000.0),
     "false_share": _noise(
-        "false_share", "share of false stars among the spots", (0.0, 0.2, 0.35, 0.5), 0.0, 0.95
+        "false_share", "share of false stars among the centroids", (0.0, 0.2, 0.35, 0.5), 0.0, 0.95
     ),
     "drop_probability": _noise(
         "drop_probability", "chance of a star to be missing", (0.0, 0.1, 0.2, 0.4), 0.0, 1.0
@@ -151,7 +151,7 @@ NOISE_PX = 0.5
 class Sweep:
     """What is to be tried."""
 
-    artifact: Path  # the artifact's folder
+    artifact: Path  # the database's folder
     # what the matcher takes the camera to be; the true one differs where ``k1`` and ``scale`` say
     # so
     camera: Camera

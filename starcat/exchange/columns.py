@@ -36,12 +36,12 @@ class Label:
     """What a file says of its table as a whole; what is not known is empty."""
 
     table: str = ""  # name of the product, or of the file that was exported
-    artifact: str = ""  # the artifact that it is a product of
+    artifact: str = ""  # the database that it is a product of
     version: str = ""
 
     @property
     def origin(self) -> dict[str, str]:
-        """Artifact and version, where they are known."""
+        """Database and version, where they are known."""
         known = {"artifact": self.artifact, "version": self.version}
         return {name: text for name, text in known.items() if text}
 

@@ -42,9 +42,9 @@ COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
 
 @dataclass(frozen=True)
 class NamedTables:
-    """Tables by product, of an artifact, a file or a peer; each is read when needed."""
+    """Tables by product, of a database, a file or a peer; each is read when needed."""
 
-    name: str  # of all of them together, such as the artifact's name and version
+    name: str  # of all of them together, such as the database's name and version
     readers: Mapping[str, Callable[[], pa.Table]]
     artifact: str = ""  # empty where they are of none
     version: str = ""
@@ -96,7 +96,7 @@ class Exported:
 
 
 def tables_of(path: Path) -> NamedTables:
-    """Return the tables of an artifact, or the one of a Parquet file."""
+    """Return the tables of a database, or the one of a Parquet file."""
     if path.is_dir():
         artifact = open_artifact(path)
         readers = {name: partial(artifact.table, name) for name in artifact.products}
@@ -120,7 +120,7 @@ def _read_file(path: Path) -> pa.Table:
         return read_parquet(path)
     except (OSError, pa.ArrowException) as error:
         raise SourceError(
-            f"{path}: not a readable Parquet file ({error}); give the folder of an artifact or a "
+            f"{path}: not a readable Parquet file ({error}); give the folder of a database or a "
             "Parquet file, or say with --from-peer whose file it is",
             path=path,
         ) from error

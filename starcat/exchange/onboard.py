@@ -1,4 +1,4 @@
-"""An artifact as an onboard image or as C source, and images held against their artifacts."""
+"""A database as an onboard image or as C source, and images held against their databases."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def export_image(
     max_bytes: int | None = None,
     replace: bool = False,
 ) -> ExportedImage:
-    """Write the onboard image of an artifact."""
+    """Write the onboard image of a database."""
     check_method(method)
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
@@ -94,7 +94,7 @@ def export_image(
 
 
 def contents_of(artifact: Artifact, method: str) -> Contents:
-    """Return what the image of an artifact is made of."""
+    """Return what the image of a database is made of."""
     _check_product(artifact, method)
     product, columns = FEATURES[method]
     stars, features = artifact.table("stars"), artifact.table(product)
@@ -114,7 +114,7 @@ def contents_of(artifact: Artifact, method: str) -> Contents:
 
 
 def verify_image(path: Path, against: Path | None = None) -> Verification:
-    """Check an onboard image: its blocks, its parts, and what its artifact says."""
+    """Check an onboard image: its blocks, its parts, and what its database says."""
     artifact = None if against is None else check_artifact(against)
     data = bytes_of_file(path)
     checks, findings = 1, list(_damage(data, path.name))

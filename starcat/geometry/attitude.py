@@ -12,11 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from starcat.arrays import Array, Directions, Matrix
+from starcat.arrays import Array, Directions, Matrix, Rows
 
 Quaternion = tuple[float, float, float, float]
 
 Turn = tuple[float, float, float]
+
+_UNIT = np.eye(3)
+
+_SINGULAR = 1e-13
+"""Least share of the largest eigenvalue of an information matrix that the smallest may be."""
 
 
 def matrix_from_quaternion(q: Array) -> Array:
@@ -153,6 +158,91 @@ def determinant(matrix: Matrix) -> float:
     """Return the determinant of one matrix, in a tenth of the general time."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+def information(
+    directions: Array, *, with_scale: bool = False, weights: Array | None = None
+) -> Array:
+    """Return the information matrix of an attitude that the centroids of stars determine.
+
+    ``sum(w (I - b b^T))`` over the directions b: its inverse is the covariance of the small
+    rotations that the attitude is off by, where w is one over the variance of a direction on each
+    axis across it; without weights the unit is that variance, the same for all.
+
+    Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
+    """
+    if weights is not None:
+        return np.asarray(weights.sum() * _UNIT - (directions.T * weights) @ directions)
+    of_angles = len(directions) * _UNIT - directions.T @ directions
+    if not with_scale:
+        return np.asarray(of_angles)
+    x, y, z = directions.T
+    found = np.empty((4, 4))
+    found[:3, :3] = of_angles
+    # A turn d moves the direction u of a star by d x u; a longer focal length moves that of its
+    # centroid by u_z e_z - u_z^2 u, towards the axis.
+    found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
+    found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
+    return found
+
+
+def information_of_groups(
+    directions: Directions, group: Rows, count: int, weights: Array | None = None
+) -> Array:
+    """Return the `information` of many groups of directions at once.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (M, 3)
+        Unit vectors, those of each group in a frame of its own.
+    group : ndarray of int, shape (M,)
+        The group of each, from 0.
+    count : int
+        Number of groups.
+    weights : ndarray of float64, shape (M,), optional
+        One over the variance of each direction; 1 by default.
+
+    Returns
+    -------
+    ndarray of float64, shape (count, 3, 3)
+        Zero where a group has no direction.
+    """
+    found = np.empty((count, 3, 3))
+    for (i, j), term in information_terms(directions).items():
+        term = term if weights is None else term * weights
+        found[:, i, j] = found[:, j, i] = np.bincount(group, term, count)
+    return found
+
+
+def information_terms(directions: Directions) -> dict[tuple[int, int], Array]:
+    """Return ``I - b b^T`` of each direction by row and column, those above the diagonal once.
+
+    The diagonal is that of sums of squares, which keep their digits in a narrow field.
+    """
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    return {
+        (0, 0): yy + zz,
+        (1, 1): xx + zz,
+        (2, 2): xx + yy,
+        (0, 1): -x * y,
+        (0, 2): -x * z,
+        (1, 2): -y * z,
+    }
+
+
+def attitude_deviations(matrices: Array) -> Array:
+    """Return the standard deviations of attitudes about the three axes from their information.
+
+    Shape (G, 3) for matrices of shape (G, 3, 3); infinite about all axes where the directions
+    determine no attitude.
+    """
+    eigenvalues = np.linalg.eigvalsh(matrices)
+    known = eigenvalues[:, 0] > _SINGULAR * eigenvalues[:, 2]
+    found = np.full((len(matrices), 3), np.inf)
+    inverse = np.linalg.inv(matrices[known])
+    found[known] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+    return found
 
 
 def random_attitudes(count: int, generator: np.random.Generator) -> Array:

@@ -151,6 +151,11 @@ class Camera:
         x = 0.5 * self.width_px
         return float(np.degrees(self._widest_rad(np.array([[x, 0.0], [x, self.height_px]]))))
 
+    @property
+    def pixel_arcsec(self) -> float:
+        """Angle that a pixel on the optical axis covers, arcsec."""
+        return float(np.degrees(1.0 / self.focal_length_px) * 3600.0)
+
     @cached_property
     def diagonal_rad(self) -> float:
         """Largest separation of two corners, radians."""

@@ -17,13 +17,12 @@ from scipy.special import erf, ndtri
 
 from starcat.arrays import Array, Mask
 from starcat.errors import ConfigError
+from starcat.products.blends import PIXEL_VARIANCE
 from starcat.version import install_command
 
 Grey = NDArray[np.float32]
 
 SMALLEST_PX = 16  # narrowest image in which a background can be told from stars
-# What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise.
-PIXEL_VARIANCE = 1.0 / 12.0
 _BOX_PX = 64
 # Boxes of the background, tried one after the other where there are clouds.
 _BOXES_PX = (64, 32, 16)

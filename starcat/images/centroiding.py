@@ -19,7 +19,6 @@ from scipy.ndimage import convolve1d
 from starcat.arrays import Array, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.images.background import (
-    PIXEL_VARIANCE,
     Levels,
     load_sep,
     mask_hot_pixels,
@@ -30,6 +29,7 @@ from starcat.images.background import (
 from starcat.images.spot_noise import centroid_sigma_px, electrons_per_step, noise_at
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
 from starcat.images.streaks import Streak, measured_streaks, refined, streak_of
+from starcat.products.blends import APERTURE_SIGMA, widths_px
 
 _log = logging.getLogger(__name__)
 
@@ -38,8 +38,6 @@ _ROOM, _ROOM_SHARE = 300_000, 0.3
 _MOST_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
 # The threshold is raised by this factor, so many times, where the room does not do.
 _RAISE, _TRIES = 1.5, 4
-_NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
-_APERTURE_SIGMA = 2.0
 # A plateau: pixels that differ by no more than read noise, and by half a per cent.
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
 
@@ -121,13 +119,13 @@ def _streaked(
 def _measured(
     levels: Levels, found: NDArray[Any], sigma: float, gain: float, most: int | None
 ) -> Spots:
-    seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
-    window = max(seen, _NARROWEST_WINDOW_PX)
+    widths = widths_px(sigma)
+    seen, window = widths.spot, widths.window
     centroids = _windowed(levels, found, window)
     x, y = (centroids - 0.5).T
-    radius = _APERTURE_SIGMA * seen
+    radius = APERTURE_SIGMA * seen
     part, _, _ = load_sep().sum_circle(levels.above, x, y, radius, mask=levels.mask, subpix=0)
-    flux = part / (1.0 - np.exp(-0.5 * _APERTURE_SIGMA**2))
+    flux = part / (1.0 - np.exp(-0.5 * APERTURE_SIGMA**2))
     sigma_px = centroid_sigma_px(flux, noise_at(levels, centroids), seen, gain, window)
     return _in_order(centroids, flux, sigma_px, sigma, most)
 

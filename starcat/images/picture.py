@@ -1,4 +1,4 @@
-"""A picture of one frame: the image or its spots, which of them are which stars, where north is.
+"""A picture of one frame: the image or its centroids, which are which stars, where north is.
 
 The same input gives the same bytes. Nothing is identified here.
 """
@@ -59,8 +59,8 @@ def draw(
             f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
         )
         below = (
-            f"{result.n_matched} of {len(result.star_index)} spots are stars of {database.name}, "
-            f"residual {result.residual_arcsec:.1f} arcsec"
+            f"{result.n_matched} of {len(result.star_index)} centroids are stars of "
+            f"{database.name}, residual {result.residual_arcsec:.1f} arcsec"
         )
         matrix = matrix_from_quaternion(result.q_body_from_icrs)
         compass = compass_from_matrix(matrix)
@@ -125,7 +125,7 @@ def draw_identified(
     compass: tuple[Array, Array] | None = None,
     overlay: Overlay | None = None,
 ) -> None:
-    """Draw which spots of a frame are which stars."""
+    """Draw which centroids of a frame are which stars."""
     check_kind(path, "picture")
     with own_style():
         figure, axes, scale = _canvas(camera_size, title, below)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -114,9 +114,11 @@ class FrameAnswer:
             *("dx_px", "dy_px", "separation_arcsec", "difference_mag"),
         )
         columns = {name: getattr(stars, name).tolist() for name in numbers}
-        content = []
+        content, given = [], self.frame.mag
         for number, (x, y) in enumerate(self.frame.centroids_px.tolist()):
-            one: Content = {"x_px": _or_none(x), "y_px": _or_none(y), "star": None, "mag": None}
+            seen = None if given is None else _or_none(float(given[number]))
+            one: Content = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
+            one |= {"star": None, "mag": None}
             row = row_of.get(number)
             if row is not None:
                 one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
@@ -132,8 +134,10 @@ def facts(result: MatchResult) -> Content:
     found: Content = {"status": result.status, "origin": result.origin}
     found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
     if result.ok:
-        camera = result.camera
+        camera, database = result.camera, result.database
         found |= {
+            "database": None if database is None else database.name,
+            "camera": None if camera is None else asdict(camera),
             "boresight_ra_deg": result.boresight_ra_deg,
             "boresight_dec_deg": result.boresight_dec_deg,
             "roll_deg": result.roll_deg,
@@ -332,7 +336,7 @@ def _is_limited(result: MatchResult) -> bool:
 
 
 def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
-    """Open the database of an artifact, or an onboard image, for identifying with some options."""
+    """Open a database, or an onboard image, for identifying with some options."""
     given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
     method = given.pop("method")
     return Matcher.open(

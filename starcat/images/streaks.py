@@ -19,8 +19,9 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from starcat.arrays import Array
-from starcat.images.background import PIXEL_VARIANCE, Levels
+from starcat.images.background import Levels
 from starcat.images.spot_noise import noise_at
+from starcat.products.blends import PIXEL_VARIANCE
 
 _FEWEST, _MOST = 5, 30
 _LONG = 2.5  # length over width from which a spot is long, by standard deviations along its axes

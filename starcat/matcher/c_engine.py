@@ -185,7 +185,7 @@ class CEngine:
         if status != 0:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
-                f"{NOT_OPENED.get(status, f'error {status}')}; export the artifact for this machine"
+                f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
             )
         own = np.arange(int(self.image.n_stars)) if rows is None else rows
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))

@@ -84,7 +84,7 @@ class Database:
     def check_has_products(self, why: str, **fact: Any) -> None:
         """Check that this is no onboard image, which has none."""
         if self.image is not None:
-            raise ConfigError(f"{why}; open the artifact that it is of", **fact)
+            raise ConfigError(f"{why}; open the database that it is of", **fact)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: all but what can be made again there."""
@@ -350,7 +350,7 @@ class _Checks:
 def damaged(product: str, what: str, found: str) -> ProductError:
     """Return the error of a database that no build wrote as it is."""
     return ProductError(
-        f"{product}/{what} {found}; the database is damaged. Build the artifact again, or fetch "
+        f"{product}/{what} {found}; the database is damaged. Build the database again, or fetch "
         "it again",
         product=product,
     )

@@ -70,7 +70,7 @@ class Matcher(Settings, _WithDatabase):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
-            text = "engine 'numpy' needs an artifact; an onboard image has no products"
+            text = "engine 'numpy' needs a database; an onboard image has no products"
             raise ConfigError(text, key="engine", value=self.engine)
         if self.engine == "c" and self._c_engine is None:
             raise ConfigError(f"engine 'c': {self._without_c()}", key="engine", value="c")

@@ -18,7 +18,7 @@ import numpy as np
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.attitude import information, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Candidates, Observation
 
@@ -36,8 +36,6 @@ the focal length is taken as known; where it is fitted, twice as much, as its er
 
 LEAST_WEIGHT = 1e-8
 """Least weight of a centroid over the largest of its frame; rounding leaves no room for less."""
-
-_UNIT = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -213,28 +211,6 @@ def _corner_error_rad(covariance: Array, n: int, residual_rad: float, camera: Ca
     # Three of the 2n components went into the attitude, a fourth into the scale.
     deviation_rad = residual_rad * math.sqrt(n / (2 * n - len(covariance)))
     return deviation_rad * corner_deviation(covariance, camera)
-
-
-def information(
-    directions: Array, *, with_scale: bool = False, weights: Array | None = None
-) -> Array:
-    """Return the information matrix of an attitude that the centroids of stars determine.
-
-    Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
-    """
-    if weights is not None:
-        return np.asarray(weights.sum() * _UNIT - (directions.T * weights) @ directions)
-    of_angles = len(directions) * _UNIT - directions.T @ directions
-    if not with_scale:
-        return np.asarray(of_angles)
-    x, y, z = directions.T
-    found = np.empty((4, 4))
-    found[:3, :3] = of_angles
-    # A turn d moves the direction u of a star by d x u; a longer focal length moves that of its
-    # centroid by u_z e_z - u_z^2 u, towards the axis.
-    found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
-    found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
-    return found
 
 
 def weighted_share(covariance: Array, directions: Array) -> float:

@@ -343,7 +343,7 @@ class MatchResult:
             return head + (f"<p>{escape(f'{why.message}. Try: {why.hint}')}</p>" if why else "")
         stars = self.stars
         columns = {
-            "spot": stars.spot.tolist(),
+            "centroid": stars.spot.tolist(),
             "star": [escape(name) for name in stars.star],
             "RA deg": [f"{value:.5f}" for value in stars.ra_deg],
             "Dec deg": [f"{value:+.5f}" for value in stars.dec_deg],

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix
+from starcat.geometry.attitude import information
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Frame
-from starcat.matcher.pose import information, weights_of
+from starcat.matcher.pose import weights_of
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""

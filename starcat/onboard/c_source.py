@@ -17,7 +17,7 @@ _WORDS_A_LINE = 4
 
 
 def c_symbol(name: str) -> str:
-    """Return the name of the array: that of the artifact, with ``_`` for what C does not allow."""
+    """Return the name of the array: that of the database, with ``_`` for what C does not allow."""
     return "starcat_" + re.sub("[^0-9a-z]", "_", name.lower())
 
 

@@ -1,4 +1,4 @@
-"""Checks of an onboard image: what its numbers say of each other, and what its artifact says.
+"""Checks of an onboard image: what its numbers say of each other, and what its database says.
 
 Everything is computed again from directions and rows. Functions yield what is wrong, in words.
 """
@@ -75,7 +75,7 @@ def capacity_problems(image: OnboardImage) -> Iterator[str]:
 
 
 def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
-    """Yield where an image is not of an artifact."""
+    """Yield where an image is not of a database."""
     digest = contents.manifest_sha256.hex()
     if image.manifest_sha256 != digest:
         yield (
@@ -90,7 +90,7 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
         ("camera", camera, (theirs.width_px, theirs.height_px, theirs.focal_length_px)),
     ):
         if ours != other:
-            yield f"{name} is {ours}; the artifact says {other}"
+            yield f"{name} is {ours}; the database says {other}"
     order = np.argsort(contents.star_id)
     numbers = image.star_id
     place = np.searchsorted(contents.star_id[order], numbers)
@@ -98,12 +98,12 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
     missing = contents.star_id[row] != numbers if len(order) else np.ones(len(row), dtype=bool)
     if missing.any():
         named = ", ".join(map(str, numbers[missing][:5].tolist()))
-        yield f"{int(missing.sum())} stars are not in the artifact: {named}"
+        yield f"{int(missing.sum())} stars are not in the database: {named}"
         return
     yield from _star_problems(image, contents, row)
     features = np.sort(row[image.features], axis=1)
     if not _in_rows(features, np.sort(contents.features, axis=1), len(order)).all():
-        yield f"section {FEATURES[image.method][0]}: not all of them are in the artifact"
+        yield f"section {FEATURES[image.method][0]}: not all of them are in the database"
 
 
 def _star_problems(
@@ -113,14 +113,14 @@ def _star_problems(
     if moved.any():
         worst = separation(image.directions[moved], contents.directions[row][moved]).max()
         yield (
-            f"section directions: {int(moved.sum())} stars lie elsewhere than in the artifact, by "
+            f"section directions: {int(moved.sum())} stars lie elsewhere than in the database, by "
             f"up to {np.degrees(worst) * 3600.0:.4g} arcsec"
         )
     ours, theirs = image.mag, contents.mag[row]
     far = ~(np.abs(ours - theirs) <= 0.5 / MAG_SCALE + 1e-9)
     far &= ~(np.isnan(ours) & ~np.isfinite(theirs)) & ~(np.abs(theirs) > 32.7)
     if far.any():
-        yield f"section magnitudes: {int(far.sum())} stars have another one in the artifact"
+        yield f"section magnitudes: {int(far.sum())} stars have another one in the database"
 
 
 def _in_rows(found: NDArray[np.int64], known: NDArray[np.int64], count: int) -> NDArray[np.bool_]:

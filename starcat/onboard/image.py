@@ -35,7 +35,7 @@ SMALLEST_MARGIN = 1e-12
 class Contents:
     """What an image is made of."""
 
-    name: str  # ``<name>-<version>`` of the artifact
+    name: str  # ``<name>-<version>`` of the database
     epoch_jyear: float  # epoch of the directions, Julian year
     camera: Camera  # size of the detector and focal length are used
     star_id: NDArray[np.int64]  # permanent star numbers; shape (N,)
@@ -73,7 +73,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
             f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
-            f"{layout.MAX_BYTES:,} can be said in it. Build a smaller artifact, or pass "
+            f"{layout.MAX_BYTES:,} can be said in it. Build a smaller database, or pass "
             "--max-bytes",
             key="max_bytes",
         )
@@ -118,7 +118,7 @@ def _check_name(name: str) -> None:
     if size > layout.NAME_BYTES:
         raise ConfigError(
             f"{name}: has {size} bytes; an onboard image has room for names of "
-            f"{layout.NAME_BYTES}. Build the artifact under a shorter name",
+            f"{layout.NAME_BYTES}. Build the database under a shorter name",
             key="name",
             value=name,
         )

@@ -33,8 +33,8 @@ class OnboardImage:
 
     data: bytes
     byte_order: ByteOrder
-    name: str  # ``<name>-<version>`` of the artifact
-    manifest_sha256: str  # SHA-256 of the artifact's manifest.json, hexadecimal
+    name: str  # ``<name>-<version>`` of the database
+    manifest_sha256: str  # SHA-256 of the database's manifest.json, hexadecimal
     method: str
     camera: Camera  # the camera that it was built for
     header: Mapping[str, int | float]  # the numbers of the header by name

@@ -34,7 +34,7 @@ class Shrunk:
     """Contents that fit, and what it took."""
 
     contents: Contents
-    stars_before: int  # of the artifact
+    stars_before: int  # of the database
     features_before: int  # of the image without a limit
     # The stars left are among so many brightest of a field; None where all are left.
     stars_per_field: int | None
@@ -69,7 +69,7 @@ def shrink(
     raise OnboardSizeError(
         f"{contents.name}: {limit:,} bytes are too few for an onboard image for the method "
         f"{contents.method}; the smallest that is of use has {smallest:,} bytes. Raise "
-        "--max-bytes, choose another --method, or build an artifact with fewer stars",
+        "--max-bytes, choose another --method, or build a database with fewer stars",
         max_bytes=int(limit),
         smallest_bytes=smallest,
     )

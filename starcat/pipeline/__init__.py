@@ -1,1 +1,1 @@
-"""Pipeline: a spec and archive files become a verified artifact."""
+"""Pipeline: a spec and archive files become a verified database."""

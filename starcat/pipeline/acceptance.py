@@ -16,7 +16,7 @@ from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
 FEW_STARS = 8
-"""A frame with fewer guide stars may be beyond any matcher when some spots are missing or false."""
+"""A frame of fewer guide stars may be beyond any matcher with missing or false centroids."""
 
 CROWDED = 2.0
 """A frame is crowded that has so many times as many stars as make a field's triangles."""
@@ -87,5 +87,5 @@ def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | 
     return (
         f"without magnitudes {bare.identified} of {bare.frames} simulated pointings are "
         f"identified, with them {clean.identified} of {clean.frames}: give the magnitudes "
-        f"of the spots, or set selection.max_stars_per_field = {thinned}"
+        f"of the centroids, or set selection.max_stars_per_field = {thinned}"
     )

@@ -1,4 +1,4 @@
-"""The stages of a build, in order: from a spec and archive files to an artifact.
+"""The stages of a build, in order: from a spec and archive files to a database.
 
 Each stage is a plain function of the results before it; the last ones write into a partial
 folder, read it back, identify simulated fields with it and only then give it its name.
@@ -19,8 +19,10 @@ import pyarrow as pa
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.ingest import Ingested
+from starcat.catalog.observed import with_observed
 from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
+from starcat.catalog.span import validity, with_span
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
@@ -28,7 +30,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
-from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
 from starcat.pipeline.recipes import (
@@ -46,6 +48,7 @@ from starcat.pipeline.report_data import (
     filter_coverages,
     report_content,
 )
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
@@ -69,9 +72,9 @@ _logger = logging.getLogger(__name__)
 class Built:
     """A finished build."""
 
-    folder: Path  # the artifact
+    folder: Path  # the database
     outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
-    manifest: dict[str, Any]  # manifest of the artifact
+    manifest: dict[str, Any]  # manifest of the database
     filters: tuple[FilterCoverage, ...]  # what each filter left
     coverage: CoverageReport  # coverage by the guide stars
     # rates of the self-test: clean and hard frames, and the same without magnitudes
@@ -81,7 +84,7 @@ class Built:
     times_s: dict[str, float]  # seconds by stage
 
     def __repr__(self) -> str:
-        """Return the artifact and how it identifies in one line."""
+        """Return the database and how it identifies in one line."""
         clean, hard = self.rates[:2]
         stars = self.manifest["products"]["stars"]["rows"]
         return (
@@ -101,7 +104,7 @@ def build(
     announce: Callable[[Cost], None] | None = None,
     max_memory_bytes: int | None = None,
 ) -> Built:
-    """Build an artifact."""
+    """Build a database."""
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
 
@@ -138,6 +141,9 @@ def _make(
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
     stars, joined = join_all(catalog.stars, amplitudes)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
+    stars = with_observed(in_band.stars, spec.selection.observed)
+    stars = with_span(stars, spec.span_jyear)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motions_of(catalog.stars, motions.table, selected.guide_stars)
@@ -154,9 +160,11 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
-    sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
+    sources = [star_source, *motion_sources(motions, products), *others]
+    sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = BuildResults(spec, sources, products, facts, fields, filters, rates)
+    own = (spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(*own, in_band=in_band.made, neighbours=selected.neighbours)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -164,6 +172,10 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *in_band.notes,
+            *spec.exposure_notes,
+            str(validity(selected.guide_stars, spec.span_jyear) or ""),
+            *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),
             advice_without_magnitudes(rates, spec),
@@ -221,10 +233,11 @@ def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
     spec = results.spec
     counted = field_coverage(results.fields, spec.boresights.brightest)
-    coverage = coverage_report(counted, spec)
+    stars = next(each.table for each in results.products if each.name == "stars")
+    coverage = coverage_report(counted, results.fields, directions_of(stars), spec)
     content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", content, coverage)
+    write_report(folder / "report", content, coverage, results.in_band)
     for warning in content["warnings"]:
         _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
     return coverage
@@ -237,7 +250,7 @@ def make_products(
     fields: FieldStars,
     progress: Progress = no_progress,
 ) -> list[Product]:
-    """Compute the products of an artifact."""
+    """Compute the products of a database."""
     rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
     products = [

@@ -11,12 +11,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.catalog.observed import with_observed
+from starcat.catalog.span import with_span
 from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
 from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
+from starcat.pipeline.sensor_band import in_band_of
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import BuildSpec, Observed
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and to place it."""
@@ -70,6 +73,9 @@ def read_snapshot(
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
+    in_band = in_band_of(stars, spec, inputs, workers, progress)
+    stars = with_observed(in_band.stars, spec.selection.observed)
+    stars = with_span(stars, spec.span_jyear)
     catalog = joined.catalog
     return CatalogSnapshot(
         stars.combine_chunks(),
@@ -78,7 +84,7 @@ def read_snapshot(
         round(len(catalog.rejected) * _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS))),
         catalog.stars.nbytes + catalog.rejected.nbytes,
         catalog.rows_read,
-        catalog.notes,
+        (*catalog.notes, *in_band.notes),
     )
 
 
@@ -90,7 +96,11 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
-    if spec.catalog.motions:
+    if spec.selection.observed != Observed():
+        wanted["observed"] = content["selection"]["observed"]
+    if spec.camera.response.name is not None:
+        wanted["response"] = content["camera"]["response"]
+    if spec.catalog.motions or spec.camera.response.photometry:
         model = content["products"]["crossmatch"]
         wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
     return wanted

@@ -22,7 +22,13 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
 from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
-from starcat.pipeline.guide_stars import MOST_FIELD_STARS, check_fields, check_tiling, thinned_stars
+from starcat.pipeline.guide_stars import (
+    MOST_FIELD_STARS,
+    check_fields,
+    check_tiling,
+    depth_notes,
+    thinned_stars,
+)
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars
@@ -67,7 +73,7 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()
     most = spec.selection.max_stars_per_field
-    check_tiling(len(stars), spec, most)
+    check_tiling(int(np.searchsorted(mag, spec.selection.faint_limit_mag, "right")), spec, most)
     if len(stars) < MIN_GUIDE_STARS:
         thinned_stars(read.stars, spec)  # says so, in the words of the build
     selected = thinned_stars(stars, spec)
@@ -88,6 +94,8 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
 
 def _faintest(selection: Selection) -> float:
     """Return the magnitude beyond which a star is too faint, and nobody's companion."""
+    if selection.neighbours.is_on:
+        return np.inf
     companions = selection.doubles.companion_limit_mag
     return max(selection.faint_limit_mag, -np.inf if companions is None else companions)
 
@@ -136,7 +144,7 @@ class Estimate:
 
     @property
     def total_bytes(self) -> int:
-        """Size of the artifact."""
+        """Size of the database."""
         return sum(self.cost.files.values())
 
     @property
@@ -184,7 +192,13 @@ def estimate(
         tuple((step.name, len(step.directions)) for step in choice.selected.steps),
         choice.rejected,
         tuple(refusals),
-        (*read.notes, *coverage_warnings(summary, gap)),
+        (
+            *read.notes,
+            *spec.exposure_notes,
+            *spec.exposure_proposal,
+            *depth_notes(read.stars, spec),
+            *coverage_warnings(summary, gap),
+        ),
     )
 
 

@@ -12,18 +12,26 @@ from numpy.typing import NDArray
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields
+from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
+from starcat.products.thinning import thin_by_cells, thin_by_information
 from starcat.specs.build_spec import BuildSpec
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
 
+LEAST_CONTAMINATION = 0.001
+"""A thousandth of a star's light moves no centroid; fainter neighbours need not be known."""
+
 FIRST_LOOK = 4.0
 """Times as many stars as fill a field of the mean are looked at first."""
+
+POOL = 2.0
+"""Times as many stars of a field as stay on average, the brightest, may stay by another rule."""
 
 
 def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars]:
@@ -36,13 +44,47 @@ def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars
 
 def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
     """Select guide stars, and thin them if the spec says so."""
-    selected = select_guide_stars(stars, spec.selection)
+    selected = select_guide_stars(stars, spec.selection, spec.camera.camera().pixel_arcsec)
     check_guide_stars(selected, spec)
     most = spec.selection.max_stars_per_field
-    if most is not None:
+    if spec.selection.thinning != "brightest":
+        reason = Reason.beyond_count if most is None else Reason.density
+        selected = reject_dense(selected, even_stars(selected.guide_stars, spec), reason)
+    elif most is not None:
         selected = reject_dense(selected, brightest_of_fields(selected.guide_stars, spec, most))
-        check_guide_stars(selected, spec)
+    else:
+        return selected
+    check_guide_stars(selected, spec)
     return selected
+
+
+def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
+    """Return the rows of stars that a spec's thinning keeps, ascending.
+
+    They are as many as the brightest of the same limits are. Stars that are not among several
+    times as many of any field are not looked at, so that deep catalogs take hardly longer.
+    """
+    order = np.lexsort((guide_stars["star_id"].to_numpy(), floats_of(guide_stars, "mag")))
+    stars, selection = guide_stars.take(pa.array(order)), spec.selection
+    bright = stars.slice(0, selection.max_stars)
+    count = len(bright)
+    if selection.max_stars_per_field is not None:
+        count = len(brightest_of_fields(bright, spec, selection.max_stars_per_field))
+    if count == len(stars):
+        return np.arange(count)
+    pool = brightest_of_fields(stars, spec, int(np.ceil(POOL * count * field_share(spec))))
+    if len(pool) < count:  # where fields leave much of the sphere out
+        pool = np.arange(len(stars))
+    directions, mag = directions_of(stars)[pool], floats_of(stars, "mag")[pool]
+    if selection.thinning == "voronoi":
+        kept = thin_by_cells(directions, mag, count)
+    else:
+        size, wanted = field_size(spec), spec.boresights
+        check_tiling(len(pool), spec, None, what="thin by information")
+        fields = tile_sphere(wanted.count, directions, mag, size, wanted.field)
+        reach = reach_rad(size, wanted.field)
+        kept = thin_by_information(fields, directions, mag, reach, count)
+    return np.sort(order[pool[kept]])
 
 
 def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> NDArray[np.int64]:
@@ -75,7 +117,11 @@ def field_share(spec: BuildSpec) -> float:
 
 
 def check_tiling(
-    stars: int, spec: BuildSpec, thinned_to: int | None, most: int = MOST_FIELD_STARS
+    stars: int,
+    spec: BuildSpec,
+    thinned_to: int | None,
+    most: int = MOST_FIELD_STARS,
+    what: str = "estimate",
 ) -> None:
     """Check that the fields of a tiling have not too many stars to be gone through in a moment."""
     in_field = stars * field_share(spec)
@@ -84,7 +130,7 @@ def check_tiling(
     found = spec.boresights.count * in_field
     if found > most:
         raise BuildError(
-            f"{spec.name}: too dense to estimate: the {spec.boresights.count:,} fields of the "
+            f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
             "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
         )
@@ -103,6 +149,23 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
             f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}"
         )
+
+
+def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
+    """Return what to say of a catalog that has not all neighbours of [selection.neighbours]."""
+    rule, mag = spec.selection.neighbours, floats_of(stars, "mag")
+    share = max(rule.max_contamination, LEAST_CONTAMINATION)
+    if not rule.is_on or share >= 0.5 or np.isnan(mag).all():
+        return ()
+    faintest, fainter = np.nanmax(mag), 2.5 * np.log10((1.0 - share) / share)
+    if faintest - fainter >= spec.selection.faint_limit_mag:
+        return ()
+    return (
+        f"selection.neighbours: the faintest star that was read has magnitude {faintest:.2f}, and "
+        f"a neighbour {fainter:.2f} mag fainter than a guide star is still {share:.3g} of its "
+        f"light. Stars fainter than {faintest - fainter:.2f} are judged by some of their "
+        "neighbours only: read a deeper catalog, or raise catalog.read_limit_mag",
+    )
 
 
 def check_fields(fields: FieldStars, spec: BuildSpec) -> None:

@@ -1,6 +1,6 @@
-"""The build log: seconds and memory of one run, in a file beside the artifact.
+"""The build log: seconds and memory of one run, in a file beside the database.
 
-They differ from run to run, so they are no part of the artifact and nothing digests them.
+They differ from run to run, so they are no part of the database and nothing digests them.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def available_memory_bytes() -> int | None:
 
 
 def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
-    """Write the log of a build beside its artifact."""
+    """Write the log of a build beside its database."""
     content: dict[str, Any] = {
         "artifact": artifact.name,
         "outcome": outcome,

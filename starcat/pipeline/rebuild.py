@@ -1,4 +1,4 @@
-"""Building an artifact again from its own manifest, and comparing the bytes."""
+"""Building a database again from its own manifest, and comparing the bytes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from starcat.storage.digests import file_sha256
 
 @dataclass(frozen=True)
 class FileChange:
-    """A file of an artifact that the rebuild did not reproduce."""
+    """A file of a database that the rebuild did not reproduce."""
 
-    file: str  # path within the artifact
+    file: str  # path within the database
     what: str  # how it differs, and whether its product does
 
 
@@ -48,7 +48,7 @@ class Rebuilt:
 def rebuild(
     artifact: Path, inputs: Inputs, output: Path | None = None, progress: Progress = no_progress
 ) -> Rebuilt:
-    """Build an artifact again from its manifest, and compare every file."""
+    """Build a database again from its manifest, and compare every file."""
     old = open_artifact(artifact)
     spec = old.spec
     check_inputs(spec, inputs)
@@ -109,7 +109,7 @@ def _what_differs(name: str, old: Artifact, new: Artifact) -> str:
     """Return how a file differs; empty where it has the same bytes."""
     before, after = old.folder / name, new.folder / name
     if not before.is_file():
-        return "missing in the artifact"
+        return "missing in the database"
     if not after.is_file():
         return "not made by the rebuild"
     digest = file_sha256(before)

@@ -9,24 +9,29 @@ from typing import Any
 
 import numpy as np
 
+from starcat.arrays import Directions
 from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
-from starcat.catalog.selection import Selected, Step
-from starcat.catalog.stars import floats_of
+from starcat.catalog.selection import NeighbourTally, Selected, Step
+from starcat.catalog.sensor_band import InBand
+from starcat.catalog.span import validity
+from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
 from starcat.pipeline.counterparts import source_facts
-from starcat.pipeline.recipes import field_size
+from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
+from starcat.products.evenness import evenness_of
 from starcat.report.report import (
     CoverageReport,
     count_magnitudes,
     coverage_warnings,
     report_coverage,
 )
+from starcat.report.sensor_band import band_content
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
@@ -61,10 +66,15 @@ def filter_coverages(
     return tuple(found)
 
 
-def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
-    """Return what a report says about coverage."""
+def coverage_report(
+    coverage: Coverage, fields: FieldStars, directions: Directions, spec: BuildSpec
+) -> CoverageReport:
+    """Return what a report says about coverage by the guide stars, whose directions are given."""
     size = field_size(spec)
-    return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
+    focal_length_px = spec.camera.camera().focal_length_px
+    evenness = evenness_of(fields, directions, size, spec.boresights.field, focal_length_px)
+    reach = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
+    return report_coverage(coverage, reach, evenness)
 
 
 def all_source_facts(
@@ -107,6 +117,8 @@ class BuildResults:
     fields: FieldStars  # the tiling of the guide stars
     filters: Sequence[FilterCoverage]  # what each filter left
     rates: Sequence[Rates]  # rates of the self-test
+    in_band: InBand | None = None  # where the spec states a response
+    neighbours: NeighbourTally | None = None  # what the rule of neighbours decided
 
 
 def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
@@ -120,8 +132,12 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))
+    band = results.in_band
+    held = validity(tables["stars"], spec.span_jyear)
     return {
-        **{name: recorded[name] for name in ("name", "version", "description", "epoch_jyear")},
+        **{name: recorded[name] for name in ("name", "version", "description")},
+        "epoch_jyear": spec.middle_jyear,
+        **({} if held is None else {"validity": asdict(held)}),
         "frame": "ICRS",
         "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
         "sources": sources,
@@ -129,18 +145,22 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
         "products": products,
         "database_bytes": (folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in results.filters],
+        **({"neighbours": asdict(results.neighbours)} if results.neighbours else {}),
         "coverage": coverage.as_dict(),
         "magnitudes": {"band": str(tables["stars"]["band"][0]), **count_magnitudes(*mags)},
         "self_test": [rates.as_dict() for rates in results.rates],
+        **({} if band is None else {"band": band_content(band, spec.selection)}),
         "spec": recorded,
         "software": software_versions(),
     }
 
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:
-    """Return the coverage of an artifact, from its own boresights."""
+    """Return the coverage of a database, from its own boresights and stars."""
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()
     coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
-    return coverage_report(coverage, artifact.spec)
+    stars = artifact.table("stars")
+    fields = tile_guide_stars(stars, artifact.spec)
+    return coverage_report(coverage, fields, directions_of(stars), artifact.spec)

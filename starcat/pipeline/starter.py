@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
+from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
@@ -30,6 +31,7 @@ from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.camera_exposure import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import whole_file
@@ -41,7 +43,7 @@ EPOCH_JYEAR = 2016.0
 """Of the embedded sky, whose stars have no proper motions."""
 
 ENOUGH_STARS = 10
-"""So many stars in nearly every field leave some when spots are missing."""
+"""So many stars in nearly every field leave some when centroids are missing."""
 
 ENOUGH_SHARE = 0.995
 """Share of the fields that have as many."""
@@ -95,6 +97,11 @@ class Starter:
     cost: Cost  # what the build will cost, by estimate
 
     @property
+    def band(self) -> str:
+        """The band of the limits."""
+        return self.spec.camera.response.name or BAND
+
+    @property
     def left_out(self) -> tuple[str, ...]:
         """Products that the camera could use, and that would cost too much."""
         products = self.spec.products
@@ -123,12 +130,17 @@ def starter_spec(
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
         sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
+    response = camera.response.response()
+    if response is not None:
+        sky = in_sensor_band(sky, SOURCE, response).stars
     mag = np.sort(floats_of(sky, "mag"))
     spec_to = partial(_spec, name, camera, widest_fov_x_deg)
     shape = spec_to(float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
-        limit = enough_limit(sky, shape)
+        exposure = camera.exposure.exposure(response)
+        seen = np.inf if exposure is None else exposure.limit_mag(USUAL_SIGNAL_TO_NOISE)
+        limit = min(enough_limit(sky, shape), round(float(seen), 2))
     check_tiling(int(np.searchsorted(mag, limit, side="right")), shape, None, most_field_stars)
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
@@ -265,16 +277,17 @@ def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
 
 def advice(starter: Starter) -> Sequence[str]:
     """Return what to think of before a limit is kept."""
-    own, told = starter.own, []
+    own, spec = starter.own, starter.spec
+    told = [*spec.exposure_notes, *spec.exposure_proposal]
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
         told.append(
-            f"the embedded sky ends at {BAND} = {starter.deepest_mag:.2f}; take a deeper catalog "
-            "for a fainter limit"
+            f"the embedded sky ends at {starter.band} = {starter.deepest_mag:.2f}; take a deeper "
+            "catalog for a fainter limit"
         )
     if own.stars.one_percent < ENOUGH_STARS - 2:
         told.append(
             f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
-            f"{ENOUGH_STARS} leave some where spots are missing: "
+            f"{ENOUGH_STARS} leave some where centroids are missing: "
             + (
                 "the embedded sky has no fainter ones, so many frames will have no answer"
                 if own.faint_limit_mag >= starter.deepest_mag
@@ -285,7 +298,7 @@ def advice(starter: Starter) -> Sequence[str]:
         told.append(
             f"the middle field has {own.stars.median} stars up to the limit, and the database "
             f"keeps the {STARS_A_FIELD} brightest of each field "
-            "(selection.max_stars_per_field): give the matcher the brightness of the spots, so "
+            "(selection.max_stars_per_field): give the matcher the brightness of the centroids, so "
             "that it begins with these"
         )
     if starter.left_out:

@@ -55,6 +55,20 @@ class FieldStars:
         return np.diff(self.offsets)
 
     @property
+    def field(self) -> NDArray[np.int64]:
+        """The field of each entry of ``star_index``, shape (M,)."""
+        return np.repeat(np.arange(len(self.boresights)), self.count)
+
+    def seen(self, directions: Directions) -> Directions:
+        """Return the directions of the stars in the frame of their field at roll 0, shape (M, 3).
+
+        x to the right, which is west, y down, z along the boresight.
+        """
+        east, north = tangent_axes(*radec_from_directions(self.boresights))
+        axes = np.stack([-east, -north, self.boresights], axis=1)
+        return np.asarray(np.einsum("mij,mj->mi", axes[self.field], directions[self.star_index]))
+
+    @property
     def nbytes(self) -> int:
         """Memory that it takes."""
         return int(self.boresights.nbytes + self.offsets.nbytes + self.star_index.nbytes)

@@ -1,1 +1,1 @@
-"""SQL over artifacts and catalogs."""
+"""SQL over databases and catalogs."""

@@ -114,7 +114,7 @@ class Macro:
     name: str
     arguments: str
     help: str
-    example: str  # a query that shows it and runs on any artifact
+    example: str  # a query that shows it and runs on any database
     text: str  # the SQL that makes it, with {places} where that schema has to be named
 
     @property

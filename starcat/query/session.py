@@ -164,7 +164,7 @@ def preamble(targets: Sequence[Target]) -> str:
 
 
 def preamble_of(given: Sequence[str]) -> str:
-    """Return the preamble of artifacts and Parquet files by name, for any DuckDB."""
+    """Return the preamble of databases and Parquet files by name, for any DuckDB."""
     with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
         engine = Engine(Path(folder), PREAMBLE_GB, PREAMBLE_GB)
         try:
@@ -209,7 +209,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)
         raise ProductError(
             f"{where}: a table cannot be opened ({str(error).splitlines()[0]}); 'starcat verify' "
-            "says what is wrong with an artifact"
+            "says what is wrong with a database"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""What a query is about: artifacts, star tables, stores, archive files, and the views on them."""
+"""What a query is about: databases, star tables, stores, archive files, and the views on them."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class View:
 class Target:
     """Something that a query is about."""
 
-    name: str  # the schema of its views: the name of the artifact, the source or the file
-    version: str  # the version of an artifact; empty for anything else
+    name: str  # the schema of its views: the name of the database, the source or the file
+    version: str  # the version of a database; empty for anything else
     views: tuple[View, ...]
 
 
@@ -87,7 +87,7 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
         is_there = path.exists()
         what = "cannot tell what it is" if is_there else "no such database, file or source"
         raise (QueryError if is_there else TargetMissing)(
-            f"{text}: {what}; give the folder of an artifact or a HATS catalog, a Parquet file, an "
+            f"{text}: {what}; give the folder of a database or a HATS catalog, a Parquet file, an "
             "archive file (SOURCE=PATH where its name is not the archive's), or a source that "
             "'starcat sources' lists"
         )
@@ -104,7 +104,7 @@ def _artifact(folder: Path) -> Target:
         if path.parent != folder or path.is_symlink() or not product.isidentifier():
             raise ProductError(
                 f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is no "
-                "file of the artifact; fetch or build it again",
+                "file of the database; fetch or build it again",
                 product=product,
                 path=folder,
             )

@@ -1,1 +1,1 @@
-"""Published versions of artifacts: registries, pulling, pinning."""
+"""Published versions of databases: registries, pulling, pinning."""

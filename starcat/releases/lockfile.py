@@ -1,6 +1,6 @@
 """``starcat.lock``, the pins of a project: reading, writing, and pulling what it pins or asks for.
 
-One entry an artifact, sorted, without a clock: the same pins are the same bytes.
+One entry a database, sorted, without a clock: the same pins are the same bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LOCK_VERSION = "1.0.0"
 
 
 class Pin(Release):
-    """An artifact that a lock file pins."""
+    """A database that a lock file pins."""
 
     registry: str  # where it came from: an address, or a folder relative to the lock file's
 
@@ -72,7 +72,7 @@ def _writing(path: Path) -> AbstractContextManager[None]:
 
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
-    """Pin a release, in place of another version of the same artifact."""
+    """Pin a release, in place of another version of the same database."""
     given = registry if is_address(registry) else _seen_from(path.parent, registry)
     pin = Pin(name=release.name, version=release.version, manifest=release.manifest, registry=given)
     prepare(path)
@@ -105,7 +105,7 @@ def pinned_registry(path: Path, pin: Pin) -> str:
 
 
 def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) -> Pin:
-    """Return the pin of an artifact."""
+    """Return the pin of a database."""
     if name not in pins:
         there = ", ".join(sorted(pins)) or "nothing"
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Publishing an artifact into a registry on disk.
+"""Publishing a database into a registry on disk.
 
 The order of the steps is what makes it safe: content first, each blob on disk under its digest;
 then the release, a file that is made once and never changed; the index last, made from the
@@ -56,7 +56,7 @@ class Published:
 
 
 def publish_artifact(artifact: Path, registry: str, progress: Progress = no_progress) -> Published:
-    """Put an artifact into a registry."""
+    """Put a database into a registry."""
     if is_address(registry):
         raise ConfigError(
             f"{registry}: a registry behind an address can only be read; publish into a folder, "

@@ -1,4 +1,4 @@
-"""Pulling a release: every file checked on arrival, the artifact as a whole, then its name.
+"""Pulling a release: every file checked on arrival, the database as a whole, then its name.
 
 What arrives is kept in ``.<name>-<version>.<digest>.partial`` beside the final folder until
 all is there, and a pull that was killed goes on from it. Files are copied, not linked: a
@@ -33,7 +33,7 @@ class Pulled:
 
     release: Release  # the release
     registry: str  # the folder or address that it came from
-    folder: Path  # the folder of the artifact
+    folder: Path  # the folder of the database
     outcome: Literal["pulled", "unchanged"]  # ``unchanged`` where it was there already, whole
 
     def as_dict(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ def _assemble(
     findings = verify_artifact(whole).findings
     if findings:
         raise ProductError(
-            f"{where}: not a whole artifact: {first_of(findings)}. Build the artifact again, and "
+            f"{where}: not a whole database: {first_of(findings)}. Build the database again, and "
             "publish that"
         )
     return whole

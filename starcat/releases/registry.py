@@ -46,7 +46,7 @@ class FolderRegistry:
         except ProductError as error:
             error.args = (
                 f"{error}. The registry is damaged: remove that blob if it is there, and "
-                "publish the artifact again",
+                "publish the database again",
             )
             raise
 

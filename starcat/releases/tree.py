@@ -52,16 +52,16 @@ class Blob(_Model):
 
 
 class Release(_Model):
-    """A version of an artifact."""
+    """A version of a database."""
 
-    # name, version: name and version of the artifact
+    # name, version: name and version of the database
     name: Name
     version: Version
     manifest: Blob  # its file ``manifest.json``, which names all the others
 
     @property
     def title(self) -> str:
-        """Name of the artifact's folder."""
+        """Name of the database's folder."""
         return f"{self.name}-{self.version}"
 
     @property
@@ -148,14 +148,14 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
 
 
 def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
-    """Return the files that a manifest lists, none of which lies outside the artifact."""
+    """Return the files that a manifest lists, none of which lies outside the database."""
     with _explained(where):
         files = _Files.model_validate({"files": manifest["files"]}).files
     folders = {name[:k] for name in files for k, letter in enumerate(name) if letter == "/"}
     for name in files:
         if not _FILE_NAME.fullmatch(name) or name == MANIFEST_NAME or name in folders:
             raise ProductError(
-                f"{where}: lists a file {name[:200]!r}, which is no plain path within an artifact; "
+                f"{where}: lists a file {name[:200]!r}, which is no plain path within a database; "
                 "nothing was written"
             )
     return dict(sorted(files.items()))
@@ -186,6 +186,6 @@ def choose(releases: Iterable[Listed], name: str, version: str | None, where: st
         return found[-1]
     if not named:
         there = ", ".join(sorted({r.name for r in listed})[:20]) or "nothing"
-        raise SourceMissing(f"{where} has no artifact {name!r}; it has {there}")
+        raise SourceMissing(f"{where} has no database {name!r}; it has {there}")
     there = ", ".join(r.version for r in named[-20:])
     raise SourceMissing(f"{where} has no version {version} of {name}; it has {there}")

@@ -20,6 +20,8 @@ from starcat.arrays import Array
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, saff_kuijlaars
 from starcat.matcher.chance import MIN_STARS
 
+Counts = NDArray[np.int64]
+
 HALF_WIDTH, HALF_HEIGHT = float(2.0 * np.sqrt(2.0)), float(np.sqrt(2.0))
 """Half axes of the ellipse, for a sphere of radius 1."""
 
@@ -53,7 +55,7 @@ def _auxiliary(dec: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> Array:
+def nearest_raster(boresights: Array, values: Array | Counts, width: int) -> Array:
     """Return the map as a raster of the value at the nearest boresight.
 
     Shape (width // 2, width), north at the top; NaN outside of the ellipse.
@@ -97,8 +99,6 @@ def galactic_equator(count: int = 721) -> tuple[Array, Array]:
     circle = np.cos(angle) * ascending + np.sin(angle) * np.cross(pole, ascending)
     return radec_from_directions(circle)
 
-
-Counts = NDArray[np.int64]
 
 UNIT = 100.0
 COLOURS = (

@@ -41,13 +41,16 @@ figure img { max-width: 100%; height: auto; background: var(--paper); }
 
 _ALT = {
     "coverage_map": "All-sky map in Mollweide's projection: guide stars in the field of view",
+    "attitude_error": "All-sky map in Mollweide's projection: attitude error across the boresight",
     "coverage_histogram": "Histogram: how many fields hold how many guide stars",
     "stars_by_magnitude": "Bar chart: records read and guide stars by magnitude",
 }
 
 
-def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page."""
+def report_page(
+    content: Mapping[str, Any], plots: Mapping[str, bytes], more: Sequence[str] = ()
+) -> str:
+    """Return the report of a build as an HTML page, with more sections after the selection."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -58,11 +61,15 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
         *(_source(source, content["reasons"]) for source in content["sources"]),
         "<h2>Selection</h2>",
         _filters(content["filters"]),
+        *([_neighbours(content["neighbours"])] if "neighbours" in content else []),
         figure(_ALT["stars_by_magnitude"], plots["stars_by_magnitude"]),
+        *more,
         "<h2>Coverage</h2>",
         _coverage(content["coverage"]),
         figure(_ALT["coverage_map"], plots["coverage_map"]),
         figure(_ALT["coverage_histogram"], plots["coverage_histogram"]),
+        _evenness(content["coverage"]),
+        figure(_ALT["attitude_error"], plots["attitude_error"]),
         "<h2>Products</h2>",
         _products(content["products"], content["database_bytes"]),
         "<h2>Self-test</h2>",
@@ -134,6 +141,7 @@ def _summary(content: Mapping[str, Any]) -> str:
     rows = [
         ("guide stars", f"{stars:,}"),
         ("positions", f"{content['frame']}, epoch J{content['epoch_jyear']:g}"),
+        *_validity(content.get("validity")),
         ("camera", camera.in_words),
         ("fewest guide stars in a field", f"{content['coverage']['stars']['minimum']:,}"),
         (
@@ -145,11 +153,26 @@ def _summary(content: Mapping[str, Any]) -> str:
     return table("", ("", ""), rows)
 
 
+def _validity(held: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    if held is None:
+        return []
+    worst = ", ".join(f"{one['designation']} {one['drift_arcsec']:.2f}" for one in held["worst"])
+    error = held["largest_error_arcsec"]
+    return [
+        ("they hold", f"from J{held['begin_jyear']:g} to J{held['end_jyear']:g}"),
+        ("stars drift, arcsec", f"median {held['median_drift_arcsec']:.2f}; worst: {worst}"),
+        ("with a release at the middle", f"at most {held['reissued_worst_arcsec']:.2f} arcsec"),
+        ("largest error of a position", "not known" if error is None else f"{error:.3f} arcsec"),
+        ("stars without a motion", f"{held['stars_without_motion']:,}"),
+    ]
+
+
 def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        what = "motion" if source["role"] == "motions" else "amplitude"
+        kinds = {"motions": "motion", "photometry": "magnitude partly"}
+        what = kinds.get(source["role"], "amplitude")
         rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
     for name, moved_arcsec in source.get("moved_arcsec", {}).items():
         rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))
@@ -178,6 +201,14 @@ def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
     return table("What each filter leaves in the fields of the tiling", heads, rows, (1, 2, 3, 4))
 
 
+def _neighbours(tally: Mapping[str, int]) -> str:
+    return (
+        f"<p>[selection.neighbours] keeps {tally['regained']:,} stars that the separation rule of "
+        f"[selection.doubles] would leave out, and leaves out {tally['lost']:,} that it would "
+        f"keep. The light of {tally['absorbed']:,} stars is in merged ones.</p>"
+    )
+
+
 def _coverage(coverage: Mapping[str, Any]) -> str:
     names = ("minimum", "one_percent", "median", "mean", "maximum")
     rows = [
@@ -197,7 +228,25 @@ def _coverage(coverage: Mapping[str, Any]) -> str:
     )
 
 
-def _rounded(value: float) -> str:
+def _evenness(coverage: Mapping[str, Any]) -> str:
+    errors = coverage["attitude_error_arcsec_per_px"]
+    names = ("median", "one_percent", "worst")
+    rows = [
+        (f"{axis} the boresight", *(_rounded(errors[axis][name]) for name in names))
+        for axis in ("across", "about")
+    ]
+    heads = ("arcsec for 1 px of noise", "median", "worst 1 % of the fields", "worst")
+    return (
+        table("Attitude error that the stars of a field allow", heads, rows, range(1, 4))
+        + f"\n<p>The entropy of the stars is {coverage['entropy']:.4f} over "
+        f"{coverage['entropy_cells']:,} cells of the size of a field; it is 1 where all have as "
+        "many.</p>"
+    )
+
+
+def _rounded(value: float | None) -> str:
+    if value is None:
+        return "no attitude"
     return f"{value:,.1f}" if isinstance(value, float) else f"{value:,}"
 
 

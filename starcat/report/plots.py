@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
+from starcat.geometry.sphere import radec_from_directions
 from starcat.images.figure_file import figure_bytes, own_style, write_figure
 from starcat.products.coverage import Coverage, CoverageSummary
+from starcat.products.evenness import Evenness
 from starcat.report.coverage_map import (
     HALF_HEIGHT,
     HALF_WIDTH,
@@ -27,7 +29,10 @@ from starcat.report.coverage_map import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colorbar import Colorbar
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
@@ -59,38 +64,87 @@ _COLOURS = 24
 def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
     """Draw the number of stars in each field over the whole sky."""
     from matplotlib import colormaps
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Ellipse
 
     raster = nearest_raster(coverage.boresights, coverage.stars, _RASTER_WIDTH)
     least = summary.stars.minimum
     most = max(int(np.quantile(coverage.stars, 0.995, method="inverted_cdf")), least + 1)
+    colours = colormaps["viridis"].resampled(min(most - least + 1, _COLOURS))
     with own_style(STYLE):
-        figure = Figure(figsize=(8.4, 5.2))
-        headline(figure, f"{title}: guide stars in the field", _map_legend(summary))
-        axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
-        edge = Ellipse((0, 0), 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fill=False, color="#333", lw=1)
-        axes.add_patch(edge)
-        colours = colormaps["viridis"].resampled(min(most - least + 1, _COLOURS))
-        extent = (-HALF_WIDTH, HALF_WIDTH, -HALF_HEIGHT, HALF_HEIGHT)
-        image = axes.imshow(
-            raster, colours, vmin=least - 0.5, vmax=most + 0.5, extent=extent,
-            interpolation="nearest",
-        )  # fmt: skip
-        image.set_clip_path(edge)
-        _graticule(axes)
-        axes.plot(*_cut(*project(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
-        x, y = project(summary.worst_ra_deg, summary.worst_dec_deg)
-        for colour, width in (("white", 4.2), (_RED, 2.2)):
-            axes.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
-        axes.set(xlim=(-3.02, 2.88), ylim=(-1.46, 1.46), aspect="equal")
-        axes.set_axis_off()
-        place = figure.add_axes((0.27, 0.1, 0.48, 0.025))
-        extend = "max" if summary.stars.maximum > most else "neither"
-        bar = figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
+        figure, image = _sky(
+            (f"{title}: guide stars in the field", _map_legend(summary)),
+            (raster, colours, least - 0.5, most + 0.5),
+            (summary.worst_ra_deg, summary.worst_dec_deg),
+        )
+        bar = _bar(figure, image, summary.stars.maximum > most)
         bar.ax.xaxis.set_major_locator(_whole_ticks())
         bar.set_label("guide stars in the field of the nearest boresight")
     return figure
+
+
+def draw_error_map(title: str, boresights: Directions, evenness: Evenness) -> Figure:
+    """Draw the error across the boresight that the stars of each field allow over the whole sky."""
+    from matplotlib import colormaps
+
+    errors, spread = evenness.across, evenness.spreads["across"]
+    known = errors[np.isfinite(errors)]
+    least, most = np.quantile(known, [0.0, 0.995]) if len(known) else (0.0, 1.0)
+    most = max(most, 1.001 * least)
+    # Few colours, and yellow where the error is small; red has no attitude.
+    colours = colormaps["viridis_r"].resampled(_COLOURS).with_extremes(bad=_RED)
+    raster = nearest_raster(
+        boresights, np.where(np.isfinite(errors), errors, np.nan), _RASTER_WIDTH
+    )
+    ra_deg, dec_deg = radec_from_directions(boresights[int(np.argmax(errors))])
+    worst = f"{spread.worst:.1f} arcsec" if np.isfinite(spread.worst) else "no attitude (red)"
+    told = (
+        f"{len(errors):,} fields. Ring: the worst, {worst}, at RA {ra_deg:.1f}°, Dec "
+        f"{dec_deg:+.1f}°. Dashed: galactic equator."
+    )
+    with own_style(STYLE):
+        figure, image = _sky(
+            (f"{title}: attitude error that the stars of the field allow", told),
+            (raster, colours, float(least), float(most)),
+            (float(ra_deg), float(dec_deg)),
+        )
+        bar = _bar(figure, image, bool(len(known)) and float(known.max()) > most)
+        bar.set_label("error across the boresight, arcsec for 1 px of centroid noise")
+    return figure
+
+
+def _sky(
+    words: tuple[str, str],
+    drawn: tuple[Array, Colormap, float, float],
+    ring_deg: tuple[float, float],
+) -> tuple[Figure, AxesImage]:
+    """Draw title and legend, a raster with its colours and their ends, and a ring somewhere."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Ellipse
+
+    figure = Figure(figsize=(8.4, 5.2))
+    headline(figure, *words)
+    axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
+    edge = Ellipse((0, 0), 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fill=False, color="#333", lw=1)
+    axes.add_patch(edge)
+    extent = (-HALF_WIDTH, HALF_WIDTH, -HALF_HEIGHT, HALF_HEIGHT)
+    raster, colours, least, most = drawn
+    image = axes.imshow(
+        raster, colours, vmin=least, vmax=most, extent=extent, interpolation="nearest"
+    )
+    image.set_clip_path(edge)
+    _graticule(axes)
+    axes.plot(*_cut(*project(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
+    x, y = project(*ring_deg)
+    for colour, width in (("white", 4.2), (_RED, 2.2)):
+        axes.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
+    axes.set(xlim=(-3.02, 2.88), ylim=(-1.46, 1.46), aspect="equal")
+    axes.set_axis_off()
+    return figure, image
+
+
+def _bar(figure: Figure, image: AxesImage, is_cut: bool) -> Colorbar:
+    place = figure.add_axes((0.27, 0.1, 0.48, 0.025))
+    extend = "max" if is_cut else "neither"
+    return figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
 
 
 def _map_legend(summary: CoverageSummary) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.catalog.sensor_band import InBand
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
@@ -22,8 +23,17 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
+from starcat.products.evenness import Evenness
 from starcat.report.page import report_page
-from starcat.report.plots import MAG_BIN, draw_histogram, draw_magnitudes, draw_map, save_plot
+from starcat.report.plots import (
+    MAG_BIN,
+    draw_error_map,
+    draw_histogram,
+    draw_magnitudes,
+    draw_map,
+    save_plot,
+)
+from starcat.report.sensor_band import band_section, draw_band
 from starcat.storage.digests import json_bytes
 
 DECIMALS = 6
@@ -37,6 +47,7 @@ class CoverageReport:
     coverage: Coverage  # stars, pairs and triangles by boresight
     summary: CoverageSummary  # the coverage in a few numbers
     gap: TilingGap  # the widest gap between the boresights
+    evenness: Evenness  # the attitude error that the stars of each field allow
 
     def __repr__(self) -> str:
         stars = self.summary.stars
@@ -64,6 +75,12 @@ class CoverageReport:
                 "stars": summary.stars.minimum,
             },
             "fields_by_stars": summary.histogram.tolist(),
+            "attitude_error_arcsec_per_px": {
+                axis: {name: _finite(value) for name, value in asdict(spread).items()}
+                for axis, spread in self.evenness.spreads.items()
+            },
+            "entropy": round(self.evenness.entropy, DECIMALS),
+            "entropy_cells": self.evenness.cells,
             "tiling": {
                 "holes": gap.has_holes,
                 "tile_radius_deg": round(float(np.degrees(gap.tile_radius_rad)), DECIMALS),
@@ -74,10 +91,17 @@ class CoverageReport:
         }
 
 
-def report_coverage(coverage: Coverage, tile_radius_rad: float) -> CoverageReport:
+def _finite(error_arcsec: float) -> float | None:
+    """Return an error as JSON holds it: null where there is no attitude."""
+    return round(error_arcsec, DECIMALS) if np.isfinite(error_arcsec) else None
+
+
+def report_coverage(
+    coverage: Coverage, tile_radius_rad: float, evenness: Evenness
+) -> CoverageReport:
     """Summarise a coverage and look for holes in its tiling."""
     gap = tiling_gap(coverage.boresights, tile_radius_rad)
-    return CoverageReport(coverage, summarise_coverage(coverage), gap)
+    return CoverageReport(coverage, summarise_coverage(coverage), gap, evenness)
 
 
 def _holes(gap: TilingGap) -> str:
@@ -117,6 +141,20 @@ def coverage_csv(coverage: Coverage) -> bytes:
     )
 
 
+def attitude_error_csv(coverage: Coverage, evenness: Evenness) -> bytes:
+    """Return the attitude errors by boresight as CSV; empty where there is no attitude."""
+    ra_deg, dec_deg = radec_from_directions(coverage.boresights)
+    columns = (ra_deg, dec_deg, coverage.stars, evenness.across, evenness.about)
+    rows = enumerate(zip(*(column.tolist() for column in columns), strict=True))
+    return _csv(
+        "boresight,ra_deg,dec_deg,stars,across_arcsec_per_px,about_arcsec_per_px",
+        (
+            f"{n},{ra:.6f},{dec:.6f},{stars}," + (f"{a:.4f},{b:.4f}" if np.isfinite(a) else ",")
+            for n, (ra, dec, stars, a, b) in rows
+        ),
+    )
+
+
 def _csv(head: str, rows: Iterable[str]) -> bytes:
     return ("\n".join([head, *rows]) + "\n").encode()
 
@@ -127,12 +165,17 @@ def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str
     histogram = (f"{n},{fields}" for n, fields in enumerate(report.summary.histogram.tolist()))
     (folder / "coverage_histogram.csv").write_bytes(_csv("stars,fields", histogram))
     (folder / "coverage.json").write_bytes(json_bytes(report.as_dict()))
+    errors = attitude_error_csv(report.coverage, report.evenness)
+    (folder / "attitude_error.csv").write_bytes(errors)
     save_plot(draw_map(title, report.coverage, report.summary), folder, "coverage_map")
+    drawn = draw_error_map(title, report.coverage.boresights, report.evenness)
+    save_plot(drawn, folder, "attitude_error")
     save_plot(draw_histogram(title, report.summary), folder, "coverage_histogram")
     return [
         "coverage.csv",
         "coverage.json",
         *(f"coverage_map.{kind}" for kind in ("png", "svg")),
+        *(f"attitude_error.{kind}" for kind in ("csv", "png", "svg")),
         *(f"coverage_histogram.{kind}" for kind in ("csv", "png", "svg")),
     ]
 
@@ -159,7 +202,12 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
     return {"from_mag": edges[:-1], "to_mag": edges[1:], "guide_stars": kept, "rejected": rejected}
 
 
-def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageReport) -> None:
+def write_report(
+    folder: Path,
+    content: Mapping[str, Any],
+    coverage: CoverageReport,
+    in_band: InBand | None = None,
+) -> None:
     """Write all files of a report; ``content`` is that of report.json."""
     title, counts = f"{content['name']}-{content['version']}", content["magnitudes"]
     write_coverage(folder, title, coverage)
@@ -172,6 +220,10 @@ def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageRep
     (folder / "report.json").write_bytes(json_bytes(content))
     plots = {
         name: (folder / f"{name}.svg").read_bytes()
-        for name in ("coverage_map", "coverage_histogram", "stars_by_magnitude")
+        for name in ("coverage_map", "coverage_histogram", "attitude_error", "stars_by_magnitude")
     }
-    (folder / "index.html").write_text(report_page(content, plots), encoding="utf-8")
+    more: list[str] = []
+    if in_band is not None:
+        save_plot(draw_band(title, in_band), folder, "sensor_band")
+        more = band_section(content["band"], (folder / "sensor_band.svg").read_bytes())
+    (folder / "index.html").write_text(report_page(content, plots, more), encoding="utf-8")

@@ -27,17 +27,17 @@ class Database:
     """A built database."""
 
     id: str  # 16 hexadecimal digits: the beginning of the digest of what it was made from
-    folder: Path  # the artifact, ``<name>-<version>``
+    folder: Path  # the database, ``<name>-<version>``
     manifest: dict[str, Any]
 
     @property
     def name(self) -> str:
-        """Name of the artifact."""
+        """Name of the database."""
         return str(self.manifest["name"])
 
     @property
     def version(self) -> str:
-        """Version of the artifact."""
+        """Version of the database."""
         return str(self.manifest["version"])
 
     @property

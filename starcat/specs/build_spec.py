@@ -1,17 +1,26 @@
 """The build spec: everything that a database depends on, but for its input files.
 
 Every key has a unit in its name, a range and a meaning, which ``docs/spec.md`` lists. The whole
-spec travels in the manifest of the artifact. `starcat.specs.reading` reads one from a file.
+spec travels in the manifest of the database. `starcat.specs.reading` reads one from a file.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PlainValidator, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
-from starcat.errors import quoted
 from starcat.geometry.camera import Camera
+from starcat.specs.camera_exposure import (
+    CameraExposure,
+    contradiction,
+    exposure_notes,
+    exposure_proposal,
+    with_limits,
+)
+from starcat.specs.camera_response import CameraResponse
+from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
+from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
     NAME_PATTERN,
     VERSION_PATTERN,
@@ -25,9 +34,17 @@ MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = ("products.levels", "catalog.motions", "selection.max_drift_arcsec")
+LATER_KEYS = (
+    *("products.levels", "catalog.motions", "selection.neighbours"),
+    *("selection.thinning", "selection.observed"),
+    *("camera.response", "camera.exposure", "selection.max_drift_arcsec"),
+)
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
 spec without them makes the bytes that it always made."""
+
+
+SHA256_PATTERN = r"^[0-9a-f]{64}$"
+Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
 
 class Catalog(Section):
@@ -108,6 +125,58 @@ class Variables(Section):
     )
 
 
+class Observed(Section):
+    """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
+
+    zero_point_mag: float | None = Field(
+        None,
+        ge=-100.0,
+        le=100.0,
+        description="measured magnitude of a star of colour 0 minus the catalog's; told, not "
+        "applied",
+        examples=[0.2],
+    )
+    colour_term: float = Field(
+        0.0,
+        ge=-5.0,
+        le=5.0,
+        description="mag becomes mag + colour_term x (colour_mag - reference_colour_mag)",
+    )
+    colour_bands: str | None = Field(
+        None, max_length=40, description="the colour that the term is for", examples=["BP-RP"]
+    )
+    reference_colour_mag: float = Field(
+        0.0,
+        ge=-20.0,
+        le=20.0,
+        description="stars of this colour keep their mag, as do those of unknown colour",
+    )
+    reject: tuple[int, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=4000,
+        description="star_id of the stars to distrust, which are rejected",
+        examples=[[3, 17]],
+    )
+    frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
+    database: str | None = Field(
+        None,
+        max_length=200,
+        description="database that they were identified with",
+        examples=["mycam-1.0.0"],
+    )
+    manifest_sha256: str | None = Field(
+        None, pattern=SHA256_PATTERN, description="digest of its manifest", examples=["0" * 64]
+    )
+    results_sha256: tuple[Sha256, ...] = Field(
+        (),
+        strict=False,
+        max_length=1000,
+        description="digests of the files of identified frames",
+        examples=[["0" * 64]],
+    )
+
+
 class Selection(Section):
     """Which stars become guide stars."""
 
@@ -116,7 +185,10 @@ class Selection(Section):
         description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
     )
     max_stars: int | None = Field(
-        None, ge=1, le=2_000_000_000, description="number of stars that are kept, the brightest"
+        None,
+        ge=1,
+        le=2_000_000_000,
+        description="number of stars that are kept, by default the brightest",
     )
     max_stars_per_field: int | None = Field(
         None,
@@ -130,10 +202,18 @@ class Selection(Section):
         gt=0.0,
         le=36_000.0,
         description="stars that are further from their place at the ends of the span of "
-        "epoch_jyear are rejected",
+        "epoch_jyear are rejected; default: none",
+    )
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
     )
     doubles: Doubles = Doubles()
+    neighbours: NeighbourRule = NeighbourRule()
     variables: Variables = Variables()
+    observed: Observed = Observed()
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Selection:
@@ -141,6 +221,32 @@ class Selection(Section):
             raise ValueError(
                 f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
                 f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_thin(self) -> Selection:
+        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
+            raise ValueError(
+                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
+                "max_stars or max_stars_per_field"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_rule_of_close_stars(self) -> Selection:
+        doubles = self.doubles
+        if self.neighbours.is_on and doubles.action == "merge":
+            raise ValueError(
+                'doubles.action = "merge" and [selection.neighbours] both say what becomes of '
+                'close stars; leave it out, and set neighbours.action = "merge" to merge them as '
+                "the sensor does"
+            )
+        if self.neighbours.is_on and doubles.companion_limit_mag is not None:
+            raise ValueError(
+                f"doubles.companion_limit_mag {doubles.companion_limit_mag:g} is of the separation "
+                "rule, which [selection.neighbours] replaces: it counts all stars that were read. "
+                "Leave it out, or set catalog.read_limit_mag"
             )
         return self
 
@@ -159,6 +265,8 @@ class CameraSpec(Section):
     pixel_um: float | None = Field(
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
     )
+    response: CameraResponse = CameraResponse()
+    exposure: CameraExposure = CameraExposure()
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
@@ -220,7 +328,7 @@ class SelfTest(Section):
         0.2,
         ge=0.0,
         le=10.0,
-        description="noise of the magnitude of a spot, standard deviation; it decides what is "
+        description="noise of the magnitude of a centroid, standard deviation; it decides what is "
         "tried first",
     )
     min_identified: float = Field(
@@ -232,35 +340,12 @@ class SelfTest(Section):
     )
 
 
-Epoch = Annotated[float, Field(ge=1800.0, le=2200.0)]
-
-
-def _epoch_or_span(value: Any) -> float | tuple[float, float]:
-    """Return a Julian year, or the two of a span, after checking them."""
-    years = value if isinstance(value, list | tuple) else [value]
-    if len(years) not in (1, 2) or isinstance(value, list | tuple) and len(years) == 1:
-        raise ValueError(f"found {len(years)} years; give one, or [begin, end] of a span")
-    for year in years:
-        is_number = isinstance(year, int | float) and not isinstance(year, bool)
-        if not is_number or not 1800.0 <= year <= 2200.0:
-            raise ValueError(f"found {quoted(str(year))}; give a Julian year from 1800 to 2200")
-    if len(years) == 1:
-        return float(years[0])
-    begin, end = map(float, years)
-    if begin >= end:
-        raise ValueError(
-            f"the span ends at {end:g}, not after it begins at {begin:g}; give [begin, end], or "
-            "one year"
-        )
-    return begin, end
-
-
 class BuildSpec(Section):
     """Everything that a database depends on, but for its input files."""
 
     name: str = Field(
         pattern=NAME_PATTERN,
-        description="name of the artifact: small letters, digits and hyphens",
+        description="name of the database: small letters, digits and hyphens",
         examples=["mycam"],
     )
     version: str = Field(
@@ -270,10 +355,7 @@ class BuildSpec(Section):
         examples=["1.0.0"],
     )
     description: str = Field("", max_length=2000, description="what the database is for")
-    epoch_jyear: Annotated[
-        float | tuple[float, float],
-        PlainValidator(_epoch_or_span, json_schema_input_type=Epoch | tuple[Epoch, Epoch]),
-    ] = Field(
+    epoch_jyear: EpochOrSpan = Field(
         description="Julian year of all positions, or a span [begin, end]: positions are then at "
         "its middle, and how far a star drifts to the ends is told",
         examples=[2026.0],
@@ -285,12 +367,44 @@ class BuildSpec(Section):
     products: Products = Products()
     self_test: SelfTest = SelfTest()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_of_the_exposure(cls, content: Any) -> Any:
+        return with_limits(content)
+
+    @model_validator(mode="after")
+    def _limits_said_once(self) -> BuildSpec:
+        wanted = self.camera.exposure.limits(self.camera.response.response())
+        problem = contradiction(wanted, {key: getattr(self.selection, key) for key in wanted})
+        if problem:
+            raise ValueError(problem)
+        return self
+
+    @model_validator(mode="after")
+    def _drift_needs_a_span(self) -> BuildSpec:
+        if self.selection.max_drift_arcsec is not None and not isinstance(self.epoch_jyear, tuple):
+            raise ValueError(
+                "selection.max_drift_arcsec: epoch_jyear is one year, in which no star drifts; "
+                "give a span, such as epoch_jyear = [2027.0, 2042.0]"
+            )
+        return self
+
     @model_validator(mode="after")
     def _counterparts_in_other_catalogs(self) -> BuildSpec:
         if self.catalog.source in self.products.crossmatch.catalogs:
             raise ValueError(
                 f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
                 "themselves; name others"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _photometry_of_other_catalogs(self) -> BuildSpec:
+        named = self.camera.response.photometry
+        if self.catalog.source in named or len(set(named)) != len(named):
+            raise ValueError(
+                f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
+                f"{self.catalog.source}, that of the stars themselves"
             )
         return self
 
@@ -323,8 +437,19 @@ class BuildSpec(Section):
             )
         return self
 
+    @property
+    def exposure_proposal(self) -> tuple[str, ...]:
+        """The limits that the camera's exposure proposes."""
+        return exposure_proposal(self.camera.exposure, self.camera.response.response())
+
+    @property
+    def exposure_notes(self) -> tuple[str, ...]:
+        """What the camera's exposure says of a limit that is beyond it."""
+        response = self.camera.response.response()
+        return exposure_notes(self.camera.exposure, response, self.selection.faint_limit_mag)
+
     def recorded(self) -> dict[str, Any]:
-        """Return what an artifact says of its spec."""
+        """Return what a database says of its spec."""
         content = self.model_dump(mode="json")
         for name in LATER_KEYS:
             section, _, key = name.rpartition(".")
@@ -338,20 +463,19 @@ class BuildSpec(Section):
     @property
     def span_jyear(self) -> tuple[float, float]:
         """The first and the last Julian year that the database is for, often the same."""
-        given = self.epoch_jyear
-        return given if isinstance(given, tuple) else (given, given)
+        return ends_of(self.epoch_jyear)
 
     @property
     def middle_jyear(self) -> float:
         """Julian year of all positions."""
-        begin, end = self.span_jyear
-        return begin + 0.5 * (end - begin)
+        return middle_of(self.epoch_jyear)
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.catalog.motions, *self.selection.variables.join]
+        joined = (*self.selection.variables.join, *self.camera.response.photometry)
+        names = [self.catalog.source, *self.catalog.motions, *joined]
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:

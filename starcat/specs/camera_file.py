@@ -73,6 +73,8 @@ def camera_toml(camera: Camera) -> str:
 
 
 def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
+    # A spec is a camera file too; how its sensor sees light is no part of the geometry.
+    table = {key: value for key, value in table.items() if key not in ("response", "exposure")}
     _refuse_unknown(table, KEYS, path, prefix)
     for key in SIZES:
         if key not in table:

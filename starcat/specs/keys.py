@@ -15,7 +15,7 @@ from typing import Any
 
 from starcat.specs.build_spec import BuildSpec
 
-UNITS = {unit: unit for unit in ("deg", "arcsec", "mag", "px", "mm", "um")}
+UNITS = {unit: unit for unit in ("deg", "arcsec", "mag", "px", "mm", "um", "nm")}
 UNITS["jyear"] = "Julian year"
 """Units by the last part of a name; proper motions are the one unit of two parts."""
 
@@ -135,6 +135,7 @@ def _plain(number: float) -> str:
 
 
 _WIDTH = 96
+_NUMBERS_A_LINE = 10
 
 
 def spec_toml(spec: BuildSpec) -> str:
@@ -163,7 +164,11 @@ def toml_value(value: Any) -> str:
     ('["hipparcos"]', 'true', '6.0')
     """
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_value, value))}]"
+        if len(value) <= _NUMBERS_A_LINE:
+            return f"[{', '.join(map(toml_value, value))}]"
+        starts = range(0, len(value), _NUMBERS_A_LINE)
+        lines = (", ".join(map(toml_value, value[k : k + _NUMBERS_A_LINE])) for k in starts)
+        return "[\n  " + ",\n  ".join(lines) + "\n]"
     if isinstance(value, str):
         # JSON's escapes are among TOML's; the one control character that JSON lets pass is not.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -57,7 +57,7 @@ PlanarDeg = Annotated[float, Field(ge=0.001, le=80.0)]
 class Product(Section):
     """A product that can be left out."""
 
-    enabled: bool = Field(True, description="whether the artifact has this product")
+    enabled: bool = Field(True, description="whether the database has this product")
 
 
 class Pairs(Product):
@@ -139,9 +139,9 @@ class Radial(Product):
 
 
 class Levels(Product):
-    """Stars and triangles for fields wider than the camera's: one artifact for a range of them."""
+    """Stars and triangles for fields wider than the camera's: one database for a range of them."""
 
-    enabled: bool = Field(False, description="whether the artifact has this product")
+    enabled: bool = Field(False, description="whether the database has this product")
     widest_fov_x_deg: FieldDeg = Field(
         30.0, description="largest field across the width; the range begins at the camera's own"
     )
@@ -156,7 +156,7 @@ class Levels(Product):
 class Crossmatch(Product):
     """Counterparts of the guide stars in other catalogs."""
 
-    enabled: bool = Field(False, description="whether the artifact has this product")
+    enabled: bool = Field(False, description="whether the database has this product")
     catalogs: tuple[Literal["sao", "hipparcos", "tycho1", "tycho2", "2mass", "gaia"], ...] = Field(
         (),
         strict=False,  # a list in TOML
@@ -214,7 +214,7 @@ class Crossmatch(Product):
 
 
 class Products(Section):
-    """Which products the artifact holds, and their parameters."""
+    """Which products the database holds, and their parameters."""
 
     pairs: Pairs = Pairs()
     triangles: Triangles = Triangles()

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.camera_response import with_files_read
 
 
 class _Shown(reprlib.Repr):
@@ -59,7 +60,8 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     """
     path = Path(path)
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
-    return spec_from_dict(changed(content_of_toml(text, str(path)), changes or {}), path.name)
+    content = changed(content_of_toml(text, str(path)), changes or {})
+    return spec_from_dict(with_files_read(content, path.parent), path.name)
 
 
 def text_of_toml(path: Path, missing: str) -> str:

@@ -59,5 +59,5 @@ def _own(group: Any, name: str) -> Any:
 def _refused(place: str, what: str) -> ProductError:
     return ProductError(
         f"{place} is {what}; expected what 'starcat build' writes, one piece in the file itself. "
-        "Build the artifact again, or get it from a trusted source"
+        "Build the database again, or get it from a trusted source"
     )

@@ -3,7 +3,7 @@
 A store that starcat made gives what reading its archive files gives, to the last bit: it keeps
 rejected records, and records whose star was read before, beside the stars, and says what it was
 made from. HATS catalogs of others need the columns `NEEDED`; what else of the stars schema they
-have is used, and their own files are the inputs that the artifact names.
+have is used, and their own files are the inputs that the database names.
 """
 
 from __future__ import annotations

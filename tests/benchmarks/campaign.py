@@ -46,7 +46,7 @@ BATCH = 1000
 
 @lru_cache(maxsize=2)
 def matcher_of(folder: Path, is_stated: bool) -> Matcher:
-    """Return the matcher of an artifact; each process opens its own."""
+    """Return the matcher of a database; each process opens its own."""
     stated: dict[str, Any] = {"noise_px": NOISE_PX, "noise_mag": NOISE_MAG} if is_stated else {}
     return Matcher.open(folder, engine="c", **stated)
 

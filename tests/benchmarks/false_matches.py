@@ -146,7 +146,7 @@ class Counts:
 class Job:
     """Some frames of a kind."""
 
-    folders: tuple[Path, Path]  # artifacts: the one that is asked, and the dense one
+    folders: tuple[Path, Path]  # databases: the one that is asked, and the dense one
     kind: str
     first: int  # seed of the first frame
     count: int
@@ -156,7 +156,7 @@ class Job:
 
 @lru_cache(maxsize=2)
 def matcher_of(folder: Path) -> Matcher:
-    """Return the matcher of an artifact; each process opens its own."""
+    """Return the matcher of a database; each process opens its own."""
     return Matcher.open(folder, engine="c")
 
 

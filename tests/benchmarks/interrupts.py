@@ -20,6 +20,10 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
+
+from archives import plain_sao
 from rows import Options, Rows, ended
 
 STARCAT = (sys.executable, "-m", "starcat")
@@ -36,19 +40,6 @@ self_test = { frames = 50 }
 """
 
 STARS = 2_000
-
-
-def write_stars(path: Path) -> None:
-    """Write records in the layout of SAO, of stars that do not exist."""
-    generator = np.random.default_rng(STARS)
-    ra_rad = generator.uniform(0.0, 2.0 * np.pi, STARS)
-    dec_rad = np.arcsin(generator.uniform(-1.0, 1.0, STARS))
-    lines = []
-    for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
-        front = f"{number:6d}".ljust(80) + f"{2.0 + 6.0 * number / STARS:4.1f}A0V"
-        motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
-        lines.append(f"{motion.ljust(183)}{ra:10.8f}{dec:+11.8f}".ljust(204) + "\n")
-    path.write_text("".join(lines))
 
 
 def commands(folder: Path) -> dict[str, tuple[list[str], Path]]:
@@ -89,7 +80,7 @@ def main(rows: Rows) -> None:
     generator = np.random.default_rng(given.seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_stars(folder / "stars.dat")
+        (folder / "stars.dat").write_bytes(b"".join(plain_sao(STARS, 8.0)))
         (folder / "small.toml").write_text(SPEC)
         known, lengths_s, found = commands(folder), {}, Counter[tuple[str, str, int]]()
         whole = [*known["build"][0][:-1], str(folder / "whole")]
@@ -103,6 +94,7 @@ def main(rows: Rows) -> None:
             name = list(known)[attempt % len(known)]
             command, output = known[name]
             number = [signal.SIGINT, signal.SIGTERM][int(generator.integers(2))]
+            unfinished = output.with_name(f".{output.name}.work")  # of an ingest
             code, said = interrupted(command, number, generator.uniform(0.0, lengths_s[name]))
             found[name, number.name, code] += 1
             ended_well = code in (0, 128 + number, -number)
@@ -114,10 +106,11 @@ def main(rows: Rows) -> None:
                 left = {path.name for path in output.parent.glob("*")} - known_names
                 rows.expect(not left, f"build {attempt}: left {sorted(left)}")
             if attempt % (5 * len(known)) < len(known):
-                more = ["--resume"] if name == "ingest" and output.exists() else []
+                more = ["--resume"] if name == "ingest" and unfinished.exists() else []
                 done = subprocess.run([*STARCAT, *command, *more], capture_output=True, text=True)
                 rows.expect(done.returncode == 0, f"{name} {attempt}, again: {done.stderr}")
             shutil.rmtree(output, ignore_errors=True)
+            shutil.rmtree(unfinished, ignore_errors=True)
     print(f"{'command':<10}{'signal':<9}{'exit':>5}{'times':>7}")
     for (name, sent, code), times in sorted(found.items()):
         print(f"{name:<10}{sent:<9}{code:>5}{times:>7}")

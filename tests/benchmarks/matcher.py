@@ -250,7 +250,7 @@ def number(value: float) -> str:
 
 
 def opening(artifact: Path, scratch: Path) -> dict[str, Any]:
-    """Return the time to open an artifact, and the memory that 100 frames take."""
+    """Return the time to open a database, and the memory that 100 frames take."""
     seconds = []
     for _ in range(20):
         start = time.perf_counter()
@@ -294,7 +294,7 @@ def print_frames(made: dict[str, list[Frame]], built: Built) -> None:
 def own_facts(artifact: Path, scratch: Path, made: dict[str, list[Frame]]) -> dict[str, Any]:
     """Measure and print what only starcat is asked."""
     facts = opening(artifact, scratch)
-    print(f"Opening an artifact: {facts['open_ms']:.1f} ms, median of 20; a process that does")
+    print(f"Opening a database: {facts['open_ms']:.1f} ms, median of 20; a process that does")
     print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
     if is_compiled():
         facts["us_a_frame"] = by_the_frame(artifact, made)

@@ -5,7 +5,7 @@ follow a jump of 40 deg. *tracked*: a Tracker, jumps included. *prior*: a prior 
 wrong by up to an angle. *lost*: no prior. Magnitudes are not given. Milliseconds are processor time
 of the call alone.
 
-Run with ``python tests/benchmarks/tracking.py [ARTIFACT] [--frames N]``; without an artifact
+Run with ``python tests/benchmarks/tracking.py [ARTIFACT] [--frames N]``; without a database
 gaia-12deg is built. It fails where an answer is wrong or nothing is identified.
 """
 

@@ -388,3 +388,17 @@ def file_header(layout: RecordFile, count: int) -> bytes:
         header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
         return header.ljust(layout.header_bytes, b"\0")
     return b"# Variable stars that do not exist\n" if layout.comment else b""
+
+
+def plain_sao(count: int, faintest_mag: float = 6.4) -> list[bytes]:
+    """Return records of SAO with the fields that are read, all over the sky, from V 2.0 on."""
+    generator = np.random.default_rng(count)
+    ra_rad = generator.uniform(0.0, 2.0 * np.pi, count)
+    dec_rad = np.arcsin(generator.uniform(-1.0, 1.0, count))
+    lines = []
+    for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
+        mag = 2.0 + (faintest_mag - 2.0) * number / count
+        front = f"{number:6d}".ljust(80) + f"{mag:4.1f}A0V"
+        motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
+        lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
+    return lines

@@ -1,4 +1,4 @@
-"""Copies of an artifact that may be changed, and manifests that are right again afterwards."""
+"""Copies of a database that may be changed, and manifests that are right again afterwards."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starcat.storage.digests import file_sha256, json_bytes
 
 
 def copied(artifact: Path, folder: Path) -> Path:
-    """Copy an artifact into a folder, under its own name; the files can be written to."""
+    """Copy a database into a folder, under its own name; the files can be written to."""
     return Path(shutil.copytree(artifact, folder / artifact.name, copy_function=shutil.copyfile))
 
 

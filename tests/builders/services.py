@@ -23,6 +23,26 @@ if TYPE_CHECKING:
 DATABASE = "0123456789abcdef"
 LOCAL = "http://127.0.0.1:8000"
 
+SPEC = """\
+name = "small"
+version = "1.0.0"
+epoch_jyear = 2016.0
+
+[catalog]
+source = "gaia"
+
+[selection]
+faint_limit_mag = 4.5
+
+[camera]
+width_px = 512
+height_px = 512
+fov_x_deg = 30.0
+
+[boresights]
+count = 300
+"""
+
 
 @contextmanager
 def client_of(
@@ -35,7 +55,7 @@ def client_of(
 
 
 def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
-    """Copy an artifact into the folder of a service; return where it is."""
+    """Copy a database into the folder of a service; return where it is."""
     return copied(artifact, root / "databases" / database)
 
 

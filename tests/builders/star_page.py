@@ -320,7 +320,7 @@ Each is a pure function of unit vectors, in starcat/products: {links}."""
 def artifact_section(story: Story) -> str:
     manifest = story.built.manifest
     source = manifest["sources"][0]["files"][0]
-    return f"""## 7. The artifact
+    return f"""## 7. The database
 
 {link("starcat/artifact/writer.py")} writes the folder `{story.built.folder.name}`, reads it back,
 and only then gives it its name. Polaris can be followed through it:

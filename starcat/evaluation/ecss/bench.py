@@ -1,6 +1,6 @@
 """The test bench: frames of a star sensor from electrons, and the attitudes that come of them.
 
-Stars of the whole catalog of the artifact shine through a lens that is not quite the known one on
+Stars of the whole catalog of the database shine through a lens that is not quite the known one on
 pixels that are not quite alike; spots and attitude are found as in flight, with starcat's own
 detection and matcher. Not drawn are blooming, optics whose spot changes over the field, and
 stars fainter than the catalog's.
@@ -255,7 +255,7 @@ class Bench:
 
 
 def open_bench(artifact: Path, sensor: Sensor, seed: int, method: str | None) -> Bench:
-    """Return the bench of an artifact's own camera and stars."""
+    """Return the bench of a database's own camera and stars."""
     return Bench(sensor, Matcher.open(artifact, method), catalog_of_artifact(artifact), seed)
 
 

@@ -13,13 +13,12 @@ import numpy as np
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.evaluation.ecss.bench import Bench, error_arcsec, random_day
-from starcat.geometry.attitude import quaternion_from_matrix, solve_wahba_svd
-from starcat.images.background import PIXEL_VARIANCE, load_sep
-from starcat.matcher.pose import information
+from starcat.geometry.attitude import information, quaternion_from_matrix, solve_wahba_svd
+from starcat.images.background import load_sep
 from starcat.matcher.stars import ARCSEC
+from starcat.products.blends import widths_px
 from starcat.sky.observer import aberrated
 
-_NARROWEST_WINDOW_PX = 1.0  # as in starcat.images.centroiding
 _STEP_PX = 0.5
 LOW_ORBIT_KM_S = 7.6
 
@@ -37,11 +36,6 @@ CONTRIBUTORS = {
 """What is simulated by itself, in the order of the report."""
 
 
-def window_px(psf_sigma_px: float) -> float:
-    """Return the standard deviation of the window that centroids are measured with."""
-    return max(math.sqrt(psf_sigma_px**2 + PIXEL_VARIANCE), _NARROWEST_WINDOW_PX)
-
-
 def centroid_noise_px(bench: Bench, mag: Array) -> Array:
     """Return the noise of a star's centroid on one axis, in closed form.
 
@@ -54,7 +48,8 @@ def centroid_noise_px(bench: Bench, mag: Array) -> Array:
     """
     sensor = bench.sensor
     electrons = sensor.zero_point_e * 10.0 ** (-0.4 * np.asarray(mag))
-    s2, w2 = sensor.psf_sigma_px**2 + PIXEL_VARIANCE, window_px(sensor.psf_sigma_px) ** 2
+    widths = widths_px(sensor.psf_sigma_px)
+    s2, w2 = widths.spot**2, widths.window**2
     rounding = sensor.gain_e_adu**2 / 12.0
     background = sensor.background_e + sensor.read_noise_e**2 + rounding
     slope, part = (w2 / (s2 + w2)) ** 2, w2 / (2.0 * s2 + w2)
@@ -127,7 +122,8 @@ def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
     """Return where the window settles in light without noise; it starts at the true places."""
     held = np.minimum(light, bench.sensor.full_well_e)
     start = np.ascontiguousarray((places - 0.5).T)
-    x, y, _ = load_sep().winpos(held, *start, window_px(bench.sensor.psf_sigma_px), subpix=0)
+    window = widths_px(bench.sensor.psf_sigma_px).window
+    x, y, _ = load_sep().winpos(held, *start, window, subpix=0)
     return np.stack([x, y], axis=1) + 0.5
 
 

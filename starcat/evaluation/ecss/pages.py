@@ -234,7 +234,7 @@ def _sky(content: Content) -> Table:
 
 def _simulation(content: Content) -> Table:
     rows = [
-        ("artifact", content["artifact"]),
+        ("database", content["artifact"]),
         ("camera", content["camera"]),
         ("method", content["method"]),
         ("frames from electrons to attitude", f"{content['frames']:,}"),

@@ -40,7 +40,7 @@ def evaluate_sensor(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> tuple[dict[str, Any], Path]:
-    """Simulate a star sensor with an artifact; return the figures and the page of the report."""
+    """Simulate a star sensor with a database; return the figures and the page of the report."""
     bench = cached_bench(artifact, sensor, seed, method)
     trials = trials_of(bench, pointings)
     faintest = math.floor(bench.limit_mag)
@@ -66,7 +66,7 @@ def _header(bench: Bench, artifact: Path, seed: int) -> dict[str, Any]:
         "fov_deg": [bench.camera.fov_x_deg, bench.camera.fov_y_deg],
         "method": bench.matcher.method,
         "seed": seed,
-        "sky_in_words": f"{len(sky):,} of the artifact's catalog, down to {sky.max():.2f} mag",
+        "sky_in_words": f"{len(sky):,} of the database's catalog, down to {sky.max():.2f} mag",
         "sensor": bench.sensor.model_dump(mode="json"),
         "sensor_toml": sensor_toml(bench.sensor),
     }

@@ -1,17 +1,17 @@
 """A star sensor as TOML: what turns the light of stars into electrons, and what is not known of it.
 
-The optics, the size of the detector and the stars are those of an artifact.
+The optics, the size of the detector and the stars are those of a database.
 """
 
 from __future__ import annotations
 
-import math
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
+from starcat.bands.exposure import PHOTONS_S_MM2, zero_point_e_s
 from starcat.specs.keys import toml_value
 from starcat.specs.product_sections import Mag, Section
 from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
@@ -43,7 +43,7 @@ class Sensor(Section):
 
     zero_point_e_s: Positive | None = _key(
         None,
-        "electrons/s of a star of magnitude 0 in the band of the artifact; or else aperture_mm and "
+        "electrons/s of a star of magnitude 0 in the band of the database; or else aperture_mm and "
         "quantum_efficiency",
         6.0e6,
     )
@@ -52,7 +52,7 @@ class Sensor(Section):
         None, "electrons per photon, transmission of the optics included", 0.5
     )
     photons_s_mm2: Positive = _key(
-        38_200.0,
+        PHOTONS_S_MM2,
         "photons/s and mm2 of a star of magnitude 0; the default is Liebe's 19,100 electrons "
         "(2002) at a quantum efficiency of 0.5",
     )
@@ -78,7 +78,7 @@ class Sensor(Section):
         5.0, "threshold of detection, standard deviations"
     )
     limit_mag: Mag | None = _key(
-        None, "fainter spots are not used, mag; default: 0.3 beyond the artifact's", 6.3
+        None, "fainter spots are not used, mag; default: 0.3 beyond the database's", 6.3
     )
     most_spots: Annotated[int, Field(ge=4, le=10_000)] = _key(64, "brightest spots that are used")
     update_rate_hz: Positive = _key(..., "frames/s", 5.0)
@@ -149,9 +149,8 @@ class Sensor(Section):
         """Electrons of a star of magnitude 0 in a frame."""
         if self.zero_point_e_s is not None:
             return self.zero_point_e_s * self.exposure_s
-        area_mm2 = 0.25 * math.pi * (self.aperture_mm or 0.0) ** 2
-        electrons = area_mm2 * self.photons_s_mm2 * (self.quantum_efficiency or 0.0)
-        return electrons * self.exposure_s
+        optics = (self.aperture_mm or 0.0, self.quantum_efficiency or 0.0)
+        return zero_point_e_s(*optics, self.photons_s_mm2) * self.exposure_s
 
     @property
     def background_e(self) -> float:
@@ -185,7 +184,7 @@ def sensor_toml(sensor: Sensor) -> str:
 
 def example_toml() -> str:
     """Return a sensor with every key explained: its meaning, unit and default."""
-    lines = ["# A star sensor: starcat evaluate ARTIFACT --ecss SENSOR.toml"]
+    lines = ["# A star sensor: starcat evaluate DATABASE --ecss SENSOR.toml"]
     for name, field in Sensor.model_fields.items():
         text, value = str(field.description), (field.examples or [field.default])[0]
         if field.is_required():

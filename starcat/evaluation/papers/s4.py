@@ -122,8 +122,8 @@ PAPER = Paper(
         "The detector and the lens make 8.08 x 6.46 degrees; the tiling has the paper's 8 x 6.",
         "Images show every star of the excerpt up to the limit, guide star or not, and with "
         "magnitude noise also stars below it.",
-        "False stars: so many that they are the stated share of all spots; their magnitudes are "
-        "those of stars drawn at random.",
+        "False stars: so many that they are the stated share of all centroids; their magnitudes "
+        "are those of stars drawn at random.",
         "Noises are Gaussian with the stated value as standard deviation (per axis for positions).",
         "The paper's rule: the attitude is right. A false-match probability of 0.01 ends the "
         "search, else the best agreement is the answer, as four stars of four do not reach "

@@ -12,10 +12,12 @@ from itertools import pairwise
 from pydoc import locate
 from typing import Any
 
+from docutils.utils.math.latex2mathml import tex2mathml
 from fastapi import Request
 from fastapi.responses import RedirectResponse, Response
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
+from mdit_py_plugins.dollarmath import dollarmath_plugin
 
 from starcat.resources import resource_folder
 from starcat.service.pages.rendering import page_router, render
@@ -116,6 +118,7 @@ def read_page(name: str) -> Page:
 @cache
 def _markdown() -> MarkdownIt:
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
+    dollarmath_plugin(markdown, allow_blank_lines=False, renderer=_formula)
     rules: Any = vars(markdown.renderer)["rules"]
     # What is wider than the page scrolls in a box of its own, which the keyboard reaches.
     rules["table_open"] = _table
@@ -124,6 +127,11 @@ def _markdown() -> MarkdownIt:
     rules["th_close"] = lambda *_: ""  # HTML ends a cell where the next begins
     rules["fence"] = rules["code_block"] = _code
     return markdown
+
+
+def _formula(tex: str, options: dict[str, bool]) -> str:
+    """Return a formula as MathML, which browsers draw without a script."""
+    return str(tex2mathml(tex.strip(), as_block=options["display_mode"]))
 
 
 def _table(tokens: Sequence[Token], index: int, _: Any, environment: dict[str, int]) -> str:

@@ -1,0 +1,240 @@
+"""Relations from the bands of a catalog to a sensor's: what to add to a magnitude, and its error.
+
+A relation is a smooth line through the library's spectra: at each colour a straight line is fitted
+to those of about that colour, common ones with more weight. Nothing is fitted to stars of the sky.
+The error of a relation has three parts: how the spectra scatter about the line, what errors of the
+library's own flux calibration do to it, and how well the zero points of published bands are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from starcat.arrays import Array, Mask
+from starcat.bands.response import Response, shipped
+from starcat.bands.spectra import library, parsed_type
+from starcat.bands.synthetic import magnitudes, row_weights
+
+GRID_MAG = 0.02
+"""Step of the colours that a relation is worked out at."""
+
+WIDTH_MAG, WIDEST_MAG = 0.06, 0.6
+"""Colours this far apart count as about the same (one standard deviation); where the library has
+few spectra the width grows, at the most to the second."""
+
+FEWEST_TYPES = 3.0
+"""So many types, at the least, make the line at a colour."""
+
+ZERO_POINT_MAG = 0.007
+"""How well the passband and zero point of a published band are known (Bessell and Murphy 2012,
+section 4: 0.01 mag)."""
+
+PASSBAND_SHARE = 0.002
+"""How well the mean wavelength of a response is known, relative: 1.6 nm at 550 nm. Zero points are
+set by white stars, so that this matters more the further a star's colour is from theirs."""
+
+OUTSIDE_MAG = 0.5
+"""What the error grows by for each magnitude that a colour is outside of the library's."""
+
+TYPE_WIDTH, CLASS_WIDTH = 1.5, 0.7
+"""Subclasses and luminosity classes that a spectral type spreads over."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Magnitudes in a sensor's band."""
+
+    mag: Array  # shape (N,): NaN where the base magnitude is
+    error_mag: Array  # shape (N,): standard deviation
+    is_outside: Mask  # shape (N,): the colour is outside of the relation's
+    has_colour: Mask  # shape (N,): False where a mean over all stars had to do
+
+
+@dataclass(frozen=True)
+class Relation:
+    """What to add to a magnitude in a base band, by colour."""
+
+    base: str  # a shipped response, such as "G"
+    colour: tuple[str, str]  # such as ("BP", "RP")
+    target: Response
+    colour_mag: Array  # shape (G,), rising
+    offset_mag: Array  # shape (G,): target minus base
+    slope: Array  # shape (G,): of the offset by colour
+    scatter_mag: Array  # shape (G,): of the spectra about the offset
+    calibration_mag: Array  # shape (G,): from errors of the library's fluxes
+    band_mag: Array  # shape (G,): from errors of the passbands and their zero points
+    typical_offset_mag: float  # without a colour
+    typical_scatter_mag: float
+    typical_error_mag: float  # the error of the relation at common colours
+
+    @property
+    def error_mag(self) -> Array:
+        """The error of the relation at each colour of the grid, shape (G,)."""
+        squares = self.scatter_mag**2 + self.calibration_mag**2 + self.band_mag**2
+        return np.asarray(np.sqrt(squares))
+
+    def predict(
+        self, mag: Array, colour_mag: Array, mag_error: Array, colour_error: Array
+    ) -> Prediction:
+        """Return magnitudes in the target's band.
+
+        Parameters
+        ----------
+        mag, colour_mag : ndarray of float64, shape (N,)
+            Magnitudes in the base band, and colours; NaN where unknown.
+        mag_error, colour_error : ndarray of float64, shape (N,)
+            Their standard deviations.
+
+        Returns
+        -------
+        Prediction
+            Beyond the ends of the relation it goes on as a straight line, and the error grows.
+        """
+        grid, has_colour = self.colour_mag, np.isfinite(colour_mag)
+        colour = np.where(has_colour, colour_mag, grid[0])
+        beyond = colour - np.clip(colour, grid[0], grid[-1])
+        slope = np.interp(colour, grid, self.slope)
+        offset = np.interp(colour, grid, self.offset_mag) + slope * beyond
+        relation = np.interp(colour, grid, self.error_mag) + OUTSIDE_MAG * np.abs(beyond)
+        offset = np.where(has_colour, offset, self.typical_offset_mag)
+        relation = np.where(has_colour, relation, self.typical_scatter_mag)
+        by_colour = np.where(has_colour, slope * colour_error, 0.0)
+        error = np.sqrt(relation**2 + mag_error**2 + by_colour**2)
+        return Prediction(mag + offset, error, has_colour & (beyond != 0.0), has_colour)
+
+
+def _zone_shares(response: Response) -> Array:
+    """Return which share of each spectrum's signal comes from each zone, shape (E, T, Z)."""
+    spectra = library()
+    signal = spectra.flux * row_weights(response)
+    starts = np.flatnonzero(np.diff(spectra.deviation, prepend=-1.0) != 0)
+    return np.asarray(np.add.reduceat(signal, starts, axis=2) / signal.sum(axis=2)[..., None])
+
+
+def _zone_deviations() -> Array:
+    """Return the library's relative error in each zone, shape (Z,)."""
+    deviation = library().deviation
+    return deviation[np.flatnonzero(np.diff(deviation, prepend=-1.0) != 0)]
+
+
+def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
+    """Return the relation from a band and a colour of a catalog to a sensor's band."""
+    first, second = (shipped(band) for band in colour)
+    x = (magnitudes(first) - magnitudes(second)).ravel()
+    y = (magnitudes(target) - magnitudes(shipped(base))).ravel()
+    weight = library().weight
+    grid = _grid(x)
+    kernels = np.stack([_kernel(x, at) for at in grid])
+    each = kernels * weight.ravel()
+    total = each.sum(axis=1)
+    mean_x, mean_y = each @ x / total, each @ y / total
+    square = np.maximum((each @ x**2) / total - mean_x**2, 1e-9)
+    slope = ((each @ (x * y)) / total - mean_x * mean_y) / square
+    offset = mean_y + slope * (grid - mean_x)
+    residual = y - (offset[:, None] + slope[:, None] * (x - grid[:, None]))
+    scatter = np.sqrt(np.sum(each * residual**2, axis=1) / total)
+    shares = _zone_shares(target) - _zone_shares(shipped(base))
+    by_colour = _zone_shares(first) - _zone_shares(second)
+    at_spectrum = np.interp(x, grid, slope).reshape(weight.shape)
+    excess = shares - at_spectrum[..., None] * by_colour
+    calibration = 1.0857 * np.sqrt(np.sum((excess * _zone_deviations()) ** 2, axis=2)).ravel()
+    typical = float(np.sum(weight.ravel() * y))
+    band = each @ _band_variance(shipped(base), target) / total
+    at_colour = scatter**2 + each @ calibration**2 / total + band
+    return Relation(
+        base=base,
+        colour=colour,
+        target=target,
+        colour_mag=grid,
+        offset_mag=offset,
+        slope=slope,
+        scatter_mag=scatter,
+        calibration_mag=np.sqrt(each @ calibration**2 / total),
+        band_mag=np.sqrt(band),
+        typical_offset_mag=typical,
+        typical_scatter_mag=float(np.sqrt(np.sum(weight.ravel() * (y - typical) ** 2))),
+        typical_error_mag=float(np.sqrt(weight.ravel() @ np.interp(x, grid, at_colour))),
+    )
+
+
+def _band_variance(base: Response, target: Response) -> Array:
+    """Return the variance that errors of two passbands make for each spectrum, shape (E * T,)."""
+    if base is target:
+        return np.zeros(library().weight.size)
+    variance = np.full(library().weight.shape, ZERO_POINT_MAG**2)
+    for one in (base, target):
+        shifted = replace(one, wavelength_nm=one.wavelength_nm * (1.0 + PASSBAND_SHARE))
+        variance = variance + (magnitudes(shifted) - magnitudes(one)) ** 2
+    return np.asarray(variance).ravel()
+
+
+def _grid(x: Array) -> Array:
+    """Return the colours from the bluest spectrum to the reddest."""
+    low, high = np.floor(x.min() / GRID_MAG), np.ceil(x.max() / GRID_MAG)
+    return np.arange(low, high + 1.0) * GRID_MAG
+
+
+def _kernel(x: Array, at: float) -> Array:
+    """Return how much each spectrum counts at a colour, before how common it is."""
+    share = library().weight / library().weight.sum(axis=0)
+    width = WIDTH_MAG
+    while True:
+        near = np.exp(-0.5 * ((x - at) / width) ** 2)
+        if width >= WIDEST_MAG or np.sum(near * share.ravel()) >= FEWEST_TYPES:
+            return np.asarray(near)
+        width *= 1.2
+
+
+@cache
+def _type_kernel(number: float, luminosity: float) -> Array:
+    """Return the weights, sum 1, of the spectra that a spectral type may stand for."""
+    spectra = library()
+    near = np.exp(-0.5 * ((spectra.number - number) / TYPE_WIDTH) ** 2)
+    if np.isfinite(luminosity):
+        near = near * np.exp(-0.5 * ((spectra.luminosity - luminosity) / CLASS_WIDTH) ** 2)
+    weights = near * spectra.weight
+    return np.asarray(weights / weights.sum())
+
+
+def predict_by_type(
+    base: str, target: Response, mag: Array, types: list[str], mag_error: Array
+) -> Prediction:
+    """Return magnitudes in a sensor's band from a band and spectral types such as K2III or A0."""
+    difference = magnitudes(target) - magnitudes(shipped(base))
+    everywhere = library().weight
+    bands = _band_variance(shipped(base), target).reshape(everywhere.shape)
+    found: dict[str, tuple[float, float, bool]] = {}
+    for text in set(types):
+        number, luminosity = parsed_type(text)
+        is_known = bool(np.isfinite(number))
+        weights = _type_kernel(number, luminosity) if is_known else everywhere
+        mean = float(np.sum(weights * difference))
+        scatter = float(np.sqrt(np.sum(weights * ((difference - mean) ** 2 + bands))))
+        found[text] = (mean, scatter, is_known)
+    rows = np.array([found[text] for text in types]).reshape(-1, 3)
+    error = np.sqrt(rows[:, 1] ** 2 + mag_error**2)
+    return Prediction(mag + rows[:, 0], error, np.zeros(len(mag), bool), rows[:, 2] > 0)
+
+
+def combined(predictions: list[Prediction]) -> Prediction:
+    """Return the mean of predictions from several catalogs, weighted by their errors.
+
+    Those of a star that are unknown, or outside of a relation where another is not, do not count.
+    """
+    mags = np.stack([one.mag for one in predictions])
+    errors = np.stack([one.error_mag for one in predictions])
+    outside = np.stack([one.is_outside for one in predictions])
+    known = np.isfinite(mags)
+    inside = known & ~outside
+    counted = np.where(inside.any(axis=0), inside, known)
+    weight = np.where(counted, 1.0 / np.maximum(errors, 1e-6) ** 2, 0.0)
+    total = weight.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mag = np.sum(np.where(counted, mags, 0.0) * weight, axis=0) / total
+        error = np.sqrt(1.0 / total)
+    has_colour = np.any(np.stack([one.has_colour for one in predictions]) & counted, axis=0)
+    is_outside = np.asarray(known.any(axis=0) & ~inside.any(axis=0))
+    return Prediction(mag, error, is_outside, np.asarray(has_colour))

@@ -1,0 +1,229 @@
+"""Answers of ``starcat identify`` as arrays: which star was seen where and how bright, or not seen.
+
+A file holds a line of JSON a frame, as ``--ndjson`` prints them, or one JSON value of all frames.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Directions
+from starcat.errors import ConfigError, FileMissing, reason
+from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.geometry.sphere import Zones, zones_of
+
+EDGE_PX = 5.0
+"""A star that should be nearer to the edge of the frame is not expected to be seen."""
+
+MAKE_THEM = "make it with 'starcat identify DATABASE FRAMES --ndjson > answers.ndjson'"
+
+_ARCSEC = np.degrees(1.0) * 3600.0
+_SAME_MAG = 1e-6
+
+
+@dataclass(frozen=True)
+class SkyStars:
+    """The guide stars of a database, one row each."""
+
+    name: str  # of the database, ``<name>-<version>``
+    star_id: NDArray[np.int64]
+    designation: tuple[str, ...]
+    directions: Directions
+    mag: Array
+    colour: Array  # of one pair of bands; NaN where a star has none
+
+    def __len__(self) -> int:
+        return len(self.mag)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """The stars that should be in identified frames, a row for each star of each frame."""
+
+    frame: NDArray[np.int64]  # number of the frame, ascending
+    star: NDArray[np.int64]  # row of the database
+    is_seen: NDArray[np.bool_]  # whether a centroid was identified as the star
+    mag: Array  # measured magnitude; NaN unless seen and measured
+    offset_arcsec: Array  # seen minus database, east and north; NaN unless seen; shape (N, 2)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the files say."""
+
+    names: tuple[str, ...]  # of the identified frames
+    n_frames: int  # of all
+    sightings: Sightings
+
+
+def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
+    """Read the identified frames of files, and find which stars each should show."""
+    row_of = {number: row for row, number in enumerate(stars.star_id.tolist())}
+    zones = zones_of(stars.directions)
+    names, parts, count = list[str](), list[tuple[NDArray[Any], ...]](), 0
+    for path in paths:
+        for where, answer in _answers_of(path):
+            count += 1
+            if answer["status"] != "identified":
+                continue
+            seen = _seen_stars(answer, stars, row_of, where)
+            parts.append(_of_frame(answer, seen, stars, zones, len(names), where))
+            names.append(str(answer.get("frame", where)))
+    if not names:
+        raise ConfigError(
+            f"none of the {count} frames of {', '.join(str(path) for path in paths[:3])} is "
+            "identified, and nothing can be learnt of them; 'starcat identify' says why of each"
+        )
+    frame, star, is_seen, mag, offset = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
+    if np.isnan(mag).all():
+        raise ConfigError(
+            f"{paths[0]}: no centroid of a star has a magnitude; give 'starcat identify' frames "
+            "with a column mag or flux"
+        )
+    return Answers(tuple(names), count, Sightings(frame, star, is_seen, mag, offset))
+
+
+def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Return each answer of a file, and where it stands."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise FileMissing(f"{path}: no such file; {MAKE_THEM}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        why = reason(error) if isinstance(error, OSError) else "not text"
+        raise ConfigError(f"{path}: cannot be read ({why}); {MAKE_THEM}") from error
+    if not text.strip():
+        raise ConfigError(f"{path}: the file is empty; {MAKE_THEM}")
+    for where, answer in _values_of(text, path):
+        if not isinstance(answer, dict) or "status" not in answer:
+            raise ConfigError(
+                f"{where}: no answer of 'starcat identify', which is an object with the key "
+                f"'status'; {MAKE_THEM}"
+            )
+        yield where, answer
+
+
+def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
+    if text.lstrip().startswith("["):
+        try:
+            for number, one in enumerate(json.loads(text), start=1):
+                yield f"{path}: frame {number}", one
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"{path}: not JSON ({error}); {MAKE_THEM}") from error
+        return
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            yield f"{path}: line {number}", json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(
+                f"{path}: line {number} is not JSON ({error}); expected a line a frame: {MAKE_THEM}"
+            ) from error
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The centroids of a frame that are stars."""
+
+    row: NDArray[np.int64]
+    px: Array
+    mag: Array
+
+
+def _seen_stars(
+    answer: dict[str, Any], stars: SkyStars, row_of: dict[int, int], where: str
+) -> _Seen:
+    """Return the stars of an answer; the database has to be the one that it was found with."""
+    made_with = answer.get("database")
+    if made_with is not None and made_with != stars.name:
+        raise ConfigError(
+            f"{where}: identified with the database {made_with}, this is {stars.name}; give the "
+            "database that the frames were identified with, or identify them again"
+        )
+    try:
+        centroids = [one for one in answer["stars"] if one["star"] is not None]
+        rows = [row_of.get(int(one["star_id"]), -1) for one in centroids]
+        told = [float(one["mag"]) for one in centroids]
+        px = [[float(one["x_px"]), float(one["y_px"])] for one in centroids]
+        mag = [float("nan" if (m := one["observed_mag"]) is None else m) for one in centroids]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{where}: the stars are not as this starcat writes them ({error!r}); identify the "
+            "frames again"
+        ) from error
+    for row, one, brightness in zip(rows, centroids, told, strict=True):
+        if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
+            raise ConfigError(
+                f"{where}: {one['star']} with magnitude {brightness:g} is no star of {stars.name}; "
+                "give the database that the frames were identified with"
+            )
+    return _Seen(
+        np.array(rows, dtype=np.int64), np.array(px).reshape(-1, 2), np.array(mag, dtype=np.float64)
+    )
+
+
+def _of_frame(
+    answer: dict[str, Any], seen: _Seen, stars: SkyStars, zones: Zones, number: int, where: str
+) -> tuple[NDArray[Any], ...]:
+    """Return the columns of `Sightings` of a frame: the stars that are seen, then the others."""
+    camera, matrix = _camera_of(answer, where), _matrix_of(answer, where)
+    near = zones.near(matrix[2], 1.05 * camera.radius_rad)
+    near = near[~np.isin(near, seen.row)]
+    body = stars.directions[near] @ matrix.T
+    px = camera.pixels_from_directions(body)
+    size = np.array([camera.width_px, camera.height_px])
+    inside = ((px > EDGE_PX) & (px < size - EDGE_PX)).all(axis=1)
+    missed = near[inside]
+    count, rest = len(seen.row) + len(missed), len(missed)
+    away = camera.directions_from_pixels(seen.px) @ matrix - stars.directions[seen.row]
+    return (
+        np.full(count, number),
+        np.concatenate([seen.row, missed]),
+        np.arange(count) < len(seen.row),
+        np.concatenate([seen.mag, np.full(rest, np.nan)]),
+        np.concatenate([_on_the_sky(away, stars.directions[seen.row]), np.full((rest, 2), np.nan)]),
+    )
+
+
+def _on_the_sky(away: Array, directions: Directions) -> Array:
+    """Return small offsets of directions as arcseconds to the east and to the north."""
+    x, y, z = directions.T
+    level = np.maximum(np.hypot(x, y), 1e-12)
+    east = (x * away[:, 1] - y * away[:, 0]) / level
+    north = level * away[:, 2] - z * (x * away[:, 0] + y * away[:, 1]) / level
+    return np.column_stack([_ARCSEC * east, _ARCSEC * north])
+
+
+def _camera_of(answer: dict[str, Any], where: str) -> Camera:
+    try:
+        told = dict(answer["camera"])
+        return Camera(**{**told, "distortion": Distortion(**told["distortion"])})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{where}: no camera that this starcat writes ({error!r}); identify the frames again"
+        ) from error
+
+
+def _matrix_of(answer: dict[str, Any], where: str) -> Array:
+    try:
+        q = np.array(answer["q_body_from_icrs"], dtype=np.float64).reshape(4)
+        return matrix_from_quaternion(q)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise ConfigError(
+            f"{where}: no attitude that this starcat writes ({error!r}); identify the frames again"
+        ) from error

@@ -1,0 +1,149 @@
+"""What a sensor makes of stars whose magnitudes are known: zero point, colour term, depth.
+
+``measured = mag + zero point + offset of the frame + colour term x colour + noise``. Pure
+functions of arrays with a row for each sighting.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom
+
+from starcat.arrays import Array, Mask, Rows
+
+HUBER = 1.345  # deviations, in their noise, from which on a measurement counts less
+OF_A_BIN = 100  # measurements of a bin of magnitude at the least
+MOST_BINS = 48
+COMPLETE = 0.85  # share of what the best bins see, from which on stars are expected
+COVERED = (
+    1e-3  # a frame that misses so many as one in a thousand does says nothing of what it lacks
+)
+FEWEST_COLOURS = 10  # stars of known colour that a colour term needs
+FEWEST_STEPS, MAX_STEPS = 10, 50  # of the fit; each has new weights
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The terms of a sensor, fitted."""
+
+    zero_point_mag: float
+    zero_point_error_mag: float
+    colour_term: float | None  # None where too few stars have a colour
+    colour_term_error: float | None
+    frame_offset_mag: Array  # of each frame, beside the zero point; 0 unless they were fitted
+
+    def predicted(self, mag: Array, colour: Array, frame: Rows | None) -> Array:
+        """Return the magnitudes that the sensor should measure, in frames or in a usual one."""
+        offset = 0.0 if frame is None else self.frame_offset_mag[frame]
+        bent = 0.0 if self.colour_term is None else self.colour_term * colour
+        return np.asarray(mag + self.zero_point_mag + bent + offset)
+
+
+def fit_terms(
+    difference: Array,
+    colour: Array,
+    frame: Rows,
+    star: Rows,
+    sigma: Array,
+    *,
+    frames: int,
+    by_frame: bool,
+) -> Terms:
+    """Fit the terms to measured minus catalog magnitudes, by repeated weights (Huber 1964).
+
+    Offsets of frames are hundreds of unknowns, but each is the mean of its frame once the colour
+    term is known: means are taken out of both sides, and one unknown is left (Frisch and Waugh
+    1933). Errors are from how the stars scatter, as the sightings of a star share what is wrong
+    with it. Stars without colour have no part in it, unless nearly all have none.
+    """
+    known = np.isfinite(colour)
+    has_colour = len(np.unique(colour[known])) >= FEWEST_COLOURS
+    used = known if has_colour else np.ones(len(star), dtype=bool)
+    y, frame, star, sigma = difference[used], frame[used], star[used], sigma[used]
+    x = colour[used] if has_colour else np.zeros(len(y))
+    group = frame if by_frame else np.zeros(len(frame), dtype=np.int64)
+    weight, slope = sigma**-2.0, 0.0
+    for step in range(MAX_STEPS):
+        before = slope
+        total = np.maximum(np.bincount(group, weight), 1e-300)
+        x_mean = np.bincount(group, weight * x) / total
+        y_mean = np.bincount(group, weight * y) / total
+        x_left, y_left = x - x_mean[group], y - y_mean[group]
+        square = float(weight @ x_left**2)
+        slope = float(weight @ (x_left * y_left)) / square if has_colour else 0.0
+        left = y_left - slope * x_left
+        far = np.maximum(np.abs(left) / (HUBER * sigma), 1.0)
+        weight = sigma**-2.0 / far
+        if step >= FEWEST_STEPS and abs(slope - before) < 1e-12:
+            break
+    offset = y_mean - slope * x_mean
+    pull = weight * left
+    slope_pull = pull * x_left / square if has_colour else np.zeros(len(x))
+    if by_frame:
+        seen = np.unique(group)
+        zero_point = float(offset[seen].mean())
+        error = float(offset[seen].std()) / np.sqrt(len(seen))
+    else:
+        zero_point = float(offset[0])
+        error = _error(pull / weight.sum() - x_mean[0] * slope_pull, star)
+    of_frame = np.zeros(frames)
+    if by_frame:
+        of_frame[seen] = offset[seen] - zero_point
+    return Terms(
+        zero_point,
+        float(error),
+        slope if has_colour else None,
+        _error(slope_pull, star) if has_colour else None,
+        of_frame,
+    )
+
+
+def _error(pull: Array, star: Rows) -> float:
+    """Return the standard error of a sum of pulls that are independent from star to star."""
+    return float(np.sqrt((np.bincount(star, pull) ** 2).sum()))
+
+
+@dataclass(frozen=True)
+class Depth:
+    """How deep the frames see."""
+
+    limit_mag: float  # measured magnitude from which stars are missed; inf where none are
+    chance: Array  # that each sighting is seen; NaN where nothing is expected
+
+
+def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) -> Depth:
+    """Find which sightings are expected, from how often stars of each brightness are seen.
+
+    Nothing is expected of stars near the limit and beyond, and of frames that miss more than
+    chance does: the limb of the Earth or the baffle may hide a part of them.
+    """
+    used = np.flatnonzero(is_trusted)
+    bins = int(np.clip(len(used) // OF_A_BIN, 1, MOST_BINS))
+    order = used[np.argsort(predicted[used], kind="stable")]
+    parts = np.array_split(order, bins)
+    edges = np.array([predicted[part[0]] for part in parts[1:]])
+    seen = np.array([is_seen[part].sum() for part in parts])
+    size = np.array([len(part) for part in parts])
+    usual = float(np.quantile(seen / size, 0.9))
+    is_full = seen >= COMPLETE * usual * size
+    limit = np.inf
+    if not is_full[-1]:
+        # The faintest bin that is full may end in the limit.
+        first = int(np.flatnonzero(is_full)[-1]) if is_full.any() else 0
+        is_full[first:] = False
+        limit = float(predicted[parts[first][0]])
+    place = np.searchsorted(edges, predicted, side="right")
+    chance = np.where(is_full[place], (seen / (size + 1.0))[place], np.nan)
+    chance[_is_covered(chance, is_seen, frame)[frame]] = np.nan
+    return Depth(limit, chance)
+
+
+def _is_covered(chance: Array, is_seen: Mask, frame: Rows) -> Mask:
+    """Return which frames see fewer of the expected stars than chance explains."""
+    some = np.isfinite(chance)
+    count = np.bincount(frame[some], minlength=frame.max() + 1)
+    found = np.bincount(frame[some], is_seen[some], minlength=len(count))
+    mean = np.bincount(frame[some], chance[some], minlength=len(count)) / np.maximum(count, 1)
+    return np.asarray((count > 0) & (binom.cdf(found, count, mean) < COVERED))

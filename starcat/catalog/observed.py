@@ -1,0 +1,66 @@
+"""What flew, put into a star table: magnitudes with the colour term of the sensor, and distrust."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.arrays import Mask
+from starcat.catalog.stars import floats_of, with_columns
+from starcat.errors import BuildError
+from starcat.specs.build_spec import Observed
+
+SOURCE = "observed"
+"""What `mag_source` and `band` say of a magnitude with the colour term of a sensor that flew."""
+
+_MOST_NAMED = 5
+
+
+def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
+    """Return stars whose magnitudes are those of the sensor; the catalog's stay beside them."""
+    _check_numbers(stars, observed)
+    if observed.colour_term == 0.0:
+        return stars
+    _check_bands(stars, observed)
+    redder = floats_of(stars, "colour_mag") - observed.reference_colour_mag
+    known = pa.array(~np.isnan(redder))
+    return with_columns(
+        stars,
+        {
+            "mag": floats_of(stars, "mag") + observed.colour_term * np.nan_to_num(redder),
+            "band": SOURCE,
+            "mag_source": pc.if_else(known, SOURCE, stars["mag_source"]),
+            # Where a spec has made a sensor's magnitude before, the catalog's is there already.
+            "catalog_mag": pc.coalesce(stars["catalog_mag"], stars["mag"]),
+            "catalog_band": pc.coalesce(stars["catalog_band"], stars["band"]),
+        },
+    )
+
+
+def _check_bands(stars: pa.Table, observed: Observed) -> None:
+    found = sorted(filter(None, pc.unique(stars["colour_bands"]).to_pylist()))
+    if found != [observed.colour_bands]:
+        raise BuildError(
+            f"selection.observed.colour_term is for the colour {observed.colour_bands}; the stars "
+            f"have {', '.join(found) or 'none'}. Learn it from frames of a database of this "
+            "catalog, or leave colour_term out"
+        )
+
+
+def _check_numbers(stars: pa.Table, observed: Observed) -> None:
+    wanted = np.array(observed.reject, dtype=np.int64)
+    unknown = wanted[~np.isin(wanted, stars["star_id"].to_numpy())]
+    if len(unknown):
+        named = ", ".join(map(str, unknown[:_MOST_NAMED].tolist()))
+        more = ", ..." if len(unknown) > _MOST_NAMED else ""
+        raise BuildError(
+            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are the "
+            "star_id of no star of the catalog; learn from frames of a database of this catalog"
+        )
+
+
+def is_distrusted(stars: pa.Table, observed: Observed) -> Mask:
+    """Return which stars the spec says to distrust."""
+    wanted = np.array(observed.reject, dtype=np.int64)
+    return np.isin(stars["star_id"].to_numpy(), wanted)

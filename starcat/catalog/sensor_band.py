@@ -1,0 +1,238 @@
+"""Star tables in the band of a sensor: every magnitude predicted, with its error and its origin.
+
+The catalog's own magnitude stays in ``catalog_mag``. Of the relations that the catalog's bands and
+colours give, the most exact one that a star has the magnitudes for is taken; where a star has no
+colour its spectral type is, and where it has none the mean of all stars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Mask
+from starcat.bands.catalogs import colour_of, relations_of
+from starcat.bands.photometry import band_error, variability_error
+from starcat.bands.relation import Prediction, Relation, combined, predict_by_type
+from starcat.bands.response import Response, shipped_names
+from starcat.catalog.stars import floats_of, with_columns
+from starcat.catalog.verdict import Quality
+from starcat.errors import ConfigError
+
+ALONE = " alone"
+"""How the origin of a magnitude ends that is the mean of all stars of the band."""
+
+
+@dataclass(frozen=True)
+class InBand:
+    """A star table in the band of a sensor."""
+
+    stars: pa.Table
+    response: Response
+    band: str  # of the catalog
+    counts: dict[str, int]  # stars by the origin of their magnitude
+    outside: int  # stars whose colour is outside of the relation's
+    relation: Relation | None  # the one that most stars have their magnitude by
+
+
+@dataclass(frozen=True)
+class Other:
+    """What another catalog says of some of the stars, arrays of shape (M,)."""
+
+    source: str
+    rows: NDArray[np.int64]  # of the stars
+    prediction: Prediction
+    code: NDArray[np.int32]  # how each magnitude was made: a place in ``told``
+    told: tuple[str, ...]
+
+
+def in_sensor_band(
+    stars: pa.Table, source: str, response: Response, others: Sequence[Other] = ()
+) -> InBand:
+    """Return a star table with its magnitudes in the band of a sensor.
+
+    What other catalogs say of the same stars is averaged with it, by the errors of each.
+    """
+    band = _only(stars, "band") or ""
+    predicted, best = _predicted(stars, source, response)
+    for other in others:
+        predicted.mix(other)
+    variable = variability_error(floats_of(stars, "amplitude_mag"))
+    columns = {
+        "mag": predicted.mag,
+        "band": response.name,
+        "mag_error": np.hypot(predicted.error, variable),
+        "mag_source": pa.array(predicted.told).take(
+            pa.array(predicted.code, mask=np.isnan(predicted.mag))
+        ),
+        "catalog_mag": floats_of(stars, "mag"),
+        "catalog_band": band,
+        "quality_flags": stars["quality_flags"].to_numpy() | predicted.flags(),
+    }
+    known = np.isfinite(predicted.mag)
+    numbers = np.bincount(predicted.code[known], minlength=len(predicted.told)).tolist()
+    counts = {name: n for name, n in sorted(zip(predicted.told, numbers, strict=True)) if n}
+    outside = int(np.count_nonzero(predicted.is_outside & known))
+    return InBand(with_columns(stars, columns), response, band, counts, outside, best)
+
+
+def other_of(
+    counterparts: pa.Table, rows: NDArray[np.int64], source: str, response: Response
+) -> Other:
+    """Return what the counterparts of stars, in the order of ``rows``, say of their magnitudes."""
+    found, _ = _predicted(counterparts, source, response)
+    return Other(source, rows, found.prediction, found.code, tuple(found.told))
+
+
+def _predicted(
+    stars: pa.Table, source: str, response: Response
+) -> tuple[_Predicted, Relation | None]:
+    """Return magnitudes without variability, and the relation that is the most exact."""
+    band = _only(stars, "band") or ""
+    predicted = _Predicted(len(stars))
+    if not len(stars):
+        return predicted, None
+    if band not in shipped_names():
+        raise ConfigError(
+            f"catalog.band: the passband of {source} {band!r} is unknown, so it tells nothing of a "
+            "sensor's band; choose another, such as J, H or Ks of 2mass",
+            key="catalog.band",
+            value=band,
+        )
+    mags, colours = _magnitudes(stars, band), _colours(stars)
+    best: Relation | None = None
+    for made in relations_of(list(mags), list(colours), response):
+        text, base = "-".join(made.colour), mags[made.base]
+        error = _error(stars, made.base, base, source, is_own=made.base == band)
+        colour_error = np.hypot(*(band_error(one, base) for one in made.colour))
+        found = made.predict(base, colours[text], error, colour_error)
+        took = predicted.take(found, f"{made.base}, {text}", found.has_colour)
+        best = best or (made if took else None)
+    mag, error = mags[band], _error(stars, band, mags[band], source, is_own=True)
+    if predicted.is_open.any() and stars["spectral_type"].null_count < len(stars):
+        types = [text or "" for text in stars["spectral_type"].to_pylist()]
+        found = predict_by_type(band, response, mag, types, error)
+        predicted.take(found, f"{band}, spectral type", found.has_colour)
+    if predicted.is_open.all():
+        raise ConfigError(
+            f"camera.response: no star of {source} has a colour or a spectral type, so nothing "
+            "tells what a sensor sees of them; choose a catalog with colours: gaia, hipparcos, "
+            "tycho2 or 2mass",
+            key="camera.response",
+            value=source,
+        )
+    found = predict_by_type(band, response, mag, [""] * len(stars), error)
+    predicted.take(found, f"{band}{ALONE}", np.ones(len(stars), dtype=bool))
+    return predicted, best
+
+
+class _Predicted:
+    """The magnitudes of stars, filled in from one relation after the other."""
+
+    def __init__(self, count: int) -> None:
+        self.mag, self.error = np.full(count, np.nan), np.full(count, np.nan)
+        self.is_outside = np.zeros(count, dtype=bool)
+        # How each was made, as a place in a list: a text a star would take half a kilobyte.
+        self.code, self.told = np.zeros(count, dtype=np.int32), [""]
+
+    @property
+    def is_open(self) -> Mask:
+        """Whether a star has no magnitude yet."""
+        return np.asarray(self.code == 0)
+
+    @property
+    def is_alone(self) -> Mask:
+        """Whether a star has its magnitude without a colour or a type."""
+        parts = (text.split(" + ") for text in self.told)
+        return np.array([all(part.endswith(ALONE) for part in own) for own in parts])[self.code]
+
+    @property
+    def prediction(self) -> Prediction:
+        """The same as a prediction."""
+        has_colour = ~self.is_open & ~self.is_alone
+        return Prediction(self.mag, self.error, self.is_outside, has_colour)
+
+    def _code_of(self, text: str) -> int:
+        if text not in self.told:
+            self.told.append(text)
+        return self.told.index(text)
+
+    def take(self, found: Prediction, source: str, where: Mask) -> bool:
+        """Fill in the stars that have no magnitude yet; whether there were any."""
+        rows = self.is_open & where & np.isfinite(found.mag)
+        if not rows.any():
+            return False
+        self.mag[rows], self.error[rows] = found.mag[rows], found.error_mag[rows]
+        self.code[rows], self.is_outside[rows] = self._code_of(source), found.is_outside[rows]
+        return True
+
+    def mix(self, other: Other) -> None:
+        """Average with what another catalog says of some stars."""
+        rows, its, whole = other.rows, other.prediction, self.prediction
+        own = Prediction(*(one[rows] for one in vars(whole).values()))
+        both = combined([own, its])
+        ours, theirs = np.isfinite(own.mag), np.isfinite(its.mag)
+        # One that is outside of its relation does not count beside one that is inside.
+        only_theirs = theirs & (~ours | (own.is_outside & ~its.is_outside))
+        only_ours = ~theirs | (ours & its.is_outside & ~own.is_outside)
+        ways = np.stack([self.code[rows], other.code, only_theirs, only_ours])
+        found, place = np.unique(ways, axis=1, return_inverse=True)
+        codes = []
+        for mine, its_code, is_theirs, is_ours in found.T.tolist():
+            told = f"{other.source} {other.told[its_code]}"
+            mixed = self.told[mine] if is_ours else f"{self.told[mine]} + {told}"
+            codes.append(self._code_of(told if is_theirs else mixed))
+        self.code[rows] = np.array(codes, dtype=np.int32)[place.ravel()] if codes else 0
+        self.mag[rows], self.error[rows] = both.mag, both.error_mag
+        self.is_outside[rows] = both.is_outside
+
+    def flags(self) -> Array:
+        """Return the quality bits that the magnitudes deserve."""
+        outside, estimated = int(Quality.COLOUR_OUT_OF_RANGE), int(Quality.ESTIMATED_MAGNITUDE)
+        bits = np.where(self.is_outside, outside, 0) | np.where(self.is_alone, estimated, 0)
+        return np.asarray(bits, dtype=np.int32)
+
+
+def _only(stars: pa.Table, name: str) -> str | None:
+    """Return the one text of a column that has the same in every row."""
+    known = pc.drop_null(stars[name])
+    return str(known[0]) if len(known) else None
+
+
+def _colours(stars: pa.Table) -> dict[str, Array]:
+    """Return the colours of a star table whose two bands are known."""
+    found = {}
+    for name in ("colour", "second_colour"):
+        text = _only(stars, f"{name}_bands")
+        if text and colour_of(text):
+            found[text] = floats_of(stars, f"{name}_mag")
+    return found
+
+
+def _magnitudes(stars: pa.Table, band: str) -> dict[str, Array]:
+    """Return the magnitudes in the bands that a star table has, or that its colours give."""
+    found = {band: floats_of(stars, "mag")}
+    second = _only(stars, "second_band")
+    if second in shipped_names():
+        found[str(second)] = floats_of(stars, "second_mag")
+    for text, colour in _colours(stars).items():
+        first, last = colour_of(text) or ("", "")
+        if first in found and last not in found:
+            found[last] = found[first] - colour
+        elif last in found and first not in found:
+            found[first] = found[last] + colour
+    return found
+
+
+def _error(stars: pa.Table, band: str, mag: Array, source: str, *, is_own: bool) -> Array:
+    """Return the errors of magnitudes: the catalog's where it states them, else what is usual."""
+    usual = band_error(band, mag, source)
+    if not is_own:
+        return usual
+    stated = floats_of(stars, "mag_error")
+    return np.where(np.isfinite(stated), stated, usual)

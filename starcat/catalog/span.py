@@ -1,0 +1,115 @@
+"""The years of a mission: how far stars drift from their places, and how well those are known.
+
+A database has the positions of one epoch, the middle of its span. At both ends a star is elsewhere
+by its motion, all year round by its parallax, and less certain by the error of its motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from starcat.arrays import Array
+from starcat.catalog.proper_motion import Motion, propagate_in_space
+from starcat.catalog.stars import Columns, directions_of, floats_of, with_columns
+from starcat.geometry.sphere import separation
+
+_NAMED = 5  # of the stars that drift most
+_AXES = ("ra", "dec")
+
+
+def with_span(stars: pa.Table, span_jyear: tuple[float, float]) -> pa.Table:
+    """Return stars at the middle of a span with their errors at its ends and their drift."""
+    begin, end = span_jyear
+    columns: Columns = {
+        "position_error_begin_arcsec": position_errors(stars, begin),
+        "position_error_end_arcsec": position_errors(stars, end),
+    }
+    if end > begin:
+        columns["drift_arcsec"] = drifts(stars, 0.5 * (end - begin))
+    return with_columns(stars, columns)
+
+
+def position_errors(stars: pa.Table, jyear: float) -> Array:
+    """Return the standard error of each position in a year, arcsec; NaN where none is known.
+
+    Around its central epoch position and motion are independent, so that variances add up.
+    """
+    axes = []
+    for axis in _AXES:
+        years = jyear - floats_of(stars, f"{axis}_central_jyear")
+        grown = np.nan_to_num(years * floats_of(stars, f"pm_{axis}_error_mas_yr"))
+        axes.append(np.hypot(floats_of(stars, f"{axis}_error_mas"), grown))
+    return np.fmax(*axes) / 1000.0
+
+
+def drifts(stars: pa.Table, years: float) -> Array:
+    """Return how far stars are from their places within some years before and after, arcsec.
+
+    That is the larger of the ways to both ends and the annual parallax; NaN where the motion of a
+    star is not known.
+    """
+    pm = [floats_of(stars, name) for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")]
+    motion = Motion(floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg"), *pm)
+    parallax = floats_of(stars, "parallax_mas")
+    velocity, epoch = floats_of(stars, "radial_velocity_km_s"), floats_of(stars, "epoch_jyear")
+    here = directions_of(stars)
+    ways = [
+        separation(here, propagate_in_space(motion, parallax, velocity, epoch, epoch + elapsed)[1])
+        for elapsed in (-years, years)
+    ]
+    annual = np.nan_to_num(np.fmax(parallax, 0.0)) / 1000.0
+    return np.where(np.isnan(pm[0] + pm[1]), np.nan, np.degrees(np.fmax(*ways)) * 3600.0 + annual)
+
+
+@dataclass(frozen=True)
+class Validity:
+    """From when to when a database holds, and which stars hold least."""
+
+    begin_jyear: float
+    end_jyear: float
+    stars_without_motion: int  # how far they drift is not known
+    median_drift_arcsec: float  # of the guide stars whose motion is known
+    worst_1_percent_arcsec: float
+    worst: tuple[dict[str, Any], ...]  # designation and drift of those that drift most
+    reissued_worst_arcsec: float  # the largest drift if a release came at the middle
+    largest_error_arcsec: float | None  # standard error of a position at the worse end
+
+    def __str__(self) -> str:
+        """Return all in a sentence."""
+        named = ", ".join(f"{one['designation']} {one['drift_arcsec']:.2f}" for one in self.worst)
+        unknown = f"; {self.stars_without_motion:,} stars have no motion"
+        return (
+            f"positions hold from J{self.begin_jyear:g} to J{self.end_jyear:g}: the median star "
+            f"drifts {self.median_drift_arcsec:.2f} arcsec from its place, the worst 1 % "
+            f"{self.worst_1_percent_arcsec:.2f} or more ({named}); a release at the middle would "
+            f"leave {self.reissued_worst_arcsec:.2f} at the most"
+            + (unknown if self.stars_without_motion else "")
+        )
+
+
+def validity(stars: pa.Table, span_jyear: tuple[float, float]) -> Validity | None:
+    """Return how long guide stars hold; None without a span, or where no motion is known."""
+    begin, end = span_jyear
+    drift = floats_of(stars, "drift_arcsec")
+    known = np.flatnonzero(~np.isnan(drift))
+    if begin == end or not len(known):
+        return None
+    worst = known[np.lexsort((stars["star_id"].to_numpy()[known], -drift[known]))][:_NAMED]
+    error = np.fmax(*(position_errors(stars, year) for year in span_jyear))
+    return Validity(
+        begin,
+        end,
+        len(stars) - len(known),
+        float(np.median(drift[known])),
+        float(np.quantile(drift[known], 0.99)),
+        tuple(
+            {"designation": str(stars["designation"][int(row)]), "drift_arcsec": float(drift[row])}
+            for row in worst
+        ),
+        float(np.nanmax(drifts(stars, 0.25 * (end - begin)))),
+        None if np.isnan(error).all() else float(np.nanmax(error)),
+    )

@@ -1,0 +1,100 @@
+"""The command that learns from identified frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcat.cli import options as opt
+from starcat.cli.console import print_json, print_table, say
+
+if TYPE_CHECKING:
+    from starcat.calibration.lessons import Learnt
+
+app = typer.Typer()
+
+
+@app.command()
+def learn(
+    database: Annotated[
+        Path, typer.Argument(help="The folder <name>-<version> they were identified with.")
+    ],
+    results: Annotated[
+        list[Path],
+        typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
+    ],
+    output: Annotated[
+        Path | None, opt.to_file("Where the section of a spec for a patch release goes (TOML).")
+    ] = None,
+    stars: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Measured magnitude and residuals of each star: .csv, .parquet …"
+        ),
+    ] = None,
+    by_frame: Annotated[
+        bool,
+        typer.Option("--by-frame", help="An offset for each frame, as where exposures differ."),
+    ] = False,
+    min_frames: Annotated[
+        int, typer.Option(min=2, max=1000, help="Fewest frames that a star is judged from.")
+    ] = 3,
+    json: opt.Json = False,
+) -> None:
+    """Learn zero point, colour term and the stars to distrust from identified frames.
+
+    Example: starcat learn dist/gaia-12deg-1.0.0 answers.ndjson -o observed.toml
+    """
+    from starcat.calibration.lessons import content_of, learn_files, star_table, write_observed
+    from starcat.exchange.formats import format_of
+    from starcat.exchange.writers import write_batches
+
+    form = None if stars is None else format_of(stars)
+    found = learn_files(database, results, by_frame=by_frame, min_frames=min_frames)
+    if output is not None:
+        write_observed(found, output)
+    if stars is not None and form is not None:
+        write_batches(star_table(found).to_reader(), stars, form)
+    if json:
+        print_json(content_of(found))
+    else:
+        _print_learnt(found)
+    for path in filter(None, (output, stars)):
+        say(f"written: {path}")
+
+
+def _print_learnt(found: Learnt) -> None:
+    from starcat.calibration.lessons import content_of
+
+    told, lesson = content_of(found), found.lesson
+    rows = [_term("zero point, mag", told["zero_point_mag"], told["zero_point_error_mag"])]
+    if told["colour_term"] is not None:
+        name = f"colour term, {told['colour_bands']}"
+        rows.append(_term(name, told["colour_term"], told["colour_term_error"]))
+    rows += [
+        ("noise of a magnitude, mag", f"{told['noise_mag']:.3f}", ""),
+        ("stars differ beside it by, mag", f"{told['star_scatter_mag']:.3f}", ""),
+        ("noise of a place, arcsec an axis", f"{told['noise_arcsec']:.2f}", ""),
+        ("stars differ beside it by, arcsec", f"{told['star_scatter_arcsec']:.2f}", ""),
+    ]
+    if told["limit_mag"] is not None:
+        rows.append(("stars are missed from, measured mag", f"{told['limit_mag']:.2f}", ""))
+    print_table(
+        f"{found.n_identified} of {found.n_frames} frames, {lesson.n_sightings:,} measured "
+        "magnitudes",
+        ("", "value", "error"),
+        rows,
+        numbers=(1, 2),
+    )
+    print_table(
+        f"Stars to distrust: {len(lesson.distrusted)} of {lesson.n_judged:,}; chance names one "
+        f"with a probability of {told['chance']:g}",
+        ("star", "verdict", "evidence"),
+        [(one["star"], one["verdict"], one["evidence"]) for one in told["distrusted"]],
+    )
+
+
+def _term(name: str, value: float, error: float) -> tuple[str, str, str]:
+    return name, f"{value:+.4f}", f"{error:.4f}"

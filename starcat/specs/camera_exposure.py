@@ -1,0 +1,148 @@
+"""The section ``[camera.exposure]`` of a spec: light and noise, and the limits that follow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field, ValidationError, model_validator
+
+from starcat.bands.exposure import Exposure, photons_s_mm2, zero_point_e_s
+from starcat.bands.response import Response
+from starcat.specs.camera_response import CameraResponse
+from starcat.specs.product_sections import Section
+
+USUAL_SIGNAL_TO_NOISE = 5.0
+"""Of a star that is found and has a useful centroid; proposed where the spec asks for none."""
+
+SAME_MAG = 0.005
+"""Limits are rounded to hundredths of a magnitude."""
+
+NEEDED = (
+    *("aperture_mm", "quantum_efficiency", "exposure_s", "read_noise_e", "full_well_e"),
+    "psf_sigma_px",
+)
+
+
+def _size(description: str, example: float, *, most: float = 1e9, default: Any = None) -> Any:
+    return Field(default, ge=0.0, le=most, description=description, examples=[example])
+
+
+class CameraExposure(Section):
+    """Light and noise of a frame; with them the limits can be asked for as signal-to-noise."""
+
+    aperture_mm: float | None = _size("diameter of the aperture", 20.0, most=1e5)
+    quantum_efficiency: float | None = _size(
+        "electrons per photon at the peak of the response, transmission of the optics included",
+        0.5,
+        most=1.0,
+    )
+    exposure_s: float | None = _size("exposure in seconds", 0.1, most=1e5)
+    read_noise_e: float | None = _size("read noise, electrons", 8.0)
+    full_well_e: float | None = _size("electrons that a pixel holds", 50_000.0)
+    psf_sigma_px: float | None = Field(
+        None,
+        ge=0.1,
+        le=100.0,
+        description="standard deviation of the spot of a star",
+        examples=[0.8],
+    )
+    dark_e_s: float = _size("dark current of a pixel, electrons/s", 50.0, default=0.0)
+    sky_e_s: float = _size("stray light and sky in a pixel, electrons/s", 100.0, default=0.0)
+    min_snr: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e4,
+        description="makes selection.faint_limit_mag the magnitude of this signal-to-noise",
+        examples=[5.0],
+    )
+    reject_saturated: bool = Field(
+        False, description="makes selection.bright_limit_mag the magnitude that fills a pixel"
+    )
+
+    @model_validator(mode="after")
+    def _whole_or_absent(self) -> CameraExposure:
+        missing = [name for name in NEEDED if not getattr(self, name)]
+        if self == type(self).model_construct() or not missing:
+            return self
+        raise ValueError(
+            f"{', '.join(missing)} missing or 0; electrons follow from {', '.join(NEEDED)} together"
+        )
+
+    def exposure(self, response: Response | None) -> Exposure | None:
+        """Return the exposure in the band of a response, or of the catalog; None where absent."""
+        if self.aperture_mm is None or self.quantum_efficiency is None or self.exposure_s is None:
+            return None
+        photons = photons_s_mm2(response)
+        rate = zero_point_e_s(self.aperture_mm, self.quantum_efficiency, photons)
+        return Exposure(
+            rate * self.exposure_s,
+            (self.dark_e_s + self.sky_e_s) * self.exposure_s,
+            self.read_noise_e or 0.0,
+            self.psf_sigma_px or 1.0,
+            self.full_well_e or 0.0,
+        )
+
+    def limits(self, response: Response | None) -> dict[str, float]:
+        """Return the limits of the selection that are asked for."""
+        exposure, found = self.exposure(response), {}
+        if exposure is not None and self.min_snr is not None:
+            found["faint_limit_mag"] = round(exposure.limit_mag(self.min_snr), 2)
+        if exposure is not None and self.reject_saturated:
+            found["bright_limit_mag"] = round(exposure.saturation_mag, 2)
+        return found
+
+
+def with_limits(content: Any) -> Any:
+    """Return the content of a spec with the limits that its exposure asks for filled in."""
+    if not isinstance(content, dict) or not isinstance(content.get("camera"), dict):
+        return content
+    camera, selection = content["camera"], content.get("selection", {})
+    if not isinstance(camera.get("exposure"), dict) or not isinstance(selection, dict):
+        return content
+    try:
+        response = CameraResponse.model_validate(camera.get("response", {})).response()
+        wanted = CameraExposure.model_validate(camera["exposure"]).limits(response)
+    except ValidationError:
+        return content  # which is told, with its key, when the sections are checked
+    return {**content, "selection": {**wanted, **selection}} if wanted else content
+
+
+def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | None:
+    """Return what is wrong where a stated limit is not the one that the exposure gives."""
+    for key, mag in wanted.items():
+        if abs(stated[key] - mag) > SAME_MAG:
+            asked = "min_snr" if key == "faint_limit_mag" else "reject_saturated"
+            return (
+                f"selection.{key} is {stated[key]:g}, and camera.exposure.{asked} makes it "
+                f"{mag:g}; leave one of them out"
+            )
+    return None
+
+
+def exposure_proposal(section: CameraExposure, response: Response | None) -> tuple[str, ...]:
+    """Return the limits that an exposure proposes, where the spec does not ask for them."""
+    exposure = section.exposure(response)
+    if exposure is None or (section.min_snr is not None and section.reject_saturated):
+        return ()
+    return (
+        f"in this exposure a star of {exposure.limit_mag(USUAL_SIGNAL_TO_NOISE):.2f} mag has a "
+        f"signal-to-noise of {USUAL_SIGNAL_TO_NOISE:g}, and one of {exposure.saturation_mag:.2f} "
+        "mag fills a pixel; camera.exposure.min_snr and reject_saturated make them the limits",
+    )
+
+
+def exposure_notes(
+    section: CameraExposure, response: Response | None, faint_limit_mag: float
+) -> tuple[str, ...]:
+    """Return what the exposure says of a limit that is stated as a magnitude and beyond it."""
+    exposure = section.exposure(response)
+    if exposure is None or section.min_snr is not None:
+        return ()
+    reach = exposure.limit_mag(USUAL_SIGNAL_TO_NOISE)
+    if faint_limit_mag <= reach:
+        return ()
+    return (
+        f"selection.faint_limit_mag {faint_limit_mag:g} is beyond the sensor: a star of "
+        f"{reach:.2f} mag has a signal-to-noise of {USUAL_SIGNAL_TO_NOISE:g}. "
+        f"camera.exposure.min_snr = {USUAL_SIGNAL_TO_NOISE:g} instead of the limit makes it that",
+    )

@@ -1,0 +1,322 @@
+"""What flew comes back: terms of a sensor, stars to distrust, and a patch release without them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from dataclasses import replace
+
+import flight
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from starcat.artifact.reader import open_artifact
+from starcat.calibration.answers import Sightings, SkyStars, read_answers
+from starcat.calibration.learn import learn
+from starcat.calibration.lessons import learn_files, observed_toml, sky_stars
+from starcat.errors import BuildError, CalibrationError, ConfigError
+from starcat.geometry.camera import Camera
+from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.build import build
+from starcat.simulation.simulate import Noise
+from starcat.specs.reading import read_spec, spec_from_dict
+
+STARS = 2500
+
+
+def told(verdicts):
+    return {one.row: one.verdict for one in verdicts}
+
+
+def sky(database, generator):
+    """The stars of a database with colours of their own, a few without."""
+    colour = generator.uniform(-0.3, 2.5, len(database.mag))
+    colour[::50] = np.nan
+    names = tuple(f"star {number}" for number in database.star_id)
+    return SkyStars(
+        database.name, database.star_id, names, database.directions, database.mag, colour
+    )
+
+
+def identified(database, frames, path):
+    """A file of the answers to frames."""
+    matcher = Matcher(database)
+    with path.open("w") as file:
+        for frame in frames:
+            result = matcher.identify(frame.centroids_px, database.camera, magnitudes=frame.mag)
+            file.write(json.dumps(FrameAnswer(frame, result).content()) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def flown(sky_of, random_directions, tmp_path_factory):
+    """A flight of 500 frames: the stars, what was altered, and the answers."""
+    database = sky_of(random_directions(STARS, 5), Camera(2048, 2048, fov_x_deg=20.0))
+    stars = sky(database, np.random.default_rng(8))
+    taken = flight.fly(stars, database.camera, 500, 1)
+    path = identified(database, taken.frames, tmp_path_factory.mktemp("flown") / "answers.ndjson")
+    return stars, taken.altered, path
+
+
+@pytest.fixture(scope="module")
+def answers(flown):
+    return read_answers([flown[2]], flown[0])
+
+
+def test_500_frames_give_back_the_terms_and_every_altered_star_and_no_other(flown, answers):
+    stars, altered, _ = flown
+    assert (len(answers.names), answers.n_frames) == (500, 500)
+    lesson = learn(answers.sightings, stars, 500)
+    assert lesson.terms.zero_point_mag == pytest.approx(flight.ZERO_POINT, abs=0.02)
+    assert lesson.terms.colour_term == pytest.approx(flight.COLOUR_TERM, abs=0.02)
+    assert told(lesson.distrusted) == altered
+    for row, kind in altered.items():
+        if kind == "too_faint":
+            assert lesson.records.mag_residual[row] == pytest.approx(0.8, abs=0.2)
+        if kind == "moved":
+            assert np.hypot(*lesson.records.offset_arcsec[row]) == pytest.approx(30.0, abs=8.0)
+
+
+# Pure arrays --------------------------------------------------------------------------------
+
+
+def plain(seed, stars=800, per_star=8, frames=100, noise_mag=0.1, noise_arcsec=5.0):
+    """Sightings of stars as they should be, and these stars."""
+    generator = np.random.default_rng(seed)
+    count = stars * per_star
+    frame = np.sort(generator.integers(0, frames, count))
+    star = generator.permutation(np.repeat(np.arange(stars), per_star))
+    colour, mag = generator.uniform(0.0, 2.0, stars), generator.uniform(2.0, 6.0, stars)
+    measured = mag[star] + 0.2 + 0.3 * colour[star] + generator.normal(0.0, noise_mag, count)
+    known = SkyStars("x", np.arange(stars), ("",) * stars, np.zeros((stars, 3)), mag, colour)
+    offset = generator.normal(0.0, noise_arcsec, (count, 2))
+    return Sightings(frame, star, np.ones(count, dtype=bool), measured, offset), known
+
+
+def unseen(seen, which):
+    """The same with some stars not seen."""
+    blank = np.where(which, np.nan, 1.0)
+    return replace(
+        seen,
+        is_seen=seen.is_seen & ~which,
+        mag=seen.mag * blank,
+        offset_arcsec=seen.offset_arcsec * blank[:, None],
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
+    seen, stars = plain(seed)
+    lesson = learn(seen, stars, 100)
+    assert lesson.distrusted == ()
+    terms = lesson.terms
+    assert abs(terms.zero_point_mag - 0.2) < 4.0 * terms.zero_point_error_mag < 0.02
+    assert abs(terms.colour_term - 0.3) < 4.0 * terms.colour_term_error < 0.02
+    np.testing.assert_allclose(lesson.mag_noise.sigma, 0.1, rtol=0.15)
+    np.testing.assert_allclose(lesson.offset_noise.sigma, 5.0, rtol=0.15)
+
+
+def test_single_wild_measurements_convict_nobody():
+    seen, stars = plain(11)
+    rows = np.array([np.flatnonzero(seen.star == star)[0] for star in range(0, 800, 20)])
+    seen.mag[rows] += 3.0
+    seen.offset_arcsec[rows] += 100.0
+    lesson = learn(seen, stars, 100)
+    assert lesson.distrusted == ()
+    assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.01)
+
+
+def test_what_all_stars_are_off_by_convicts_nobody():
+    seen, stars = plain(12)
+    own = np.random.default_rng(12)
+    seen = replace(
+        seen,
+        mag=seen.mag + own.normal(0.0, 0.2, len(stars))[seen.star],
+        offset_arcsec=seen.offset_arcsec + own.normal(0.0, 8.0, (len(stars), 2))[seen.star],
+    )
+    lesson = learn(seen, stars, 100)
+    assert lesson.distrusted == ()
+    assert lesson.mag_noise.of_stars == pytest.approx(0.2, rel=0.15)
+    assert lesson.offset_noise.of_stars == pytest.approx(8.0, rel=0.15)
+
+
+def test_frames_of_their_own_exposures_need_an_offset_each():
+    seen, stars = plain(13)
+    offset = np.random.default_rng(13).normal(0.0, 0.7, 100)
+    seen = replace(seen, mag=seen.mag + offset[seen.frame])
+    terms = learn(seen, stars, 100, by_frame=True).terms
+    assert terms.colour_term == pytest.approx(0.3, abs=0.02)
+    found = terms.zero_point_mag + terms.frame_offset_mag
+    assert np.abs(found - 0.2 - offset).max() < 0.1
+    assert terms.zero_point_error_mag > 0.05
+    assert learn(seen, stars, 100).terms.colour_term_error > terms.colour_term_error
+
+
+def test_a_limit_neither_bends_the_terms_nor_makes_stars_missing():
+    seen, stars = plain(14, per_star=12)
+    seen = unseen(seen, seen.mag > 5.5)
+    lesson = learn(seen, stars, 100)
+    assert lesson.distrusted == ()
+    assert lesson.limit_mag == pytest.approx(5.4, abs=0.2)
+    assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.02)
+
+
+def test_frames_that_are_half_covered_make_no_star_missing():
+    seen, stars = plain(15, per_star=12)
+    covered = (seen.frame < 20) & (np.random.default_rng(15).random(len(seen)) < 0.5)
+    assert learn(unseen(seen, covered), stars, 100).distrusted == ()
+    gone = seen.star == 33
+    lesson = learn(unseen(seen, covered | gone), stars, 100)
+    assert told(lesson.distrusted) == {33: "missing"}
+    assert lesson.records.n_seen[33] == 0
+    assert lesson.records.n_missed[33] == lesson.records.n_expected[33] >= 8
+
+
+def test_a_double_scatters_in_place():
+    seen, stars = plain(16)
+    rows = seen.star == 5
+    seen.offset_arcsec[rows] *= 8.0
+    assert told(learn(seen, stars, 100).distrusted) == {5: "double"}
+
+
+def test_without_colours_there_is_a_zero_point_only():
+    seen, stars = plain(17)
+    terms = learn(seen, replace(stars, colour=np.full(len(stars), np.nan)), 100).terms
+    assert terms.colour_term is None
+    assert terms.zero_point_mag == pytest.approx(0.5, abs=0.03)  # 0.3 times the mean colour more
+
+
+def test_too_few_stars_teach_nothing():
+    seen, stars = plain(18, stars=12)
+    with pytest.raises(CalibrationError, match="12 stars of 100 identified frames"):
+        learn(seen, stars, 100)
+
+
+# Files and commands -------------------------------------------------------------------------
+
+
+def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, tmp_path):
+    database = Matcher.open(small_artifact).database
+    stars = SkyStars(
+        database.name, database.star_id, (), database.directions, database.mag,
+        np.zeros(len(database.mag)),
+    )  # fmt: skip
+    frames = flight.fly(stars, database.camera, 120, 3, Noise(0.1, noise_mag=0.05)).frames
+    content = [
+        {"centroids_px": one.centroids_px.tolist(), "mag": one.mag.tolist()} for one in frames
+    ]
+    (tmp_path / "frames.json").write_text(json.dumps(content))
+    identify = ["identify", small_artifact, tmp_path / "frames.json", "--ndjson"]
+    path, section, table = (tmp_path / name for name in ("a.ndjson", "o.toml", "s.csv"))
+    path.write_text(starcat(identify).out)
+    command = ["learn", small_artifact, path, "-o", section, "--stars", table]
+    run = starcat(command)
+    assert run.code == 0, run.err
+    assert "zero point, mag" in run.out
+    observed = tomllib.loads(section.read_text())["selection"]["observed"]
+    assert observed["zero_point_mag"] == pytest.approx(0.2, abs=0.02)
+    assert observed["database"] == "small-1.0.0"
+    told_json = json.loads(starcat([*command, "--json"]).out)
+    assert sorted(one["star_id"] for one in told_json["distrusted"]) == sorted(
+        map(str, observed["reject"])
+    )
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert len(rows) == len(told_json["stars"]) > 100
+    assert {row["verdict"] for row in rows} >= {"too_faint", "missing"}
+
+
+def test_a_database_of_other_stars_is_refused(flown):
+    stars, _, path = flown
+    with pytest.raises(ConfigError, match=r"line 1: .* is no star of sky-1\.0\.0"):
+        read_answers([path], replace(stars, mag=stars.mag + 0.5))
+    with pytest.raises(ConfigError, match=r"identified with the database sky-1\.0\.0, this is x"):
+        read_answers([path], replace(stars, name="x-1.0.0"))
+
+
+OBSERVED = {"reject": [1, 2], "zero_point_mag": 0.2}
+
+
+def test_the_section_is_recorded_only_where_it_is_said(small_spec):
+    content = tomllib.loads(small_spec)
+    assert "observed" not in spec_from_dict(content, "x").recorded()["selection"]
+    content["selection"]["observed"] = OBSERVED
+    assert spec_from_dict(content, "x").recorded()["selection"]["observed"]["reject"] == [1, 2]
+
+
+def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file, tmp_path):
+    content = tomllib.loads(small_spec)
+    content["selection"]["observed"] = OBSERVED
+    made = build(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
+    rejected = pq.read_table(made.folder / "rejected.parquet", columns=["star_id", "reason"])
+    reasons = dict(zip(*rejected.to_pydict().values(), strict=True))
+    assert {number for number, why in reasons.items() if why == "distrusted"} == {1, 2}
+
+
+@pytest.mark.parametrize(
+    ("observed", "words"),
+    [
+        ({"reject": [1, 999_999]}, "reject: 999999: 1 of 2 are the star_id of no star"),
+        ({"colour_term": 0.3, "colour_bands": "BP-RP"}, "for the colour BP-RP; the stars have"),
+    ],
+)
+def test_a_section_of_another_catalog_is_refused(observed, words, small_spec, sao_file, tmp_path):
+    content = tomllib.loads(small_spec)
+    content["selection"]["observed"] = observed
+    with pytest.raises(BuildError, match=words):
+        build(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
+
+
+FLOWN = """\
+name = "flown"
+version = "1.0.0"
+epoch_jyear = 2026.0
+catalog = { source = "gaia", read_limit_mag = 6.5 }
+camera = { width_px = 2048, height_px = 2048, fov_x_deg = 20.0 }
+boresights = { count = 1000, brightest = 6 }
+self_test = { frames = 20, min_identified = 0.8 }
+selection.faint_limit_mag = 5.5
+"""
+
+
+def flown_with(folder, seed, path):
+    """What is learnt of a flight with a database, and what was altered, by star_id."""
+    stars, _ = sky_stars(open_artifact(folder))
+    matcher_stars = Matcher.open(folder).database
+    table = open_artifact(folder).stars
+    own = np.array(table["catalog_mag"].to_pylist(), dtype=float)
+    sky = replace(stars, mag=np.where(np.isnan(own), stars.mag, own))
+    taken = flight.fly(sky, matcher_stars.camera, 500, seed)
+    learnt = learn_files(folder, [identified(matcher_stars, taken.frames, path)])
+    return learnt, taken.altered, {int(stars.star_id[row]) for row in taken.altered}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_path):
+    (tmp_path / "spec.toml").write_text(FLOWN)
+    first = build(read_spec(tmp_path / "spec.toml"), {}, tmp_path / "dist").folder
+    learnt, altered, numbers = flown_with(first, 2, tmp_path / "answers.ndjson")
+    assert told(learnt.lesson.distrusted) == altered
+    assert set(learnt.observed.reject) == numbers
+    (tmp_path / "patch.toml").write_text(FLOWN.replace("1.0.0", "1.0.1") + observed_toml(learnt))
+    patch = build(read_spec(tmp_path / "patch.toml"), {}, tmp_path / "dist").folder
+    table = open_artifact(patch).stars
+    assert not numbers & set(table["star_id"].to_pylist())
+    mag, own, colour = (
+        np.array(table[name].to_pylist(), dtype=float)
+        for name in ("mag", "catalog_mag", "colour_mag")
+    )
+    observed, known = learnt.observed, np.isfinite(colour)
+    expected = observed.colour_term * (colour - observed.reference_colour_mag)
+    np.testing.assert_allclose((mag - own)[known], expected[known], atol=1e-9)
+    assert (mag == own)[~known].all()
+    # What flew with the patch says that its colours are right, and adds to the section.
+    again, altered, more = flown_with(patch, 3, tmp_path / "answers.ndjson")
+    assert told(again.lesson.distrusted) == altered
+    assert set(again.observed.reject) == numbers | more
+    assert abs(again.lesson.terms.colour_term) < 0.01
+    assert again.observed.colour_term == pytest.approx(flight.COLOUR_TERM, abs=0.02)
+    assert again.observed.zero_point_mag == pytest.approx(flight.ZERO_POINT, abs=0.02)

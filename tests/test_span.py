@@ -1,0 +1,206 @@
+"""A mission's years: where stars are at both ends, and how well that is known."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+import pyarrow as pa
+import pytest
+from archives import record
+
+from starcat.artifact.verify import check_artifact
+from starcat.catalog.ingest import ingest
+from starcat.catalog.proper_motion import MAS, Motion, propagate_in_space
+from starcat.catalog.selection import select_guide_stars
+from starcat.catalog.source import data_source
+from starcat.catalog.span import drifts, position_errors, validity, with_span
+from starcat.catalog.stars import directions_of, floats_of, table_from_columns
+from starcat.errors import ConfigError
+from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.build import build
+from starcat.pipeline.rebuild import rebuild
+from starcat.specs.build_spec import Selection
+from starcat.specs.reading import read_spec
+
+SPAN = (2027.0, 2042.0)
+MICROARCSEC = np.radians(1e-6 / 3600.0)
+
+# HIP, V, right ascension, declination, parallax, proper motions: hip_main at J1991.25.
+FAST: dict[str, dict[str, Any]] = {
+    "Barnard's star": {
+        "hip": 87937, "v_mag": 9.54, "ra_deg": "269.45402305", "de_deg": "+04.66828815",
+        "plx": 549.01, "pm_ra": -797.84, "pm_de": 10326.93, "e_ra": 0.93, "e_de": 1.16,
+        "e_pm_ra": 1.61, "e_pm_de": 1.29,
+    },
+    "61 Cygni A": {
+        "hip": 104214, "v_mag": 5.20, "ra_deg": "316.71181046", "de_deg": "+38.74149446",
+        "plx": 287.13, "pm_ra": 4155.10, "pm_de": 3258.90,
+    },
+    "61 Cygni B": {
+        "hip": 104217, "v_mag": 6.05, "ra_deg": "316.71747967", "de_deg": "+38.73441392",
+        "plx": 285.42, "pm_ra": 4107.40, "pm_de": 3143.72,
+    },
+    "Arcturus": {
+        "hip": 69673, "v_mag": -0.05, "ra_deg": "213.91811403", "de_deg": "+19.18726997",
+        "plx": 88.85, "pm_ra": -1093.45, "pm_de": -1999.40,
+    },
+    "Polaris": {
+        "hip": 11767, "v_mag": 1.97, "ra_deg": "037.94614689", "de_deg": "+89.26413805",
+        "plx": 7.56, "pm_ra": 44.22, "pm_de": -11.74,
+    },
+}  # fmt: skip
+
+
+@pytest.fixture
+def fast_stars(tmp_path: Path) -> pa.Table:
+    layout = data_source("hipparcos").files[0]
+    path = tmp_path / "hip_main.dat"
+    path.write_bytes(b"".join(record(layout, {"catalog": "H", **one}) for one in FAST.values()))
+    return ingest("hipparcos", [path], epoch_jyear=sum(SPAN) / 2).stars
+
+
+@pytest.mark.parametrize("year", SPAN)
+def test_positions_at_both_ends_are_those_of_sofa(ingested, year):
+    """Genuine records, those without a parallax above 0 too, from their own epoch."""
+    own = ingested("hipparcos", "hip_main.dat.gz").stars
+    start = Motion(
+        *(floats_of(own, name) for name in ("ra_deg", "dec_deg")),
+        *(floats_of(own, name) for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")),
+    )
+    parallax, velocity = floats_of(own, "parallax_mas"), floats_of(own, "radial_velocity_km_s")
+    epoch = floats_of(own, "epoch_jyear")
+    _, found = propagate_in_space(start, parallax, velocity, epoch, np.array(year))
+    ra, dec = np.radians(start.ra_deg), np.radians(start.dec_deg)
+    pm_ra, pm_dec = start.pm_ra_cosdec_mas_yr * MAS / np.cos(dec), start.pm_dec_mas_yr * MAS
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        moved = erfa.pmsafe(
+            ra, dec, pm_ra, pm_dec, np.fmax(parallax, 0.0) / 1000.0, np.zeros(len(ra)),
+            *erfa.epj2jd(1991.25), *erfa.epj2jd(year),
+        )  # fmt: skip
+    expected = directions_from_radec(np.degrees(moved[0]), np.degrees(moved[1]))
+    assert np.nanmax(separation(found, expected)) < MICROARCSEC
+
+
+def test_the_stars_that_drift_leave_with_their_reason(fast_stars):
+    stars = with_span(fast_stars, SPAN)
+    wanted = {"faint_limit_mag": 10.0, "max_drift_arcsec": 1.0, "doubles": {"action": "keep"}}
+    selection = Selection.model_validate(wanted)
+    selected = select_guide_stars(stars, selection)
+    verdicts = (selected.rejected[name].to_pylist() for name in ("star_id", "reason"))
+    gone = dict(zip(*verdicts, strict=True))
+    assert gone == {87937: "drifts", 104214: "drifts", 104217: "drifts", 69673: "drifts"}
+    assert selected.guide_stars["star_id"].to_pylist() == [11767]
+    drift = dict(zip(stars["star_id"].to_pylist(), floats_of(stars, "drift_arcsec"), strict=True))
+    # 7.5 years of the motion that the catalog states, and the parallax.
+    assert drift[87937] == pytest.approx(7.5 * 10.3577 + 0.549, rel=1e-3)
+    assert drift[104214] == pytest.approx(7.5 * 5.2807 + 0.287, rel=1e-3)
+
+
+def test_validity_names_the_worst_and_what_a_release_would_gain(fast_stars):
+    held = validity(with_span(fast_stars, SPAN), SPAN)
+    assert held is not None
+    assert [one["designation"] for one in held.worst][:2] == ["HIP 87937", "HIP 104214"]
+    assert held.reissued_worst_arcsec == pytest.approx(3.75 * 10.3577 + 0.549, rel=1e-3)
+    assert "HIP 87937" in str(held)
+    assert validity(with_span(fast_stars, (2026.0, 2026.0)), (2026.0, 2026.0)) is None
+
+
+def test_a_star_without_a_motion_has_no_drift_and_no_error(fast_stars):
+    columns = {name: fast_stars[name] for name in fast_stars.column_names}
+    for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "ra_error_mas", "dec_error_mas"):
+        columns[name] = np.full(len(fast_stars), np.nan)
+    still = table_from_columns("stars", columns, len(fast_stars))
+    assert np.isnan(drifts(still, 7.5)).all()
+    assert with_span(still, SPAN)["position_error_end_arcsec"].null_count == len(still)
+
+
+@pytest.mark.parametrize("year", [1991.25, *SPAN])
+@pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.5])
+def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
+    """10,000 stars that have the errors of Barnard's star, moved one by one."""
+    barnard = FAST["Barnard's star"]
+    given = {"pm_ra_ra": f"{correlation:5.2f}", "pm_de_de": f"{correlation:5.2f}"}
+    path = tmp_path / "hip_main.dat"
+    path.write_bytes(
+        record(data_source("hipparcos").files[0], {"catalog": "H", **barnard, **given})
+    )
+    stars = ingest("hipparcos", [path]).stars
+    predicted = position_errors(stars, year)[0]
+
+    rng = np.random.default_rng(24)
+    place = [float(barnard["ra_deg"]), float(barnard["de_deg"])]
+    drawn = {}
+    for axis in ("ra", "de"):
+        own, motion = barnard[f"e_{axis}"], barnard[f"e_pm_{axis}"]
+        shared = correlation * own * motion
+        covariance = [[own**2, shared], [shared, motion**2]]
+        drawn[axis] = rng.multivariate_normal([0.0, barnard[f"pm_{axis}"]], covariance, 10_000).T
+    offset_deg = [drawn["ra"][0] / np.cos(np.radians(place[1])), drawn["de"][0]]
+    ra, dec = (start + off / 3.6e6 for start, off in zip(place, offset_deg, strict=True))
+    blank = np.full(10_000, barnard["plx"])
+    motion = Motion(ra, dec, drawn["ra"][1], drawn["de"][1])
+    epoch = np.full(10_000, 1991.25)
+    moved, _ = propagate_in_space(motion, blank, np.full(10_000, np.nan), epoch, np.array(year))
+    east = np.std(moved.ra_deg) * np.cos(np.radians(moved.dec_deg.mean())) * 3600.0
+    north = np.std(moved.dec_deg) * 3600.0
+    # The standard deviation of 10,000 draws is good to 0.7 %.
+    assert predicted == pytest.approx(max(east, north), rel=0.03)
+
+
+def test_a_database_of_a_span(tmp_path, sao_lines, small_spec):
+    spec_path, catalog = tmp_path / "small.toml", tmp_path / "sao.dat"
+    spec_path.write_text(small_spec)
+    catalog.write_bytes(b"".join(sao_lines))
+    spec = read_spec(spec_path, {"epoch_jyear": "[2027.0, 2042.0]"})
+    built = build(spec, {"sao": [catalog]}, tmp_path)
+    artifact = check_artifact(built.folder)
+    assert (artifact.manifest["epoch_jyear"], artifact.spec.span_jyear) == (2034.5, SPAN)
+    stars = artifact.table("stars")
+    known = ~np.isnan(floats_of(stars, "drift_arcsec"))
+    speed = np.hypot(floats_of(stars, "pm_ra_cosdec_mas_yr"), floats_of(stars, "pm_dec_mas_yr"))
+    np.testing.assert_allclose(
+        floats_of(stars, "drift_arcsec")[known], 7.5e-3 * speed[known], rtol=1e-4, atol=1e-9
+    )
+    one_year = build(read_spec(spec_path, {"epoch_jyear": "2034.5", "version": '"1.0.1"'}),
+                     {"sao": [catalog]}, tmp_path)  # fmt: skip
+    same = check_artifact(one_year.folder).table("stars")
+    np.testing.assert_array_equal(directions_of(stars), directions_of(same))
+    report = json.loads((built.folder / "report" / "report.json").read_text())
+    assert report["validity"]["end_jyear"] == 2042.0
+    assert Matcher.open(built.folder).database.epoch_jyear == 2034.5
+    assert rebuild(built.folder, {"sao": [catalog]}).is_identical
+
+
+@pytest.mark.parametrize(
+    ("epoch", "words"),
+    [
+        ("[2042.0, 2027.0]", "ends in 2027 and begins in 2042"),
+        ("[2027.0, 2027.0]", "ends in 2027 and begins in 2027"),
+        ("[2027.0]", "a list of 1"),
+        ("[2027.0, 2030.0, 2042.0]", "a list of 3"),
+        ("[2027.0, 27.0]", "found '27.0'; give a Julian year from 1800 to 2200"),
+        ('"2027"', "found '2027'; give a Julian year from 1800 to 2200"),
+        ("true", "give a Julian year"),
+        ("[nan, 2042.0]", "found 'nan'"),
+    ],
+)
+def test_what_is_no_span_is_told(tmp_path, small_spec, epoch, words):
+    path = tmp_path / "small.toml"
+    path.write_text(small_spec)
+    with pytest.raises(ConfigError, match="epoch_jyear") as raised:
+        read_spec(path, {"epoch_jyear": epoch})
+    assert words in str(raised.value)
+
+
+def test_a_tolerance_without_a_span_is_told(tmp_path, small_spec):
+    path = tmp_path / "small.toml"
+    path.write_text(small_spec)
+    with pytest.raises(ConfigError, match="give a span"):
+        read_spec(path, {"selection.max_drift_arcsec": "1.0"})
