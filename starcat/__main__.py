@@ -6,7 +6,11 @@ there is identifies, and says of the rest what is lacking.
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
+
+INTERRUPTED_CODES = (130, 143)
 
 
 def main() -> None:
@@ -17,7 +21,16 @@ def main() -> None:
         from starcat.cli.alone import run_alone
 
         sys.exit(run_alone(sys.argv[1:], lacking))
-    run()
+    try:
+        run()
+    except SystemExit as ended:
+        if ended.code in INTERRUPTED_CODES:
+            # All is cleaned up. A thread that still prints would abort what Python does at its end.
+            with suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(int(ended.code))
+        raise
 
 
 if __name__ == "__main__":

@@ -91,6 +91,7 @@ def test_a_store_with_a_limit_counts_what_it_left_out(catalogs, tmp_path):
 def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, ingested, tmp_path):
     read = ingested("hipparcos", "hip_main.dat.gz")
     some = ["star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag", "pm_ra_cosdec_mas_yr"]
+    some.append("parallax_mas")
     write_hats(read.stars.select([*some, "pm_dec_mas_yr"]), tmp_path / "theirs", "theirs", 500)
     how = {"epoch_jyear": 2026.0, "read_limit_mag": 8.0}
     found = read_catalog("hipparcos", [tmp_path / "theirs"], **how)

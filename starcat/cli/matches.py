@@ -132,7 +132,7 @@ def print_contents(
 
 
 def _print_one(content: dict[str, Any], database: str) -> None:
-    facts = {name: value for name, value in content.items() if name != "frame"}
+    facts = {name: content[name] for name in content if name not in ("frame", "database")}
     rows = [row for name, value in facts.items() for row in _rows_of_fact(name, value)]
     reasons = Counter(star["dropped"] for star in content["stars"] if "dropped" in star)
     rows += [(f"dropped, {why.replace('_', ' ')}", count) for why, count in sorted(reasons.items())]
@@ -162,7 +162,7 @@ def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
         ]
     if name.endswith("_deg"):
         return [(name, f"{value:.4f}")]
-    if value is None or isinstance(value, list):
+    if value is None or isinstance(value, list | dict):
         return []
     return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
 

@@ -93,7 +93,7 @@ def distribution_entropy(directions: Directions, cells: float) -> tuple[float, i
     >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> entropy, count = distribution_entropy(saff_kuijlaars(3000), 286)
     >>> round(entropy, 3), count
-    (0.999, 286)
+    (0.998, 284)
     """
     cell, count = equal_area_cells(directions, cells)
     if count == 1:

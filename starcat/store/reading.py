@@ -45,7 +45,10 @@ NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
 
 _HINT = f"a build reads {', '.join(NEEDED)} of a HATS catalog, and what else the stars schema names"
-_PLACE = ("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+_PLACE = (
+    *("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"),
+    *("parallax_mas", "radial_velocity_km_s"),
+)
 
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
