@@ -22,7 +22,7 @@ from served import serve
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
+pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
 WIDTHS_PX = (360, 768, 1280)
 

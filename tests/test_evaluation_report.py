@@ -293,6 +293,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     assert list(tmp_path.rglob("*.partial")) == [left]  # of a killed process; this one leaves none
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_path):
     seen: list[tuple[str, int, int | None]] = []
     run_paper(

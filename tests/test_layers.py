@@ -157,6 +157,7 @@ sys.exit(", ".join(failed) or 0)
 """Imports the rooms, each in a process that has other libraries but nothing of starcat."""
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 def test_the_modules_of_every_room_import_by_themselves():

@@ -165,6 +165,7 @@ class TestMethod:
             assert hasty(matcher).identify(frame.centroids_px).ok
             assert hasty(matcher).identify(mirrored_px).status == "no_match"
 
+    @pytest.mark.slow
     def test_random_points_are_never_identified(self, matcher):
         generator = np.random.default_rng(5)
         # The pyramids of 30 points are looked for among 4,060 triangles.

@@ -135,6 +135,7 @@ def undefined(folder: Path, *flags: str) -> set[str]:
     return called - defined - COMPILERS_OWN
 
 
+@pytest.mark.slow
 def test_the_library_calls_nothing_but_five_functions_of_libm(folder):
     if shutil.which("nm") is None:
         pytest.skip("nm is missing")
@@ -157,6 +158,7 @@ def test_the_functions_of_libm_can_be_replaced(folder, tmp_path):
     assert found == {f"my_{name}" for name in names}
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_goes_unseen(folder, made):
     program = build(folder, "flips", "flips.c", "random_sky.c")
     ran = subprocess.run([program, made["little"], "10000"], capture_output=True, text=True)

@@ -138,6 +138,7 @@ def test_pulled_files_are_copies_that_can_only_be_read(registry):
         assert not path.is_dir() or path.stat().st_mode & 0o200
 
 
+@pytest.mark.slow
 def test_an_artifact_of_the_builder_itself_in_two_versions(sao_file, small_spec, starcat):
     for version in ("1.9.0", "1.10.0"):
         Path("spec.toml").write_text(small_spec.replace("1.0.0", version))

@@ -30,6 +30,8 @@ from starcat.artifact.verify import verify_artifact
 
 Version = Callable[[str], Path]
 
+pytestmark = pytest.mark.slow
+
 WORKERS = """
 import errno, fcntl, json, os, signal, sys, time, traceback
 from pathlib import Path

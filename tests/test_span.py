@@ -168,13 +168,23 @@ def test_a_database_of_a_span(tmp_path, sao_lines, small_spec):
     np.testing.assert_allclose(
         floats_of(stars, "drift_arcsec")[known], 7.5e-3 * speed[known], rtol=1e-4, atol=1e-9
     )
+    report = json.loads((built.folder / "report" / "report.json").read_text())
+    assert report["validity"]["end_jyear"] == 2042.0
+    assert Matcher.open(built.folder).database.epoch_jyear == 2034.5
+
+
+@pytest.mark.slow
+def test_a_span_has_the_positions_of_its_middle(tmp_path, sao_lines, small_spec):
+    spec_path, catalog = tmp_path / "small.toml", tmp_path / "sao.dat"
+    spec_path.write_text(small_spec)
+    catalog.write_bytes(b"".join(sao_lines))
+    spec = read_spec(spec_path, {"epoch_jyear": "[2027.0, 2042.0]"})
+    built = build(spec, {"sao": [catalog]}, tmp_path)
+    stars = check_artifact(built.folder).table("stars")
     one_year = build(read_spec(spec_path, {"epoch_jyear": "2034.5", "version": '"1.0.1"'}),
                      {"sao": [catalog]}, tmp_path)  # fmt: skip
     same = check_artifact(one_year.folder).table("stars")
     np.testing.assert_array_equal(directions_of(stars), directions_of(same))
-    report = json.loads((built.folder / "report" / "report.json").read_text())
-    assert report["validity"]["end_jyear"] == 2042.0
-    assert Matcher.open(built.folder).database.epoch_jyear == 2034.5
     assert rebuild(built.folder, {"sao": [catalog]}).is_identical
 
 
