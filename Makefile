@@ -5,8 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
-# Libraries are compiled where they are imported: most of their modules never are.
+# Compiled by all processors afterwards: pip takes one.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
@@ -21,16 +22,19 @@ $(RUNS): pyproject.toml locks/run.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --require-hashes --no-deps --requirement locks/run.txt
 	@$(PIP) --no-deps --no-build-isolation --editable .
+	@$(COMPILE)
 	@touch $(RUNS)
 
 $(SERVED): $(RUNS) locks/service.txt
 	@echo "installing what the service needs into $(VENV) (30 MB)"
 	@$(PIP) --require-hashes --no-deps --requirement locks/service.txt
+	@$(COMPILE)
 	@touch $(SERVED)
 
 $(READY): $(RUNS) locks/dev.txt
 	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
 	@$(PIP) --require-hashes --no-deps --requirement locks/dev.txt
+	@$(COMPILE)
 	@touch $(READY)
 
 BUILT_WITH := $(BIN)/python -c 'import tomllib; \
