@@ -276,6 +276,7 @@ def ascii_only(table: pa.Table) -> pa.Table:
     return table
 
 
+@pytest.mark.slow
 @EVERY
 @given(data=st.data())
 def test_any_table_is_read_as_it_was(tmp_path_factory, file_format, data):

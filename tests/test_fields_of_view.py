@@ -204,6 +204,7 @@ def test_a_database_that_needs_magnitudes_says_so():
     assert "max_stars_per_field = 12" in told
 
 
+@pytest.mark.slow
 def test_a_failing_build_prints_its_tables_and_its_holes(starcat, tmp_path):
     options = ["--set", "camera.fov_x_deg=3", "--set", "self_test.frames=20"]
     few = ["--set", "boresights.count=1500", "--set", "products.pairs.enabled=false"]

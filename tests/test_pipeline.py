@@ -154,6 +154,7 @@ def test_a_build_without_a_result_leaves_nothing(changes, build_small, tmp_path)
 # Byte for byte ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_build_has_the_same_bytes(stars: Path, small_spec: str, tmp_path: Path) -> None:
     """Whatever the hash seed, folders, time zone, locale, home folder and workers are."""
     made = []
