@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -154,13 +155,22 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
     assert predicted == pytest.approx(max(east, north), rel=0.03)
 
 
-def test_a_database_of_a_span(tmp_path, sao_lines, small_spec):
-    spec_path, catalog = tmp_path / "small.toml", tmp_path / "sao.dat"
-    spec_path.write_text(small_spec)
-    catalog.write_bytes(b"".join(sao_lines))
-    spec = read_spec(spec_path, {"epoch_jyear": "[2027.0, 2042.0]"})
-    built = build(spec, {"sao": [catalog]}, tmp_path)
-    artifact = check_artifact(built.folder)
+@pytest.fixture
+def folder_of(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callable[..., Path]:
+    """Build the small spec with some of its keys changed."""
+    (tmp_path / "small.toml").write_text(small_spec)
+    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+
+    def run(**changes: str) -> Path:
+        spec = read_spec(tmp_path / "small.toml", changes)
+        return build(spec, {"sao": [tmp_path / "sao.dat"]}, tmp_path).folder
+
+    return run
+
+
+def test_a_database_of_a_span(folder_of):
+    folder = folder_of(epoch_jyear="[2027.0, 2042.0]")
+    artifact = check_artifact(folder)
     assert (artifact.manifest["epoch_jyear"], artifact.spec.span_jyear) == (2034.5, SPAN)
     stars = artifact.table("stars")
     known = ~np.isnan(floats_of(stars, "drift_arcsec"))
@@ -168,24 +178,18 @@ def test_a_database_of_a_span(tmp_path, sao_lines, small_spec):
     np.testing.assert_allclose(
         floats_of(stars, "drift_arcsec")[known], 7.5e-3 * speed[known], rtol=1e-4, atol=1e-9
     )
-    report = json.loads((built.folder / "report" / "report.json").read_text())
+    report = json.loads((folder / "report" / "report.json").read_text())
     assert report["validity"]["end_jyear"] == 2042.0
-    assert Matcher.open(built.folder).database.epoch_jyear == 2034.5
+    assert Matcher.open(folder).database.epoch_jyear == 2034.5
 
 
 @pytest.mark.slow
-def test_a_span_has_the_positions_of_its_middle(tmp_path, sao_lines, small_spec):
-    spec_path, catalog = tmp_path / "small.toml", tmp_path / "sao.dat"
-    spec_path.write_text(small_spec)
-    catalog.write_bytes(b"".join(sao_lines))
-    spec = read_spec(spec_path, {"epoch_jyear": "[2027.0, 2042.0]"})
-    built = build(spec, {"sao": [catalog]}, tmp_path)
-    stars = check_artifact(built.folder).table("stars")
-    one_year = build(read_spec(spec_path, {"epoch_jyear": "2034.5", "version": '"1.0.1"'}),
-                     {"sao": [catalog]}, tmp_path)  # fmt: skip
-    same = check_artifact(one_year.folder).table("stars")
-    np.testing.assert_array_equal(directions_of(stars), directions_of(same))
-    assert rebuild(built.folder, {"sao": [catalog]}).is_identical
+def test_a_span_has_the_positions_of_its_middle(folder_of, tmp_path):
+    folder = folder_of(epoch_jyear="[2027.0, 2042.0]")
+    same = folder_of(epoch_jyear="2034.5", version='"1.0.1"')
+    stars, others = (check_artifact(one).table("stars") for one in (folder, same))
+    np.testing.assert_array_equal(directions_of(stars), directions_of(others))
+    assert rebuild(folder, {"sao": [tmp_path / "sao.dat"]}).is_identical
 
 
 @pytest.mark.parametrize(

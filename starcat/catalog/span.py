@@ -24,9 +24,10 @@ _AXES = ("ra", "dec")
 def with_span(stars: pa.Table, span_jyear: tuple[float, float]) -> pa.Table:
     """Return stars at the middle of a span with their errors at its ends and their drift."""
     begin, end = span_jyear
+    errors = position_errors(stars, begin)
     columns: Columns = {
-        "position_error_begin_arcsec": position_errors(stars, begin),
-        "position_error_end_arcsec": position_errors(stars, end),
+        "position_error_begin_arcsec": errors,
+        "position_error_end_arcsec": errors if end == begin else position_errors(stars, end),
     }
     if end > begin:
         columns["drift_arcsec"] = drifts(stars, 0.5 * (end - begin))
@@ -99,7 +100,7 @@ def validity(stars: pa.Table, span_jyear: tuple[float, float]) -> Validity | Non
     if begin == end or not len(known):
         return None
     worst = known[np.lexsort((stars["star_id"].to_numpy()[known], -drift[known]))][:_NAMED]
-    error = np.fmax(*(position_errors(stars, year) for year in span_jyear))
+    error = np.fmax(*(floats_of(stars, f"position_error_{at}_arcsec") for at in ("begin", "end")))
     return Validity(
         begin,
         end,

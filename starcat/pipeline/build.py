@@ -164,7 +164,8 @@ def _make(
     sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
     own = (spec, sources, products, facts, fields, filters, rates)
-    results = BuildResults(*own, in_band=in_band.made, neighbours=selected.neighbours)
+    held = validity(selected.guide_stars, spec.span_jyear)
+    results = BuildResults(*own, in_band.made, selected.neighbours, held)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -174,7 +175,7 @@ def _make(
             *motion_notes(spec, products),
             *in_band.notes,
             *spec.exposure_notes,
-            str(validity(selected.guide_stars, spec.span_jyear) or ""),
+            str(held or ""),
             *depth_notes(stars, spec),
             *matched.notes,
             *coverage_warnings(report.summary, report.gap),

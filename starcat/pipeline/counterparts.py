@@ -146,6 +146,21 @@ def match_source(
     Returns facts and notes of the catalog, and the candidates; the catalog itself does not stay,
     as two of them need not fit into memory.
     """
+    stage = "motions" if role == "motions" else f"product {role}"
+    read, matches = read_and_match(name, stage, stars, wanted, inputs, workers, progress)
+    return source_facts(read, role), read.notes, matches
+
+
+def read_and_match(
+    name: str,
+    stage: str,
+    stars: pa.Table,
+    wanted: Crossmatch,
+    inputs: Mapping[str, Sequence[Path]],
+    workers: int,
+    progress: Progress,
+) -> tuple[Ingested, pa.Table]:
+    """Return a catalog, read as far as it is matched, and the candidates for stars in it."""
     read = read_catalog(
         name,
         locate(name, inputs),
@@ -154,8 +169,8 @@ def match_source(
         workers=workers,
         progress=progress,
     )
-    progress("motions" if role == "motions" else f"product {role}", 0, None)
-    return source_facts(read, role), read.notes, match_tables(stars, read.stars, wanted)[0]
+    progress(stage, 0, None)
+    return read, match_tables(stars, read.stars, wanted)[0]
 
 
 def source_facts(read: Ingested, role: str) -> SourceFacts:

@@ -16,7 +16,7 @@ from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, count_by_reason
 from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
-from starcat.catalog.span import validity
+from starcat.catalog.span import Validity
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
@@ -119,6 +119,7 @@ class BuildResults:
     rates: Sequence[Rates]  # rates of the self-test
     in_band: InBand | None = None  # where the spec states a response
     neighbours: NeighbourTally | None = None  # what the rule of neighbours decided
+    validity: Validity | None = None  # how long it holds, where the spec states a span
 
 
 def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
@@ -133,7 +134,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))
     band = results.in_band
-    held = validity(tables["stars"], spec.span_jyear)
+    held = results.validity
     return {
         **{name: recorded[name] for name in ("name", "version", "description")},
         "epoch_jyear": spec.middle_jyear,

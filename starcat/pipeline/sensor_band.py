@@ -17,12 +17,10 @@ import pyarrow.compute as pc
 from starcat.artifact.manifest import SourceFacts
 from starcat.bands.response import Response
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
-from starcat.catalog.source_files import locate
 from starcat.catalog.stars import add_nearest_neighbours
-from starcat.pipeline.counterparts import match_tables, source_facts
+from starcat.pipeline.counterparts import read_and_match, source_facts
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
-from starcat.store.reading import read_catalog
 
 
 @dataclass(frozen=True)
@@ -70,17 +68,9 @@ def _photometry(
     progress: Progress,
 ) -> tuple[Other, SourceFacts, Sequence[str]]:
     """Return what another catalog says of the magnitudes of stars, and what it is."""
-    wanted = spec.products.crossmatch
-    read = read_catalog(
-        name,
-        locate(name, inputs),
-        read_limit_mag=wanted.read_limit_mag,
-        neighbours=False,
-        workers=workers,
-        progress=progress,
+    read, matches = read_and_match(
+        name, "photometry", stars, spec.products.crossmatch, inputs, workers, progress
     )
-    progress("photometry", 0, None)
-    matches = match_tables(stars, read.stars, wanted)[0]
     is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
     best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
     place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
