@@ -56,7 +56,7 @@ install: $(READY) ## install starcat and its tools into .venv
 check: $(READY) ## format, lint, types
 	$(BIN)/ruff format --check --quiet .
 	$(BIN)/ruff check --quiet .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff format --quiet .

@@ -452,6 +452,7 @@ def test_a_build_in_the_band_of_its_sensor(tmp_path):
     assert again.manifest["products"] == built.manifest["products"]
 
 
+@pytest.mark.slow
 @genuine
 def test_hp_from_gaia_without_a_fit():
     stars = band_pairs.measured(CATALOGS)

@@ -209,7 +209,7 @@ def test_frames_support_the_terms_that_the_lens_has(skies, lens, off_px, terms):
 # From frames to the camera ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fov", [20.0, 50.0])
+@pytest.mark.parametrize("fov", [20.0, pytest.param(50.0, marks=pytest.mark.slow)])
 def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     """The acceptance of the command: k1, k2, a principal point and 5 % of focal length."""
     database = skies[fov]

@@ -29,7 +29,11 @@ COUNTS = {
 
 @pytest.mark.parametrize(
     ("name", "folder"),
-    [("gaia-12deg", "tmp_path"), ("sao-12deg", "excerpts"), (MADE, "made_catalogs")],
+    [
+        pytest.param("gaia-12deg", "tmp_path", marks=pytest.mark.slow),
+        ("sao-12deg", "excerpts"),
+        (MADE, "made_catalogs"),
+    ],
 )
 def test_a_preset_still_makes_the_same_products(name, folder, request, tmp_path_factory):
     built = golden_build(name, request.getfixturevalue(folder), tmp_path_factory.mktemp("golden"))

@@ -62,6 +62,7 @@ def pairs_of(frame: Any) -> dict[tuple[int, int], float]:
     }
 
 
+@pytest.mark.slow
 def test_lsdb_opens_a_store(stores):
     for store in stores:
         catalog = lsdb.open_catalog(store)

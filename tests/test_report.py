@@ -390,6 +390,7 @@ def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
         assert name in run.err
 
 
+@pytest.mark.slow
 def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
     few = small_spec.replace("boresights.count = 200", "boresights.count = 20")
     few = few.replace("min_identified = 0.8", "min_identified = 0.0")

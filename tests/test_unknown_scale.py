@@ -64,7 +64,7 @@ def test_a_focal_length_beyond_what_is_allowed_gives_no_answer(sky):
         assert matcher.identify(frame.centroids_px, wrong, fov_error=0.02).status == "no_match"
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
+@pytest.mark.parametrize("seed", [pytest.param(n, marks=pytest.mark.slow) for n in range(3)])
 def test_part_of_a_dense_frame_of_another_scale_is_no_answer(seed):
     # Around any point near the middle some 80 of 400 stars fit, with a chance of 1e-15 to 1e-27.
     camera, generator = Camera(1024, 1024, fov_x_deg=24.0), np.random.default_rng(seed)
