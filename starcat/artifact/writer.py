@@ -21,6 +21,7 @@ from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
     MANIFEST_VERSION,
+    MAP_VERSION,
     MOTIONS_VERSION,
     PHOTOMETRY_VERSION,
     SourceFacts,
@@ -84,6 +85,7 @@ def write_manifest(
     roles = {source.role for source in sources}
     version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
     version = PHOTOMETRY_VERSION if "photometry" in roles else version
+    version = MAP_VERSION if any(source.map for source in sources) else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
         "manifest_version": version,

@@ -11,6 +11,7 @@ import typer
 from starcat.cli.console import print_json, print_table, print_things, progress_bars, say, show
 from starcat.cli.options import (
     Json,
+    OwnSources,
     Scheduler,
     Workers,
     inputs_by_source,
@@ -100,8 +101,11 @@ Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that d
 
 @app.command()
 def ingest(
-    source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
     output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
+    source: Annotated[
+        str | None, typer.Argument(help="A star catalog, such as sao; default: that of --source.")
+    ] = None,
+    sources: OwnSources = None,
     inputs: Annotated[
         list[str] | None,
         typer.Option(
@@ -124,12 +128,16 @@ def ingest(
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
+    from starcat.catalog.source import data_source
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
     from starcat.store.plan import StoreOptions
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
+    if source is None and not sources:
+        raise ConfigError("name a source, such as sao, or a map with --source", key="source")
+    source = data_source(source or str((sources or [])[0])).name
     paths = locate(source, inputs_by_source(inputs, source))
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":

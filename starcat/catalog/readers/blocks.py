@@ -8,7 +8,7 @@ import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from isal import igzip, isal_zlib
 
@@ -16,6 +16,9 @@ from starcat.catalog.readers.records import line_ends
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
+
+if TYPE_CHECKING:
+    from starcat.catalog.readers.tables import Rows
 
 BLOCK_BYTES = 1 << 22
 GZIP_MAGIC = b"\x1f\x8b"
@@ -27,12 +30,13 @@ MAX_LINE_BYTES = 1 << 24
 
 @dataclass(frozen=True)
 class Block:
-    """Whole lines (or whole binary records) of one file."""
+    """Whole lines (or binary records, or rows of a table) of one file."""
 
     file: InputFile
     data: bytes
     first_line: int  # 1-based number of its first line (or record) in the file
     bytes_read: int = 0  # of the file as it lies on disk, when the block was whole
+    rows: Rows | None = None  # of a table, in place of the data
 
 
 class DigestReader(io.FileIO):

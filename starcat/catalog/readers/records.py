@@ -39,12 +39,12 @@ class Problem:
     byte_range: tuple[int, int] | None  # of the field, 1-based inclusive
     found: str
     expected: str
+    what: str = "line"  # what is numbered
 
     def __str__(self) -> str:
         where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
-        return (
-            f"line {self.line}{where}, {self.field}: found {self.found}; expected {self.expected}"
-        )
+        place = f"{self.what} {self.line}{where}, {self.field}"
+        return f"{place}: found {self.found}; expected {self.expected}"
 
 
 @dataclass(frozen=True)
