@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pyarrow.compute as pc
 import pytest
@@ -9,8 +12,9 @@ from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 
 from starcat.catalog.archives.mapped import identity
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.source import give_map, known_maps
+from starcat.catalog.source import give_map, known_maps, mapped
 from starcat.catalog.stars import floats_of
+from starcat.catalog.table_draft import draft_map
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.store.reading import read_catalog
 
@@ -89,3 +93,18 @@ class TestEveryFormat:
             wanted = f"{kind} =" in case.toml or case.name == "hats"
             assert (found == (expected[order] if wanted else False)).all()
             assert (pc.is_valid(read.stars[f"{kind}_flag"]).to_numpy() == found).all()
+
+
+def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
+    right = total = 0
+    for case in CASES:
+        (tmp_path / case.name).mkdir()
+        draft = draft_map(case.make(sky, tmp_path / case.name))
+        assert mapped(tomllib.loads(draft.as_toml())).table is not None
+        hits = sum(draft.used.get(column) == key for column, key in case.meant.items())
+        wrong = {c: (k, draft.used.get(c)) for c, k in case.meant.items() if draft.used.get(c) != k}
+        print(case.name, hits, len(case.meant), wrong)
+        assert hits >= 0.8 * len(case.meant), case.name
+        right, total = right + hits, total + len(case.meant)
+    print(right, total)
+    assert right >= 0.9 * total

@@ -106,7 +106,8 @@ def semicolons(sky: Sky, folder: Path) -> Path:
     """CSV with semicolons, texts of hours and degrees, FK5, thousandths of magnitudes."""
     r, d, dr, dd, _, _ = sky.fk5()
     rows = zip(
-        sky.ids, _blank(_sexagesimal(np.degrees(r), True), NO_PLACE), _sexagesimal(np.degrees(d), False),
+        sky.ids, _blank(_sexagesimal(np.degrees(r), True), NO_PLACE),
+        _sexagesimal(np.degrees(d), False),
         _blank(dr / MAS / 15.0 * 1e-3, NO_MOTION, "NULL"), dd / MAS * 1e-3,
         _blank(sky.v * 1e3, NO_MAG), np.where(sky.is_double, "D", ""), strict=True,
     )  # fmt: skip
@@ -340,7 +341,8 @@ V = "E_VMAG"
 [flags]
 double = "DUP"
 """, {
-        "IDENT": "star_id", "GLON": "ra", "GLAT": "dec", "PM_L_COSB": "pm_ra_cosdec", "PM_B": "pm_dec",
+        "IDENT": "star_id", "GLON": "ra", "GLAT": "dec", "PM_L_COSB": "pm_ra_cosdec",
+        "PM_B": "pm_dec",
         "VMAG": "magnitudes.V", "E_VMAG": "magnitude_errors.V", "DUP": "flags.double",
     }),
     Case("votable", observatory, 2016.0, """
@@ -428,7 +430,8 @@ B = "Bmag"
 V = "e_Vmag"
 """, {
         "recno": "star_id", "RAh": "ra", "RAm": "ra", "RAs": "ra", "DE-": "dec", "DEd": "dec",
-        "DEm": "dec", "DEs": "dec", "pmRA": "pm_ra_cosdec", "pmDE": "pm_dec", "Bmag": "magnitudes.B",
+        "DEm": "dec", "DEs": "dec", "pmRA": "pm_ra_cosdec", "pmDE": "pm_dec",
+        "Bmag": "magnitudes.B",
         "Vmag": "magnitudes.V", "e_Vmag": "magnitude_errors.V", "HIP": "hip_number",
         "SpType": "spectral_type",
     }),

@@ -10,7 +10,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import erfa
 import numpy as np
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.archives.sao import icrs_from_fk5
 from starcat.catalog.readers.expressions import columns_in, evaluate
-from starcat.catalog.readers.records import Problem, Records
-from starcat.catalog.readers.tables import BLANKS, OpenTable, Rows, TableColumn
+from starcat.catalog.readers.records import Problem, Records, Rows, TableColumn
+from starcat.catalog.readers.tables import BLANKS, OpenTable
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.stars import Columns, known, where_known
 from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
@@ -60,7 +60,7 @@ def understand(
             named, is_column = columns_in(value.value, list(columns), key, where)
         else:
             named, is_column = (), False
-        unit, convert = "", _as_is
+        unit, convert = "", cast(Callable[[Array], Array], _as_is)
         if target(key) is not None:
             unit, convert = _unit(key, value, columns[named[0]] if is_column else None, where)
         found[key] = Understood(value, named, is_column, unit, convert)

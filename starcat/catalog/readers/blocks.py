@@ -8,17 +8,14 @@ import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from isal import igzip, isal_zlib
 
-from starcat.catalog.readers.records import line_ends
+from starcat.catalog.readers.records import Rows, line_ends
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
-
-if TYPE_CHECKING:
-    from starcat.catalog.readers.tables import Rows
 
 BLOCK_BYTES = 1 << 22
 GZIP_MAGIC = b"\x1f\x8b"

@@ -11,7 +11,7 @@ import io
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.catalog.readers.blocks import DigestReader, open_input
-from starcat.catalog.readers.records import Problem
+from starcat.catalog.readers.records import Problem, Rows, TableColumn
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import TableMap
 from starcat.errors import StarcatError, quoted
@@ -36,27 +36,6 @@ BLANKS = ("", "null", "NULL", "nan", "NaN", "NAN", "N/A", "\\N", "--")
 """Texts that mean no value in any file."""
 
 FORMATS = "CSV, ECSV, FITS, VOTable, Parquet or Arrow"
-
-
-@dataclass(frozen=True)
-class TableColumn:
-    """What a file says of one of its columns."""
-
-    name: str
-    is_text: bool = False
-    unit: str = ""
-    ucd: str = ""
-    description: str = ""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Some rows of a table."""
-
-    columns: dict[str, TableColumn]  # of the file
-    table: pa.Table  # the columns that were asked for
-    number: NDArray[np.int64]  # 1-based, of each row in the file
-    problems: list[Problem] = field(default_factory=list)  # rows that could not be read
 
 
 @dataclass(frozen=True)
@@ -84,7 +63,7 @@ def open_table(file: InputFile) -> OpenTable:
     try:
         head = _head(file.path)
         how = next((how for magic, how in _OPENERS.items() if head.startswith(magic)), _open_text)
-        opened = how(file, file.layout.table or _ANY, head)
+        opened = how(file, file.layout.table or ANY, head)
     except StarcatError:
         raise
     except _DAMAGE as error:
@@ -125,7 +104,7 @@ def damaged(file: InputFile, error: Exception) -> StarcatError:
     return file.error(f"not a table that can be read ({why}); expected {FORMATS}. Get it again")
 
 
-_ANY = TableMap.model_validate(
+ANY = TableMap.model_validate(
     {
         "name": "any",
         "epoch": 2000,
@@ -199,8 +178,8 @@ def _open_text(file: InputFile, how: TableMap, head: bytes) -> OpenTable:
     units, after = _lines_below(lines[start + 1 : start + 3], delimiter, len(names))
     _check_names(file, names, has_header=not how.names)
     options = _TextOptions(start, after, delimiter, names, how)
-    sample = list(islice(csv.reader(io.StringIO("\n".join(lines[start + (not how.names) + after :])),
-                                    delimiter=delimiter), SAMPLE_ROWS))  # fmt: skip
+    below = io.StringIO("\n".join(lines[start + (not how.names) + after :]))
+    sample = list(islice(csv.reader(below, delimiter=delimiter), SAMPLE_ROWS))
     columns = {}
     for place, name in enumerate(names):
         values = [row[place].strip() for row in sample if len(row) > place]
