@@ -102,9 +102,6 @@ def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
         draft = draft_map(case.make(sky, tmp_path / case.name))
         assert mapped(tomllib.loads(draft.as_toml())).table is not None
         hits = sum(draft.used.get(column) == key for column, key in case.meant.items())
-        wrong = {c: (k, draft.used.get(c)) for c, k in case.meant.items() if draft.used.get(c) != k}
-        print(case.name, hits, len(case.meant), wrong)
         assert hits >= 0.8 * len(case.meant), case.name
         right, total = right + hits, total + len(case.meant)
-    print(right, total)
-    assert right >= 0.9 * total
+    assert right >= 0.95 * total

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -30,7 +31,7 @@ from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 from starcat.errors import ConfigError, quoted
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 
-_WHOLE = re.compile(r"[+-]?[0-9]{1,18}")
+_WHOLE = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
 _SEXAGESIMAL = (
     r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
     r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
@@ -109,6 +110,11 @@ def _unit(
         ) from error
 
 
+def _floats(values: pa.Array) -> Array:
+    known = values.cast(pa.float64(), safe=False)
+    return np.array(pc.fill_null(known, float("nan")), dtype=np.float64)
+
+
 def _as_is(values: Array) -> Array:
     return values
 
@@ -139,20 +145,22 @@ class _Reading:
         self._nulls = {str(one) for one in table.null} | set(BLANKS)
         self._null_numbers = [float(one) for one in table.null if _is_number(one)]
 
-    def column(self, name: str, key: str) -> pa.Array:
-        """Return a column with nulls where it has no value; texts of numbers become numbers."""
+    def column(self, name: str, key: str, *, as_text: bool = False) -> pa.Array:
+        """Return a column with nulls where it has no value.
+
+        Texts of numbers become numbers where they are not asked for as texts.
+        """
         values = self.rows.table[name].combine_chunks()
         if pa.types.is_string(values.type):
             values = pc.utf8_trim_whitespace(values)
             values = self._blanked(values, pc.is_in(values, pa.array(sorted(self._nulls))))
-            return values if self.rows.columns[name].is_text else self._numbers(values, key)
+            if as_text or self.rows.columns[name].is_text:
+                return values
+            return self._numbers(values, key)
         if pa.types.is_floating(values.type):
             values = self._blanked(values, pc.is_nan(values))
-        if self._null_numbers and (
-            pa.types.is_floating(values.type) or pa.types.is_integer(values.type)
-        ):
-            same = pc.is_in(values.cast(pa.float64()), pa.array(self._null_numbers))
-            values = self._blanked(values, same)
+        if pa.types.is_floating(values.type) or pa.types.is_integer(values.type):
+            return self._no_number(values)
         return values
 
     @staticmethod
@@ -161,6 +169,8 @@ class _Reading:
 
     def _numbers(self, texts: pa.Array, key: str) -> pa.Array:
         """Return the numbers that texts are; those that are none are malformed."""
+        with suppress(pa.ArrowInvalid):
+            return self._no_number(texts.cast(pa.int64()))
         try:
             numbers = texts.cast(pa.float64())
         except pa.ArrowInvalid:
@@ -168,9 +178,14 @@ class _Reading:
             wrong = pc.invert(pc.fill_null(is_number, True))
             self.refuse(wrong.to_numpy(zero_copy_only=False), key, texts, "a number")
             numbers = self._blanked(texts, wrong).cast(pa.float64())
-        if self._null_numbers:
-            numbers = self._blanked(numbers, pc.is_in(numbers, pa.array(self._null_numbers)))
-        return self._blanked(numbers, pc.is_nan(numbers))
+        return self._no_number(self._blanked(numbers, pc.is_nan(numbers)))
+
+    def _no_number(self, numbers: pa.Array) -> pa.Array:
+        """Return numbers with nulls for those that the map says mean no value."""
+        if not self._null_numbers:
+            return numbers
+        same = pc.is_in(numbers.cast(pa.float64(), safe=False), pa.array(self._null_numbers))
+        return self._blanked(numbers, same)
 
     def refuse(self, wrong: Mask, key: str, values: pa.Array, expected: str) -> None:
         """Leave out rows whose value cannot be."""
@@ -180,13 +195,13 @@ class _Reading:
             self.problems.append(Problem(row, key, None, text, expected, what="row"))
         self.bad |= wrong
 
-    def value(self, key: str) -> pa.Array:
+    def value(self, key: str, *, as_text: bool = False) -> pa.Array:
         """Return what a column, an expression or a number of the map gives for every row."""
         found = self.found[key]
         if not isinstance(found.value.value, str):
             return pa.repeat(pa.scalar(float(found.value.value)), self.count)
         if found.is_column:
-            return self.column(found.columns[0], key)
+            return self.column(found.columns[0], key, as_text=as_text)
         columns = {name: self.column(name, key) for name in found.columns}
         return evaluate(found.value.value, columns, self.count, key)
 
@@ -204,7 +219,7 @@ class _Reading:
                 f"{key}: {self.found[key].value.value!r} gives {values.type}; expected numbers",
                 key=key,
             )
-        array = np.array(pc.fill_null(values.cast(pa.float64()), float("nan")), dtype=np.float64)
+        array = _floats(values)
         array[np.isinf(array)] = np.nan
         return self.found[key].convert(array)
 
@@ -222,14 +237,14 @@ class _Reading:
         plain = self._numbers(
             pc.if_else(parts.is_valid(), pa.scalar(None, pa.string()), texts), key
         )
-        decimal = found.convert(np.array(pc.fill_null(plain, float("nan")), dtype=np.float64))
+        decimal = found.convert(_floats(plain))
         is_hours = key == "columns.ra" and self.map.frame != "galactic" and found.value.unit is None
         signed = np.where(negative, -size, size)
         return np.where(is_split, 15.0 * signed if is_hours else found.convert(signed), decimal)
 
     def texts(self, key: str) -> NDArray[Any]:
         """Return texts, None where there is none."""
-        values = self.value(key)
+        values = self.value(key, as_text=True)
         if pa.types.is_floating(values.type):
             rounded = pc.round(values)
             if pc.all(pc.equal(rounded, values)).as_py() is not False:
@@ -251,7 +266,7 @@ class _Reading:
 
     def identities(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
         """Return the numbers of stars, 0 where there is none, and their texts."""
-        values = self.value("columns.star_id")
+        values = self.value("columns.star_id", as_text=True)
         if pa.types.is_floating(values.type):
             array = np.array(pc.fill_null(values, 0.0), dtype=np.float64)
             wrong = (array != np.trunc(array)) | (np.abs(array) > 2.0**53)
@@ -272,8 +287,8 @@ def identity(text: str | None) -> int:
     """
     if text is None:
         return 0
-    if _WHOLE.fullmatch(text):
-        return int(text)
+    if whole := _WHOLE.fullmatch(text):
+        return int(whole[1])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 2
 
 
