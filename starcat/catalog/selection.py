@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.blended import Judged, judge_neighbours
+from starcat.catalog.doubles import is_joined
 from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
@@ -227,7 +228,7 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
     """Return which stars an archive's flags say to leave out as doubles.
 
     With ``unresolved``: flagged, with a separation below the limit or not stated, and a stated
-    magnitude difference within ``max_delta_mag``.
+    magnitude difference within ``max_delta_mag``. That of a joined pair need not be stated.
     """
     flagged = np.array(stars["is_flagged_double"])
     if doubles.flags == "ignore" or doubles.action == "keep":
@@ -236,6 +237,8 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
         return flagged
     apart = floats_of(stars, "companion_separation_arcsec") / 3600.0
     delta = floats_of(stars, "companion_delta_mag")
+    # A joined pair without magnitudes may be of two equal stars.
+    delta[np.isnan(delta) & is_joined(stars, doubles)] = 0.0
     close = np.isnan(apart) | (apart <= doubles.min_separation_deg)
     if doubles.max_delta_mag is None:
         return np.asarray(flagged & close & ~np.isnan(delta))

@@ -36,7 +36,7 @@ MOST_BINS = 10_000_000
 
 LATER_KEYS = (
     *("products.levels", "catalog.motions", "selection.neighbours"),
-    *("selection.thinning", "selection.observed"),
+    *("selection.thinning", "selection.observed", "selection.doubles.join"),
     *("camera.response", "camera.exposure", "selection.max_drift_arcsec"),
 )
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
@@ -61,7 +61,7 @@ class Catalog(Section):
     read_limit_mag: Mag | None = Field(
         None, description="fainter records, and those without magnitude, are counted and left out"
     )
-    motions: tuple[Literal["hipparcos", "tycho2"], ...] = Field(
+    motions: tuple[Literal["hipparcos", "hipparcos2", "tycho2"], ...] = Field(
         (),
         strict=False,  # a list in TOML
         description="catalogs that supply missing proper motions, in order of preference; found "
@@ -104,6 +104,14 @@ class Doubles(Section):
         "separation is below the limit or unknown and the magnitudes are known to be close; or "
         "always a rejection",
     )
+    join: tuple[Literal["wds"], ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=1,
+        description="sources that flag stars with a companion closer than min_separation_deg, by "
+        "HIP number or place; a pair without magnitudes counts as one of equal stars",
+        examples=[["wds"]],
+    )
 
 
 class Variables(Section):
@@ -117,10 +125,11 @@ class Variables(Section):
         description="what an archive's flag of a variable means: nothing; a rejection of those "
         "without a known amplitude; or always a rejection",
     )
-    join: tuple[Literal["hipparcos", "tycho1", "gcvs"], ...] = Field(
+    join: tuple[Literal["hipparcos", "tycho1", "gcvs", "vsx"], ...] = Field(
         (),
         strict=False,  # a list in TOML
-        description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number",
+        description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number, or (vsx) "
+        "by place",
         examples=[["hipparcos"]],
     )
 
@@ -471,11 +480,16 @@ class BuildSpec(Section):
         return middle_of(self.epoch_jyear)
 
     @property
+    def joins(self) -> tuple[str, ...]:
+        """Names of the sources that say what stars are doubles or vary, in the order of joining."""
+        return *self.selection.variables.join, *self.selection.doubles.join
+
+    @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        joined = (*self.selection.variables.join, *self.camera.response.photometry)
-        names = [self.catalog.source, *self.catalog.motions, *joined]
+        names = [self.catalog.source, *self.catalog.motions, *self.joins]
+        names += self.camera.response.photometry
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:
