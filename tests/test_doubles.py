@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pyarrow as pa
 import pytest
 from archives import archive_records, record
 from catalog_folder import bright_sky
 
+from starcat.artifact.verify import check_artifact
 from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
@@ -23,8 +26,12 @@ from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
+from starcat.pipeline.build import build
+from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec, Doubles, Selection
 from starcat.specs.reading import preset
+
+FILES = {"hipparcos": "hip_main.dat.gz", "wds": "wds_hip.dat.gz"}
 
 LIMIT = Doubles(min_separation_deg=10.0 / 3600.0, max_delta_mag=3.0, join=("wds",))
 
@@ -63,9 +70,9 @@ def reasons(stars: pa.Table, table: PairTable, doubles: Doubles = LIMIT) -> list
 
 
 def test_a_close_pair_is_a_flagged_double():
-    table = pairs((1, 10.0, 3.0), (2, 10.1, 0.0), (3, 2.0, 3.1), (4, 2.0, None))
-    assert reasons(stars_of(5), table) == [
-        "flagged_double", "kept", "kept", "flagged_double", "kept",
+    table = pairs((1, 10.0, 3.0), (2, 10.1, 0.0), (3, 2.0, 3.1), (4, 5.0, None), (5, 5.1, None))
+    assert reasons(stars_of(6), table) == [
+        "flagged_double", "kept", "kept", "flagged_double", "kept", "kept",
     ]  # fmt: skip
 
 
@@ -215,7 +222,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Path
     """Stars of Hipparcos-2 that do not exist, and what WDS and VSX say of them."""
     folder = tmp_path_factory.mktemp("joins")
     sky = bright_sky().where(np.arange(1500))
-    sky = replace(sky, amplitude_mag=np.where(sky.amplitude_mag > 0, sky.amplitude_mag + 0.3, 0))
+    varies = sky.amplitude_mag > 0
+    sky = replace(
+        sky,
+        amplitude_mag=np.where(varies, sky.amplitude_mag + 0.3, 0),
+        rho_arcsec=np.minimum(sky.rho_arcsec, 5.0),
+    )
     for source in ("hipparcos2", "wds", "vsx"):
         for layout in data_source(source).files:
             lines = archive_records(source, sky)[layout.name]
@@ -281,6 +293,28 @@ def test_amplitudes_of_vsx(tmp_path, fields, amplitude):
 
 
 # The spec
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_build_with_joined_doubles(tmp_path, catalogs):
+    changes = {
+        "catalog.source": "hipparcos", "catalog.band": "V", "selection.faint_limit_mag": "6.0",
+        "boresights.count": "500", "self_test.frames": "10", "self_test.min_identified": "0.0",
+    }  # fmt: skip
+    inputs = {name: [catalogs / file] for name, file in FILES.items()}
+    plain = build(preset("gaia-12deg", changes), {"hipparcos": inputs["hipparcos"]}, tmp_path)
+    joined = {**changes, "name": "joined", "selection.doubles.join": '["wds"]'}
+    built = build(preset("gaia-12deg", joined), inputs, tmp_path)
+    check_artifact(built.folder)
+    schema = json.loads((resource_folder("schemas") / "manifest-1.4.0.json").read_text())
+    jsonschema.validate(built.manifest, schema)
+    assert plain.manifest["manifest_version"] == "1.1.0"
+    stars, doubles = built.manifest["sources"]
+    assert (doubles["source"], doubles["role"]) == ("wds", "doubles")
+    before = plain.manifest["sources"][0]["rejected"]["flagged_double"]
+    assert 0 < stars["rejected"]["flagged_double"] - before <= doubles["joined"]
+    assert doubles["kept"] + sum(doubles["rejected"].values()) == doubles["rows_read"]
 
 
 def test_the_key_is_recorded_only_where_it_is_used():

@@ -109,7 +109,8 @@ class Doubles(Section):
         strict=False,  # a list in TOML
         max_length=1,
         description="sources that flag stars with a companion closer than min_separation_deg, by "
-        "HIP number or place; a pair without magnitudes counts as one of equal stars",
+        "HIP number or place; a pair without magnitudes counts as one of equal stars where it is "
+        "closer than 5 arcsec, and not at all where it is wider",
         examples=[["wds"]],
     )
 
