@@ -28,7 +28,13 @@ from starcat.service.api.databases import difference_of, fields_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
 from starcat.service.pages.downloads import image_choices
-from starcat.service.pages.facts import MANIFEST_DIGEST, database_rows, products_of, report_of
+from starcat.service.pages.facts import (
+    MANIFEST_DIGEST,
+    database_rows,
+    products_of,
+    rejections_of,
+    report_of,
+)
 from starcat.service.pages.notebook import Notebook, database_code, query_code
 from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.pages.sky import CACHED, view_of
@@ -76,6 +82,7 @@ def one_database(
         **_head(service, database, "overview"),
         report=report_of(database),
         products=products_of(manifest),
+        rejections=rejections_of(manifest),
         image=image_choices(database),
         notebook=Notebook(database.title, database_code(address_of(request, service), database.id)),
         methods=[
