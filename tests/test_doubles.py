@@ -28,7 +28,8 @@ from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
 from starcat.pipeline.build import build
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Doubles, Selection
+from starcat.specs.build_spec import BuildSpec, Selection
+from starcat.specs.doubtful_stars import Doubles
 from starcat.specs.reading import preset
 
 FILES = {"hipparcos": "hip_main.dat.gz", "wds": "wds_hip.dat.gz"}

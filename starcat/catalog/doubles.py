@@ -25,7 +25,8 @@ from starcat.catalog.stars import floats_of, with_columns
 from starcat.catalog.verdict import Reason
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import Doubles, Selection
+from starcat.specs.build_spec import Selection
+from starcat.specs.doubtful_stars import Doubles
 
 WDS_COLUMNS = {
     "wds_hip": ("hip", "wds", "sep"),

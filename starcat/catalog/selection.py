@@ -32,7 +32,8 @@ from starcat.catalog.verdict import Quality, Reason, Verdicts
 from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
-from starcat.specs.build_spec import Doubles, Selection, Variables
+from starcat.specs.build_spec import Selection
+from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.storage.schema import product_schema
 
 _STEPS = {Reason.beyond_count: "count", Reason.density: "density"}
