@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.blended import Judged, judge_neighbours
@@ -200,8 +199,10 @@ def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> 
 
 
 def _groups(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
+    )
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rows = np.unique(pairs)
     order = np.argsort(label[rows], kind="stable")
     cuts = np.flatnonzero(np.diff(label[rows][order])) + 1
