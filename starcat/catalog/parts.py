@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
-from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.archives import gaia, hipparcos, hipparcos2, sao, twomass, tycho1, tycho2
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
@@ -71,6 +71,7 @@ class Archive(Protocol):
 CATALOGS: dict[str, Archive] = {
     "sao": sao,
     "hipparcos": hipparcos,
+    "hipparcos2": hipparcos2,
     "tycho1": tycho1,
     "tycho2": tycho2,
     "2mass": twomass,
