@@ -86,6 +86,30 @@ def test_one_database_tells_filters_rates_products_and_columns(client, small_art
     assert '<form method="post"' in client.get(PAGE).text
 
 
+def test_every_reason_leads_to_its_records(client, small_artifact):
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    page = client.get(PAGE).text
+    [table] = re.findall(r'<table id="rejections-table".*?</table>', page, re.DOTALL)
+    rejected = manifest["sources"][0]["rejected"]
+    assert rejected
+    found = re.findall(r'href="([^"]*)" aria-label="(\d+) records: ([^"]*)"', table)
+    assert {name.replace(" ", "_"): int(count) for _, count, name in found} == rejected
+    for address, count, name in found:
+        answer = text_of(client.get(f"{address}&rows=2000").text)
+        assert f"{count} rows" in answer, name
+
+
+def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_artifact):
+    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    errors = report["coverage"]["attitude_error_arcsec_per_px"]
+    text = client.get(f"{PAGE}/coverage").text
+    for axis in ("across", "about"):
+        told = " ".join(f"{errors[axis][name]:.3g}" for name in ("median", "one_percent", "worst"))
+        assert f"{axis} the boresight {told}" in text_of(text.replace("><", "> <"))
+    [picture] = re.findall(r'<img src="([^"]*attitude_error.png)"', text)
+    assert client.get(picture).headers["content-type"] == "image/png"
+
+
 def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
     folder = add_database(tmp_path / "service", small_artifact)
     path = folder / "manifest.json"

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 from starcat.artifact.database import open_for_writing, write_product, write_root
 from starcat.artifact.manifest import (
     DATABASE_NAME,
+    DOUBLES_VERSION,
     MANIFEST_NAME,
     MANIFEST_VERSION,
     MAP_VERSION,
@@ -85,6 +86,7 @@ def write_manifest(
     roles = {source.role for source in sources}
     version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
     version = PHOTOMETRY_VERSION if "photometry" in roles else version
+    version = DOUBLES_VERSION if "doubles" in roles else version
     version = MAP_VERSION if any(source.map for source in sources) else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
-from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.archives import gaia, hipparcos, hipparcos2, sao, twomass, tycho1, tycho2
 from starcat.catalog.archives.mapped import MappedTable, names_wanted, records_of
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
@@ -74,6 +74,7 @@ class Archive(Protocol):
 CATALOGS: dict[str, Archive] = {
     "sao": sao,
     "hipparcos": hipparcos,
+    "hipparcos2": hipparcos2,
     "tycho1": tycho1,
     "tycho2": tycho2,
     "2mass": twomass,

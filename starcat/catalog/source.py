@@ -171,7 +171,9 @@ class DataSource(_Model):
     citation: str
     licence: str
     reference: str = ""  # the document that the layout was taken from
-    kind: Literal["stars", "variability"] = "stars"  # a catalog, or a table joined to one
+    kind: Literal["stars", "variability", "doubles"] = (
+        "stars"  # a catalog, or a table joined to one
+    )
     frame: Literal["ICRS", "FK5", "FK4", "galactic", "none"]  # axes of the positions
     epoch_jyear: float | None = None  # of the positions, where all records share it
     bands: tuple[str, ...] = ()  # of the magnitudes, the default first

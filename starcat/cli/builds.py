@@ -122,7 +122,7 @@ def _print_facts(
     folder: Path, outcome: str, manifest: dict[str, Any], facts: dict[str, Any]
 ) -> None:
     report = folder / "report" / "index.html"
-    where = {"artifact": str(folder), "report": str(report), "outcome": outcome}
+    where = {"folder": str(folder), "report": str(report), "outcome": outcome}
     contents = {key: manifest[key] for key in ("sources", "products", "files")}
     print_json({**where, **facts, **contents})
 
