@@ -27,8 +27,8 @@ MOTIONS_VERSION = "1.2.0"
 PHOTOMETRY_VERSION = "1.3.0"
 DOUBLES_VERSION = "1.4.0"
 MAP_VERSION = "1.5.0"
-"""The versions of manifests with motions, with magnitudes, and with doubles, of another catalog, and
-with the map of a table; all others are `MANIFEST_VERSION`."""
+"""The versions of manifests with motions, with magnitudes, and with doubles, of another catalog,
+and with the map of a table; all others are `MANIFEST_VERSION`."""
 
 DATABASE_NAME = "database.h5"
 
