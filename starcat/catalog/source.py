@@ -112,6 +112,7 @@ class RecordFile(_Model):
     description: str = ""  # what is in the file, where a source has several
     layout: Literal["fixed_width", "delimited", "binary"]
     record_bytes: int | None = None  # without the line end (fixed width, binary)
+    trimmed: bool = False  # lines may end after their last field, or go on after the record
     header_bytes: int = 0  # before the first record (binary)
     magic: str = ""  # text that a binary file begins with
     delimiter: str = "|"
