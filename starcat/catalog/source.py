@@ -125,6 +125,7 @@ class RecordFile(_Model):
     layout: Literal["fixed_width", "delimited", "binary", "table"]
     table: TableMap | None = None  # what the columns mean (table)
     record_bytes: int | None = None  # without the line end (fixed width, binary)
+    trimmed: bool = False  # lines may end after their last field, or go on after the record
     header_bytes: int = 0  # before the first record (binary)
     magic: str = ""  # text that a binary file begins with
     delimiter: str = "|"
