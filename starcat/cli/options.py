@@ -224,8 +224,8 @@ def inputs_by_source(
     """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
     from starcat.catalog.source import data_source, give_map
 
-    for path in maps or []:
-        give_map(path)
+    for own in maps or []:
+        give_map(own)
     inputs: dict[str, list[Path]] = {}
     for text in given or []:
         name, separator, path = text.partition("=")
