@@ -18,6 +18,7 @@ from catalog_folder import bright_sky
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
+from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
 from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.selection import select_guide_stars
@@ -199,6 +200,12 @@ def test_lines_before_the_first_record_of_wds(tmp_path):
     head = [b"<pre>", b"WDS        Discoverer", b""]
     table = read_wds([wds_file(tmp_path, {}, {}, head=head)])
     assert (table.kept, table.rejected) == (2, {"malformed_record": 2})
+
+
+def test_a_download_with_lines_before_the_first_record_is_taken(tmp_path):
+    [expected] = expected_files(data_source("wds"))
+    path = wds_file(tmp_path, {}, {"place": ""}, head=[b"<pre>"])
+    assert check_download(expected, path, path, url="").rows == 3
 
 
 def test_another_file_is_not_taken_for_wds(tmp_path):

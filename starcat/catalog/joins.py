@@ -130,7 +130,8 @@ def read_records(
         layout = block.file.layout
         if layout.layout == "delimited":
             return parse_delimited(block.data, layout, columns[layout.name], block.first_line)
-        return parse_fixed_width(_padded(block), layout, columns[layout.name], block.first_line)
+        data = _padded(block) if layout.trimmed else block.data
+        return parse_fixed_width(data, layout, columns[layout.name], block.first_line)
 
     parts: list[Records] = []
     readings: list[FileReading] = []
@@ -143,7 +144,7 @@ def read_records(
 
 
 def _padded(block: Block) -> bytes:
-    """Return lines of fixed width, of which these archives leave out the blanks at the end."""
+    """Return lines of the length of a record, of which the archive leaves out blanks at the end."""
     width = block.file.layout.record_bytes or 0
     lines = block.data.splitlines()
     return b"".join(line.ljust(width)[:width] + b"\n" if line.strip() else b"\n" for line in lines)
