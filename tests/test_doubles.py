@@ -325,6 +325,26 @@ def test_a_build_with_joined_doubles(tmp_path, catalogs):
     assert doubles["kept"] + sum(doubles["rejected"].values()) == doubles["rows_read"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_build_of_hipparcos2_with_everything_by_place(tmp_path, made):
+    folder, _ = made
+    changes = {
+        "catalog.source": "hipparcos2", "catalog.band": "Hp", "boresights.count": "500",
+        "camera.response.name": "silicon-cmos", "epoch_jyear": "[2027.0, 2042.0]",
+        "selection.doubles.join": '["wds"]', "selection.variables.join": '["vsx"]',
+        "self_test.frames": "10", "self_test.min_identified": "0.0",
+    }  # fmt: skip
+    inputs = {name: [folder] for name in ("hipparcos2", "vsx")}
+    inputs["wds"] = [folder / "wdsweb_summ2.txt"]
+    built = build(preset("gaia-12deg", changes), inputs, tmp_path)
+    check_artifact(built.folder)
+    stars, variables, doubles = built.manifest["sources"]
+    assert [one["role"] for one in (variables, doubles)] == ["variability", "doubles"]
+    assert min(variables["joined"], doubles["joined"]) > 50
+    assert stars["rejected"]["variable"] > 0 < stars["rejected"]["flagged_double"]
+
+
 def test_the_key_is_recorded_only_where_it_is_used():
     plain = preset("gaia-12deg")
     assert "join" not in plain.recorded()["selection"]["doubles"]
