@@ -31,7 +31,12 @@ sys.path.insert(0, str(Path(__file__).parent / "builders"))
 from archives import archive_records, file_header
 from catalog_folder import bright_sky
 
-TARGETS = [(name, layout.name) for name in source_names() for layout in data_source(name).files]
+TARGETS = [
+    (name, layout.name)
+    for name in source_names()
+    for layout in data_source(name).files
+    if layout.table is None
+]
 """Every source and layout that has a reader."""
 
 MADE_ONLY = ("hipparcos2", "vsx", "wds")

@@ -129,7 +129,7 @@ def test_a_good_file_is_read(tmp_path):
         ('"mag", bytes', '"Vmag", bytes', "files.0.columns.1.name", "match pattern"),
         ("record_bytes = 10\n", "", "files.0", "need record_bytes"),
         ('"fixed_width"', '"fits"', "files.0.layout", "'delimited'"),
-        ('"ICRS"', '"FK4"', "frame", "'FK5'"),
+        ('"ICRS"', '"B1950"', "frame", "'FK5'"),
         ('["tiny.dat"]', "[]", "files.0.file_names", "at least 1 item"),
     ],
 )
@@ -184,7 +184,8 @@ def test_unknown_source_lists_all_and_suggests_the_nearest(name, nearest):
 
 
 def test_seven_sources_ship():
-    assert source_names() == SOURCES
+    archives = [name for name in source_names() if data_source(name).table is None]
+    assert tuple(archives) == SOURCES
 
 
 @pytest.mark.parametrize("name", SOURCES)

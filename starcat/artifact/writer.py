@@ -22,6 +22,7 @@ from starcat.artifact.manifest import (
     DOUBLES_VERSION,
     MANIFEST_NAME,
     MANIFEST_VERSION,
+    MAP_VERSION,
     MOTIONS_VERSION,
     PHOTOMETRY_VERSION,
     SourceFacts,
@@ -86,6 +87,7 @@ def write_manifest(
     version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
     version = PHOTOMETRY_VERSION if "photometry" in roles else version
     version = DOUBLES_VERSION if "doubles" in roles else version
+    version = MAP_VERSION if any(source.map for source in sources) else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
         "manifest_version": version,

@@ -22,6 +22,7 @@ from starcat.cli.options import (
     Changes,
     Input,
     Json,
+    OwnSources,
     PresetName,
     SpecFile,
     chosen_spec,
@@ -48,6 +49,7 @@ def build(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
+    sources: OwnSources = None,
     output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a different database of that name.")
