@@ -165,6 +165,10 @@ class Client:
         """Return the report of a build, ``report/report.json`` of the database."""
         return self._json("GET", f"databases/{database}/report")
 
+    def difference(self, database: str, other: str) -> Content:
+        """Say what differs between two databases: spec, products, and stars with the reason."""
+        return self._json("GET", f"databases/{database}/diff/{other}")
+
     def publish(self, database: str, note: str = "") -> Content:
         """Publish a database; ``outcome`` is ``published``, or ``unchanged``."""
         return self._json("POST", "releases", json={"database": database, "note": note})

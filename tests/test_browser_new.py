@@ -172,6 +172,31 @@ def test_task_a_database_of_20_degrees_is_designed_and_built(page):
     assert page.get_by_role("button", name="Build").is_disabled()
 
 
+def test_a_response_is_dropped_and_its_numbers_are_in_the_address(page):
+    expect = pytest.importorskip("playwright.sync_api").expect
+    begin(page)
+    page.goto("/new")
+    settled(page)
+    page.locator("#sensor-fields > summary").click()
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    assert axe.run(page, "#sensor-fields").response["violations"] == []
+    rows = "".join(f"{nm},{0.001 * (nm - 350)}\n" for nm in range(400, 901, 50))
+    file = {"name": "blue sensor.csv", "mimeType": "text/csv", "buffer": rows.encode()}
+    page.locator("#response_file").set_input_files([file])
+    own = page.locator("#camera\\.response\\.name")
+    expect(own).to_have_value("blue-sensor", timeout=BUILD_MS)
+    settled(page)
+    assert "camera.response.wavelength_nm=" in page.url
+    assert page.locator("#response_file").input_value() == ""
+    page.goto(page.url)
+    settled(page)
+    expect(own).to_have_value("blue-sensor")
+    assert page.locator("#sensor-fields").get_attribute("open") is not None
+    own.select_option("")
+    settled(page)
+    assert "camera.response" not in page.url
+
+
 @pytest.mark.slow
 def test_task_how_good_is_it(page, served, picky_artifact: Path):
     add_database(served.root, picky_artifact)

@@ -225,12 +225,27 @@ def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, 
     assert len(digests) == 1
 
 
+def complaints_of_axe(page):
+    """What axe says of a page as it is, in all looks."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    found = []
+    for theme, width in LOOKS:
+        look(page, theme, width)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for one in axe.run(page).response["violations"]:
+            nodes = [node["html"][:160] for node in one["nodes"][:3]]
+            found.append((page.url, theme, width, one["id"], nodes))
+    look(page, "light", 1280)
+    return found
+
+
 def test_task_publish_and_pull(page, starcat, tmp_path):
     begin(page)
     click(page, "link", "small 1.0.0")
     click(page, "link", "Publish")
     click(page, "button", "Publish")
     page.get_by_text("Publish small 1.0.0 for good?").wait_for()
+    assert complaints_of_axe(page) == []
     click(page, "button", "Publish for good")
     page.get_by_text("small-1.0.0 is published.").wait_for()
     assert page.clicks == 4
@@ -263,7 +278,6 @@ LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
 @pytest.mark.slow
 def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
     # test_browser.py does it fast for the same pages as they come.
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     found = []
     for one in ADDRESSES:
         is_own = one.startswith(("/databases", "/identify", "/releases"))
@@ -271,11 +285,5 @@ def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
         page.goto(address.replace("?seed", f"?database={DATABASE}&seed"))
         for details in page.locator("main details").all():
             details.evaluate("one => { one.open = true; }")
-        for theme, width in LOOKS:
-            look(page, theme, width)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width, address
-            for one in axe.run(page).response["violations"]:
-                nodes = [node["html"][:160] for node in one["nodes"][:3]]
-                found.append((address, theme, width, one["id"], nodes))
-    look(page, "light", 1280)
+        found += complaints_of_axe(page)
     assert found == []

@@ -251,10 +251,10 @@ def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
     assert again.err == f"{estimate}\n"
     assert made["outcome"] == "unchanged"
     assert list(made) == [
-        "artifact", "report", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
+        "folder", "report", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
         "sources", "products", "files",
     ]  # fmt: skip
-    assert made["artifact"] == str(tmp_path / "dist" / "small-1.0.0")
+    assert made["folder"] == str(tmp_path / "dist" / "small-1.0.0")
     assert [step["step"] for step in made["filters"]] == ["magnitude", "doubles", "variables"]
     assert made["self_test"][0]["identified_share"] == 1.0
 

@@ -35,6 +35,7 @@ PUBLIC = [
     "identify_in_time",
     "ingest",
     "init",
+    "learn",
     "open",
     "preset",
     "publish",

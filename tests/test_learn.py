@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+import starcat as starcat_package
 from starcat.artifact.reader import open_artifact
 from starcat.calibration.answers import Sightings, SkyStars, read_answers
 from starcat.calibration.learn import learn
@@ -226,6 +227,10 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert len(rows) == len(told_json["stars"]) > 100
     assert {row["verdict"] for row in rows} >= {"too_faint", "missing"}
+    found = starcat_package.learn(str(small_artifact), str(path))
+    assert found.toml == section.read_text()
+    assert len(found.table) == len(rows)
+    assert starcat_package.learn(small_artifact, [path], min_frames=1000).lesson.distrusted == ()
 
 
 def test_a_database_of_other_stars_is_refused(flown):

@@ -24,6 +24,7 @@ from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
 from starcat.report import coverage_map
 from starcat.report.coverage_map import project
+from starcat.service.pages.facts import star_columns
 from starcat.service.pages.rendering import time_text
 from starcat.service.pages.wording import in_page_words
 
@@ -84,6 +85,49 @@ def test_one_database_tells_filters_rates_products_and_columns(client, small_art
         assert product in words
     assert "great-circle separation" in words.lower()
     assert '<form method="post"' in client.get(PAGE).text
+
+
+def test_every_reason_leads_to_its_records(client, small_artifact):
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    page = client.get(PAGE).text
+    [table] = re.findall(r'<table id="rejections-table".*?</table>', page, re.DOTALL)
+    rejected = manifest["sources"][0]["rejected"]
+    assert rejected
+    found = re.findall(r'href="([^"]*)" aria-label="(\d+) records: ([^"]*)"', table)
+    assert {name.replace(" ", "_"): int(count) for _, count, name in found} == rejected
+    for address, count, name in found:
+        answer = text_of(client.get(f"{address}&rows=2000").text)
+        assert f"{count} rows" in answer, name
+
+
+def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_artifact):
+    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    errors = report["coverage"]["attitude_error_arcsec_per_px"]
+    text = client.get(f"{PAGE}/coverage").text
+    for axis in ("across", "about"):
+        told = " ".join(f"{errors[axis][name]:.3g}" for name in ("median", "one_percent", "worst"))
+        assert f"{axis} the boresight {told}" in text_of(text.replace("><", "> <"))
+    [picture] = re.findall(r'<img src="([^"]*attitude_error.png)"', text)
+    assert client.get(picture).headers["content-type"] == "image/png"
+
+
+def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, small_artifact):
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    manifest["spec"]["epoch_jyear"] = [2027.0, 2042.0]
+    manifest["spec"]["selection"]["neighbours"] = {"psf_sigma_px": 1.0}
+    assert star_columns(manifest)[2:5] == [
+        "drift_arcsec",
+        "centroid_offset_arcsec",
+        "contamination",
+    ]
+    page = client.get(f"{PAGE}/coverage?order=most").text
+    link = re.findall(r'href="([^"]*)" aria-label="Stars of field', page)[0]
+    answer = client.get(link)
+    assert answer.status_code == 200
+    words = text_of(answer.text)
+    assert "mag_error" in words
+    assert "position_error_end_arcsec" in words
+    assert "drift_arcsec" not in words.partition("Answer")[2].partition("Named queries")[0]
 
 
 def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):

@@ -11,7 +11,8 @@ from services import client_of, token_of
 
 from starcat.errors import ConfigError
 from starcat.service.pages.design import differences, draft_of_query, pinned_draft, query_of
-from starcat.service.pages.draft import draft_of_text, draft_with
+from starcat.service.pages.draft import Draft, draft_of_form, draft_of_text, draft_with
+from starcat.service.pages.response import keys_of_file
 from starcat.specs.reading import preset_names
 
 SETTINGS = {"anonymous": "builder"}
@@ -47,8 +48,25 @@ def test_a_preset_has_a_short_address(name):
         {"camera.fov_x_deg": None, "camera.focal_length_mm": 25.0, "camera.pixel_um": 5.5},
         {"selection.faint_limit_mag": 99.0, "epoch_jyear": "soon"},
         {"selection.nothing": 3, "catalog.band": ""},
+        {
+            "epoch_jyear": [2027.0, 2042.0],
+            "selection.thinning": "voronoi",
+            "selection.neighbours.psf_sigma_px": 0.9,
+            "camera.response.name": "mine",
+            "camera.response.per": "energy",
+            "camera.response.wavelength_nm": [400.0, 450.0, 500.0],
+            "camera.response.value": [0.0, 1.0, 0.5],
+        },
     ],
-    ids=["numbers", "a list", "texts", "another lens", "wrong values", "an unknown key"],
+    ids=[
+        "numbers",
+        "a list",
+        "texts",
+        "another lens",
+        "wrong values",
+        "an unknown key",
+        "a sensor",
+    ],
 )
 def test_an_address_gives_the_design_again(changes):
     for base in ("gaia-12deg", "sao-12deg-512"):
@@ -65,6 +83,18 @@ def test_an_address_gives_the_design_again(changes):
 )
 def test_a_text_that_is_more_than_keys_is_in_the_address_as_it_is(text):
     assert pinned_draft(query_of(draft_of_text(text), "gaia-12deg")).text == text
+
+
+def test_a_design_that_is_too_long_for_an_address_has_none(client):
+    nm = [300.0 + k * 1.123456789 for k in range(350)]
+    table = {"wavelength_nm": nm, "value": [0.1234567890123456] * len(nm)}
+    changes = {f"camera.response.{key}": value for key, value in table.items()}
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 500.0, **changes})
+    assert query_of(draft, "") is None
+    sent = {"toml": draft.text, "toml-before": "", "do": "pin", "pinned": ""}
+    state = client.post("/new/preview", data=sent).json()
+    assert (state["address"], state["pinned_query"]) == ("", "")
+    assert "too long to be pinned" in state["wrong"]
 
 
 def test_an_address_of_no_design_is_told(client):
@@ -104,6 +134,88 @@ def reader(tmp_path):
     with client_of(tmp_path, anonymous="reader") as client:
         client.token = token
         yield client
+
+
+# The sensor
+
+
+def _changed(text: str, **changes: str) -> Draft:
+    known = draft_of_text(text)
+    form = {**known.values, "toml": known.text, "toml-before": known.text}
+    return draft_of_form(form | {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def test_the_years_of_a_mission_and_the_rules_of_the_sensor_are_fields():
+    rule = "selection__neighbours__"
+    draft = _changed(
+        SPEC,
+        epoch_jyear="2027-2042",
+        selection__max_drift_arcsec="2",
+        selection__thinning="information",
+        selection__max_stars_per_field="12",
+        **{f"{rule}psf_sigma_px": "0.9", f"{rule}max_offset_px": "0.05", f"{rule}action": "merge"},
+    )
+    assert draft.errors == {}
+    assert draft.spec.epoch_jyear == (2027.0, 2042.0)
+    assert draft.values["epoch_jyear"] == "2027-2042"
+    own = draft.spec.selection
+    assert (own.max_drift_arcsec, own.thinning, own.neighbours.action) == (
+        2.0, "information", "merge",
+    )  # fmt: skip
+    assert _changed(draft.text).text == draft.text
+    assert _changed(draft.text, epoch_jyear="2030").spec is None  # one year has no drift
+    wrong = _changed(SPEC, epoch_jyear="2042-2027", selection__neighbours__action="keep")
+    assert set(wrong.errors) == {"epoch_jyear", "selection.neighbours.psf_sigma_px"}
+
+
+def test_a_response_is_picked_and_another_takes_the_table_of_the_first_away():
+    csv = b"# counts: energy\nwavelength_nm,response\n400,0\n450,1\n500,0.5\n"
+    draft = draft_with(draft_of_text(SPEC), keys_of_file("My sensor (2).csv", csv, "photon"))
+    assert draft.spec.camera.response.response().counts == "energy"
+    assert draft.values["camera.response.name"] == "My-sensor-2"
+    assert draft.responses[-1] == ("My-sensor-2", "My-sensor-2: from a file")
+    assert _changed(draft.text).text == draft.text
+    shipped = _changed(draft.text, camera__response__name="silicon-cmos")
+    assert shipped.spec.camera.response.response().name == "silicon-cmos"
+    assert "wavelength_nm" not in shipped.text
+    none = _changed(draft.text, camera__response__name="")
+    assert none.spec == draft_of_text(SPEC).spec
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"wavelength_nm,value\n4000,1\n4500,1\n25000,1\n", "angstroms: divide them by 10"),
+        (b"a,b,c\n1,2,3\n", "line 1: found 'a,b,c'"),
+        (b"\xff\xfe\x00", "it is no text"),
+        (b"400,1\n" * 100_000, "more than 500,000 bytes"),
+    ],
+    ids=["angstroms", "three columns", "a picture", "too large"],
+)
+def test_a_file_that_is_no_response_is_told_beside_its_field(client, content, told):
+    sent = {"toml": SPEC.replace("20.0", "500.0"), "toml-before": "", "response_per": "photon"}
+    file = {"response_file": ("sensor.csv", content, "text/csv")}
+    state = client.post("/new/preview", data=sent, files=file).json()
+    assert told in state["errors"]["response_file"]
+    assert "sensor.csv" in state["errors"]["response_file"]
+    assert not state["can_build"]
+    assert "camera.response" not in state["toml"]
+
+
+@pytest.mark.slow
+def test_a_dropped_response_changes_the_magnitudes_that_are_counted(client):
+    csv = "\n".join(f"{nm},{1.0 if nm < 500 else 0.0}" for nm in range(380, 561, 20)).encode()
+    sent = {"toml": SPEC, "toml-before": SPEC, "response_per": "photon", "do": "preview"}
+    before = _sent(client, "/new/preview", SPEC).json()
+    while True:  # the catalog is read again, in the band
+        file = {"response_file": ("blue.csv", csv, "text/csv")}
+        state = client.post("/new/preview", data=sent, files=file).json()
+        if not state["is_busy"]:
+            break
+    assert state["errors"] == {}
+    assert draft_of_text(state["toml"]).spec.camera.response.name == "blue"
+    assert "camera.response.wavelength_nm" in state["address"]
+    assert state["stars"] != before["stars"]
 
 
 # Names

@@ -8,6 +8,7 @@ import io
 import json
 import re
 import tarfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from starcat.specs.reading import content_of_toml, preset, preset_names, spec_fr
 
 SETTINGS = {"anonymous": "publisher"}
 PAGE = f"/databases/{DATABASE}"
+OTHER = "fedcba9876543210"
 
 
 @pytest.fixture(scope="module")
@@ -149,9 +151,9 @@ def test_what_differs_between_two_databases_is_shown_in_the_sky(
     tmp_path, small_artifact, picky_artifact
 ):
     add_database(tmp_path / "service", small_artifact)
-    add_database(tmp_path / "service", picky_artifact, "fedcba9876543210")
+    add_database(tmp_path / "service", picky_artifact, OTHER)
     with client_of(tmp_path / "service", anonymous="reader") as client:
-        page = client.get(f"{PAGE}/compare?other=fedcba9876543210").text
+        page = client.get(f"{PAGE}/compare?other={OTHER}").text
         [link] = re.findall(r'href="([^"]+)">Added and removed stars in the sky', page)
         shown = client.get(html.unescape(link)).text
     [view] = re.findall(r'data-sky="([^"]+)"', shown)
@@ -229,11 +231,14 @@ def test_publishing_asks_before_it_is_final(client):
 
 
 @pytest.fixture(scope="module")
-def served(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Served:
+def served(
+    root: Path, small_artifact: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Served]:
     """The same service in a process of its own, which a program can ask."""
     folder = tmp_path_factory.mktemp("served")
     [artifact] = (root / "databases" / DATABASE).iterdir()
     add_database(folder / "service", artifact)
+    add_database(folder / "service", small_artifact, OTHER)
     with serve(folder / "service", folder / "log", anonymous="reader") as one:
         yield one
 
@@ -288,6 +293,18 @@ def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
     shown = re.findall(r'<tr data-field="(\d+)"', page)
     assert [line.split("\t")[0] for line in out.splitlines()[1:]] == shown
     assert len(shown) == 25
+
+
+def test_the_python_of_a_comparison_prints_the_stars_of_the_page(served, capsys):
+    query = {"other": OTHER}
+    out = ran(served, f"{PAGE}/compare", capsys, **query)
+    page = requests.get(f"{served.address}{PAGE}/compare", params=query, timeout=20).text
+    [table] = re.findall(r'<table id="came-table".*?</table>', page, re.DOTALL)
+    names = re.findall(r">(SAO \d+)</a>", table)
+    lines = [line.split("\t") for line in out.splitlines()[1:]]
+    assert [line[1] for line in lines if line[0] == "came"] == names
+    assert names
+    assert {line[3] for line in lines} == {"too_bright"}
 
 
 @pytest.mark.slow

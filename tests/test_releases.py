@@ -150,7 +150,7 @@ def test_an_artifact_of_the_builder_itself_in_two_versions(sao_file, small_spec,
         ("1.10.0", True),
     ]
     ran = starcat(["pull", "small@latest", "--registry", "registry", "-o", "out", "--json"])
-    assert json.loads(ran.out)[0]["artifact"] == "out/small-1.10.0"
+    assert json.loads(ran.out)[0]["folder"] == "out/small-1.10.0"
     assert starcat(["verify", "out/small-1.10.0"]).code == 0
 
 

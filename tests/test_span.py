@@ -20,7 +20,7 @@ from starcat.catalog.proper_motion import MAS, Motion, propagate_in_space
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.span import drifts, position_errors, validity, with_span
-from starcat.catalog.stars import directions_of, floats_of, table_from_columns
+from starcat.catalog.stars import directions_of, floats_of, move_to_epoch, table_from_columns
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
@@ -218,3 +218,37 @@ def test_a_tolerance_without_a_span_is_told(tmp_path, small_spec):
     path.write_text(small_spec)
     with pytest.raises(ConfigError, match="give a span"):
         read_spec(path, {"selection.max_drift_arcsec": "1.0"})
+
+
+@pytest.mark.parametrize(
+    ("from_jyear", "off_arcsec"), [(1991.25, (0.82, 1.20, 1.66)), (2016.0, (0.08, 0.22, 0.43))]
+)
+def test_a_radial_velocity_is_used_where_one_is_known(from_jyear, off_arcsec):
+    """Barnard's star comes closer by 110.5 km/s; docs/algorithms.md has the figures."""
+    star = FAST["Barnard's star"]
+    columns = {
+        "ra_deg": np.full(2, float(star["ra_deg"])),
+        "dec_deg": np.full(2, float(star["de_deg"])),
+        "epoch_jyear": np.full(2, from_jyear),
+        "pm_ra_cosdec_mas_yr": np.full(2, star["pm_ra"]),
+        "pm_dec_mas_yr": np.full(2, star["pm_de"]),
+        "parallax_mas": np.full(2, star["plx"]),
+        "radial_velocity_km_s": np.array([np.nan, -110.5]),
+    }
+    ra, dec = np.radians(columns["ra_deg"][0]), np.radians(columns["dec_deg"][0])
+    pm = star["pm_ra"] * MAS / np.cos(dec), star["pm_de"] * MAS
+    years = (SPAN[0], sum(SPAN) / 2, SPAN[1])
+    for year, off in zip(years, off_arcsec, strict=True):
+        moved = move_to_epoch(columns, year)
+        without, known = (
+            np.array([moved[axis][row] for axis in "xyz"])  # type: ignore[index]
+            for row in (0, 1)
+        )
+        times = (*erfa.epj2jd(from_jyear), *erfa.epj2jd(year))
+        sofa = erfa.pmsafe(ra, dec, *pm, star["plx"] / 1000.0, -110.5, *times)
+        expected = directions_from_radec(np.degrees(sofa[0]), np.degrees(sofa[1]))
+        assert separation(known, expected) < MICROARCSEC
+        assert np.degrees(separation(known, without)) * 3600.0 == pytest.approx(off, abs=0.006)
+    middle = table_from_columns("stars", move_to_epoch(columns, years[1]), 2)
+    gained = np.diff(drifts(middle, 7.5))[0]
+    assert gained == pytest.approx(0.5 * (off_arcsec[2] - off_arcsec[0]) + 0.036, abs=0.02)

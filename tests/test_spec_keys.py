@@ -70,7 +70,7 @@ def test_a_preset_as_toml_reads_back(name):
     description=st.text(max_size=60),
     faint=st.floats(-20.0, 30.0),
     count=st.integers(1, 1_000_000),
-    join=st.lists(st.sampled_from(["hipparcos", "tycho1", "gcvs"]), max_size=3),
+    join=st.lists(st.sampled_from(["hipparcos", "tycho1", "gcvs", "vsx"]), max_size=4),
     grid=st.booleans(),
 )
 def test_any_spec_as_toml_reads_back(description, faint, count, join, grid):

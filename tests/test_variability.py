@@ -12,6 +12,7 @@ import pyarrow as pa
 import pytest
 
 from starcat.catalog.ingest import ingest
+from starcat.catalog.joins import Keys
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes, read_gcvs
@@ -40,7 +41,7 @@ def table_of(
         {},
         np.array(amplitude, dtype=float),
         np.array(flag or [None] * len(amplitude), dtype=object),
-        {name: np.array(values, dtype=np.int64) for name, values in numbers.items()},
+        Keys({name: np.array(values, dtype=np.int64) for name, values in numbers.items()}),
     )
 
 
@@ -208,8 +209,8 @@ def test_amplitudes_of_gcvs(gcvs, record, amplitude):
 
 def test_numbers_of_gcvs(gcvs):
     found = gcvs("118218 M 1 0 2", "4313918654563864193 - 1 0 2")
-    assert found.numbers["hip_number"].tolist() == [118218, 0]
-    assert found.numbers["gaia"].tolist() == [0, 4313918654563864193]
+    assert found.keys.numbers["hip_number"].tolist() == [118218, 0]
+    assert found.keys.numbers["gaia"].tolist() == [0, 4313918654563864193]
     assert found.flag.tolist() == ["M", None]
     assert found.files[0].rows == 2
     assert found.rejected == {}
@@ -218,7 +219,7 @@ def test_numbers_of_gcvs(gcvs):
 @pytest.mark.parametrize("ref", ["none", "0", "\u00b2\u00b3", "9" * 19, "\u0661", "-5", "1_0"])
 def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs, ref):
     found = gcvs("118218 M 1 0 2", f"{ref} SR 1 0 2")
-    assert found.numbers["hip_number"].tolist() == [118218]
+    assert found.keys.numbers["hip_number"].tolist() == [118218]
     assert found.rejected == {"no_identity": 1}
     assert found.files[0].rows == 2
 
@@ -226,7 +227,7 @@ def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs, ref):
 def test_a_malformed_record_of_gcvs(gcvs):
     found = gcvs("1 M 1 0 2", "2 M 1 x 2", "3 M 1 0 2")
     assert found.rejected == {"malformed_record": 1}
-    assert found.numbers["hip_number"].tolist() == [1, 3]
+    assert found.keys.numbers["hip_number"].tolist() == [1, 3]
     assert found.files[0].rows == 3
 
 
@@ -263,7 +264,7 @@ def test_a_star_without_position_can_still_be_known_to_vary(tmp_path, catalogs):
     (tmp_path / "hip_main.dat").write_bytes(b"".join(lines))
     table = read_amplitudes("hipparcos", [tmp_path])
     assert table.rejected == {"no_position": 1}
-    row = table.numbers["hip_number"].tolist().index(4711)
+    row = table.keys.numbers["hip_number"].tolist().index(4711)
     assert table.amplitude_mag[row] > 0.6
 
 
@@ -299,10 +300,10 @@ def test_the_whole_gcvs(catalogs, has_excerpts):
     table = read_amplitudes("gcvs", [catalogs / "gcvs.tsv.gz"])
     of_hipparcos, of_gaia = (6_892, 43_100) if has_excerpts else (209, 209)
     assert (table.kept, table.rejected) == (of_hipparcos + of_gaia, {})
-    assert (table.numbers["hip_number"] > 0).sum() == of_hipparcos
-    assert (table.numbers["gaia"] > 0).sum() == of_gaia
+    assert (table.keys.numbers["hip_number"] > 0).sum() == of_hipparcos
+    assert (table.keys.numbers["gaia"] > 0).sum() == of_gaia
     assert np.nanmin(table.amplitude_mag) >= 0.0
     if has_excerpts:
-        mira = table.numbers["hip_number"].tolist().index(10826)
+        mira = table.keys.numbers["hip_number"].tolist().index(10826)
         assert table.amplitude_mag[mira] == pytest.approx(8.5)
         assert table.flag[mira] == "M"

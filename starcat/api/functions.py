@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
+    from starcat.calibration.lessons import Learnt
     from starcat.catalog.ingest import Ingested
     from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
@@ -197,6 +198,44 @@ def calibrate(
         flip=flip,
         progress=progress or no_progress,
     )
+
+
+def learn(
+    artifact: PathLike,
+    results: PathLike | Sequence[PathLike],
+    *,
+    by_frame: bool = False,
+    min_frames: int = 3,
+) -> Learnt:
+    """Learn zero point, colour term and the stars to distrust from identified frames.
+
+    Parameters
+    ----------
+    artifact : str or path-like
+        The folder ``<name>-<version>`` of the database that they were identified with.
+    results : path or sequence of paths
+        What ``starcat identify --ndjson`` printed.
+    by_frame : bool
+        Whether each frame has an offset of its own, as where exposures differ.
+    min_frames : int
+        Fewest frames that a star is judged from.
+
+    Returns
+    -------
+    Learnt
+        With ``observed``, the section of the spec of a patch release; ``toml``, the same with the
+        evidence as comments; and ``table``, what was seen of each star.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a file cannot be read, or is of another database.
+    CalibrationError
+        If too few stars were identified.
+    """
+    from starcat.calibration.lessons import learn_files
+
+    return learn_files(Path(artifact), _paths(results), by_frame=by_frame, min_frames=min_frames)
 
 
 def verify(artifact: PathLike) -> Verification:

@@ -25,8 +25,10 @@ MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.1.0"
 MOTIONS_VERSION = "1.2.0"
 PHOTOMETRY_VERSION = "1.3.0"
-"""The versions of manifests with motions, and with magnitudes, of another catalog; all others are
-`MANIFEST_VERSION`."""
+DOUBLES_VERSION = "1.4.0"
+MAP_VERSION = "1.5.0"
+"""The versions of manifests with motions, with magnitudes, and with doubles, of another catalog,
+and with the map of a table; all others are `MANIFEST_VERSION`."""
 
 DATABASE_NAME = "database.h5"
 
@@ -67,8 +69,8 @@ LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplot
 class SourceFacts:
     """One source of a build as the manifest records it."""
 
-    # name of the data source; ``stars``, ``motions``, ``variability``, ``photometry`` or
-    # ``crossmatch``
+    # name of the data source; ``stars``, ``motions``, ``variability``, ``doubles``, ``photometry``
+    # or ``crossmatch``
     source: str
     role: str
     files: Sequence[FileFacts]  # its input files
@@ -81,6 +83,7 @@ class SourceFacts:
     joined: int | None = None
     # ``median`` and ``largest`` way of the stars whose motion came from this source
     moved_arcsec: dict[str, float] | None = None
+    map: dict[str, Any] | None = None  # of a table of one's own: what its columns mean
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts as the manifest holds them."""

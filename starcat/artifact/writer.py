@@ -19,8 +19,10 @@ import pyarrow.compute as pc
 from starcat.artifact.database import open_for_writing, write_product, write_root
 from starcat.artifact.manifest import (
     DATABASE_NAME,
+    DOUBLES_VERSION,
     MANIFEST_NAME,
     MANIFEST_VERSION,
+    MAP_VERSION,
     MOTIONS_VERSION,
     PHOTOMETRY_VERSION,
     SourceFacts,
@@ -84,6 +86,8 @@ def write_manifest(
     roles = {source.role for source in sources}
     version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
     version = PHOTOMETRY_VERSION if "photometry" in roles else version
+    version = DOUBLES_VERSION if "doubles" in roles else version
+    version = MAP_VERSION if any(source.map for source in sources) else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
         "manifest_version": version,

@@ -10,6 +10,7 @@ from starcat.bands.response import Response, shipped_names
 BANDS_AND_COLOURS = {
     "gaia": (("G", "BP", "RP"), ("BP-RP",)),
     "hipparcos": (("V", "Hp", "B", "I"), ("B-V", "V-I")),
+    "hipparcos2": (("Hp",), ("B-V", "V-I")),
     "tycho1": (("V", "B"), ("B-V",)),
     "tycho2": (("V", "BT", "VT"), ("BT-VT",)),
     "2mass": (("Ks", "H", "J"), ("J-Ks",)),

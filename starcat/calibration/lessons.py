@@ -44,6 +44,16 @@ class Learnt:
             f"{len(self.lesson.distrusted)} stars to distrust>"
         )
 
+    @property
+    def toml(self) -> str:
+        """The section of the spec, with the evidence as comments."""
+        return observed_toml(self)
+
+    @property
+    def table(self) -> pa.Table:
+        """What was seen of each star that the frames should show, a row each."""
+        return star_table(self)
+
     def evidence(self, star: Distrusted) -> str:
         """Return why a star is distrusted, in words."""
         told = [_evidence(self.lesson, star.row, verdict) for verdict in (star.verdict, *star.also)]

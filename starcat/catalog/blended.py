@@ -10,10 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions, Mask, Rows
 from starcat.catalog.stars import directions_of, floats_of, with_columns
@@ -93,7 +91,7 @@ def _neighbours(sky: _Sky, rows: Rows) -> tuple[Rows, Rows]:
     _check_pairs(len(rows), len(pool), sky.widths.reach)
     if not len(rows):
         return rows, rows
-    trees = (cKDTree(sky.directions[some]) for some in (rows, pool))
+    trees = (scipy.spatial.cKDTree(sky.directions[some]) for some in (rows, pool))
     reach = chord_from_separation(sky.widths.reach)
     near = next(trees).sparse_distance_matrix(next(trees), reach, output_type="ndarray")
     place, other = near["i"].astype(np.int64), pool[near["j"]]
@@ -147,8 +145,10 @@ def _spots(
     every = np.concatenate([rows, faint])
     centroid = _moved(sky.directions[every], np.concatenate([seen.offset, more.offset]))
     same, _ = pairs_within(centroid, _SAME_SPOT * sky.widths.spot)
-    graph = coo_array((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(len(every),) * 2)
-    _, spot = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(len(every),) * 2
+    )
+    _, spot = scipy.sparse.csgraph.connected_components(graph, directed=False)
     order = np.lexsort((sky.number[every], sky.mag[every], spot))
     _, first = np.unique(spot[order], return_index=True)
     head_of_spot = every[order[first]]

@@ -16,16 +16,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.parts import (
-    CATALOGS,
-    NAMED_PROBLEMS,
-    IngestOptions,
-    merged,
-    parse_block,
-    read_files,
-)
+from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions, merged, parse_block, read_files
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.source import DataSource, data_source
+from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.catalog.stars import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
 from starcat.catalog.verdict import Reason, Verdicts, rejected_path
@@ -193,9 +186,9 @@ def ingest_options(
 ) -> IngestOptions:
     """Return the options to read a source with, after checking that it has stars and the band."""
     source = data_source(source_name)
-    if source_name not in CATALOGS:
+    if source.kind != "stars":
         raise ConfigError(
-            f"{source_name} is not a star catalog; choose one of {', '.join(CATALOGS)}",
+            f"{source_name} is not a star catalog; choose one of {', '.join(star_sources())}",
             key="source",
             value=source_name,
         )

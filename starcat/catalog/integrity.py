@@ -271,7 +271,7 @@ def _count_lines(block: Block, name: str) -> int:
     if layout.comment:
         prefix = layout.comment.encode("latin-1")
         is_record &= [not line.startswith(prefix) for line in text.split(b"\n")[:-1]]
-    if layout.layout == "fixed_width":
+    if layout.layout == "fixed_width" and not layout.trimmed:
         wrong = np.flatnonzero(is_record & (lengths != layout.record_bytes))
         if wrong.size:
             row = int(wrong[0])

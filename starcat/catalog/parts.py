@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import Protocol, TypeVar
@@ -17,11 +18,13 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
-from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.archives import gaia, hipparcos, hipparcos2, sao, twomass, tycho1, tycho2
+from starcat.catalog.archives.mapped import MappedTable, names_wanted, records_of
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
 from starcat.catalog.readers.records import Problem, Records
+from starcat.catalog.readers.tables import read_tables
 from starcat.catalog.source_files import FileFacts, InputFile
 from starcat.catalog.stars import Columns, move_to_epoch, split_by_verdict, table_from_columns
 from starcat.catalog.verdict import Reason, Verdicts
@@ -71,19 +74,20 @@ class Archive(Protocol):
 CATALOGS: dict[str, Archive] = {
     "sao": sao,
     "hipparcos": hipparcos,
+    "hipparcos2": hipparcos2,
     "tycho1": tycho1,
     "tycho2": tycho2,
     "2mass": twomass,
     "gaia": gaia,
 }
-"""The star catalogs, by the name of their data source."""
+"""The star catalogs that are archives, by the name of their data source."""
 
 
 @dataclass(frozen=True)
 class IngestOptions:
     """Which records of a catalog are read, and how."""
 
-    source_name: str  # one of `CATALOGS`
+    source_name: str  # of a star catalog
     band: str  # of `mag`
     epoch_jyear: float | None = None  # None leaves every star at its own epoch
     read_limit_mag: float | None = None  # fainter records are counted and not held
@@ -102,10 +106,8 @@ class Part:
 
 def parse_block(block: Block, options: IngestOptions) -> Part:
     """Return the stars and the rejected records of a block."""
-    layout, number = block.file.layout, block.file.number
-    catalog = CATALOGS[options.source_name]
-    names, band = catalog.COLUMNS[layout.name], options.band
-    records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
+    number, band = block.file.number, options.band
+    catalog, records = _records(block, options)
     rows, counted = records.rows, 0
     if options.read_limit_mag is not None:
         is_held = catalog.magnitudes(records, band) <= options.read_limit_mag
@@ -121,6 +123,16 @@ def parse_block(block: Block, options: IngestOptions) -> Part:
         malformed = _malformed_rows(records.problems, number, options)
         rejected = pa.concat_tables([rejected, malformed])
     return Part(rows, stars, rejected, records.problems, counted)
+
+
+def _records(block: Block, options: IngestOptions) -> tuple[Archive, Records]:
+    """Return what a block holds, and whose records they are."""
+    layout = block.file.layout
+    if layout.table is not None and block.rows is not None:
+        return MappedTable(layout.table, {}), records_of(layout.table, block.rows, block.file)
+    catalog = CATALOGS[options.source_name]
+    parse = _PARSERS[layout.layout]
+    return catalog, parse(block.data, layout, catalog.COLUMNS[layout.name], block.first_line)
 
 
 def check_ranges(columns: Columns, verdicts: Verdicts) -> Columns:
@@ -166,7 +178,11 @@ class FileReading:
 
     def blocks(self) -> Iterator[Block]:
         """Read the file from its beginning to its end."""
-        return read_blocks(self.file, self._end)
+        table = self.file.layout.table
+        if table is None:
+            return read_blocks(self.file, self._end)
+        wanted = partial(names_wanted, table, where=self.file.path.name)
+        return (Block(self.file, b"", 1, rows=r) for r in read_tables(self.file, wanted, self._end))
 
     def _end(self, digest: DigestReader) -> None:
         self._digest = digest

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.blended import Judged, judge_neighbours
+from starcat.catalog.doubles import is_joined
 from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.stars import (
@@ -31,7 +31,8 @@ from starcat.catalog.verdict import Quality, Reason, Verdicts
 from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
-from starcat.specs.build_spec import Doubles, Selection, Variables
+from starcat.specs.build_spec import Selection
+from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.storage.schema import product_schema
 
 _STEPS = {Reason.beyond_count: "count", Reason.density: "density"}
@@ -198,8 +199,10 @@ def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> 
 
 
 def _groups(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
+    )
+    _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rows = np.unique(pairs)
     order = np.argsort(label[rows], kind="stable")
     cuts = np.flatnonzero(np.diff(label[rows][order])) + 1
@@ -227,7 +230,7 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
     """Return which stars an archive's flags say to leave out as doubles.
 
     With ``unresolved``: flagged, with a separation below the limit or not stated, and a stated
-    magnitude difference within ``max_delta_mag``.
+    magnitude difference within ``max_delta_mag``. That of a joined pair need not be stated.
     """
     flagged = np.array(stars["is_flagged_double"])
     if doubles.flags == "ignore" or doubles.action == "keep":
@@ -236,6 +239,8 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
         return flagged
     apart = floats_of(stars, "companion_separation_arcsec") / 3600.0
     delta = floats_of(stars, "companion_delta_mag")
+    # A joined pair without magnitudes may be of two equal stars.
+    delta[np.isnan(delta) & is_joined(stars, doubles)] = 0.0
     close = np.isnan(apart) | (apart <= doubles.min_separation_deg)
     if doubles.max_delta_mag is None:
         return np.asarray(flagged & close & ~np.isnan(delta))

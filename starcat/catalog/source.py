@@ -1,5 +1,8 @@
 """What an archive is: the TOML files in ``data_sources``, read and checked.
 
+`data_source` finds a source by its name, and is the only function that does: those that ship with
+starcat, then tables of one's own whose map was given or is in ``$STARCAT_SOURCES``.
+
 A source has one or more files, each with a record layout: the columns byte by byte (fixed
 width), in order (delimited) or as a packed structure (binary). The readers run on these
 tables; nothing about a layout is written down anywhere else. This module reads no star.
@@ -7,15 +10,19 @@ tables; nothing about a layout is written down anywhere else. This module reads 
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starcat.errors import ConfigError, suggest
+from starcat.catalog.table_map import TableMap
+from starcat.errors import ConfigError, FileMissing, reason, suggest
 from starcat.failures import validation_message
 from starcat.resources import resource_folder
 
@@ -35,6 +42,11 @@ RANGES = {
 }
 """What a number of a unit can be at all, in any archive: the Sun has -27 mag, and Barnard's star,
 the fastest, moves 10.4 arcsec a year."""
+
+SOURCES_VARIABLE = "STARCAT_SOURCES"
+"""Names maps of tables of one's own: TOML files and folders of them."""
+
+_ENDINGS = ("csv", "tsv", "ecsv", "fits", "vot", "xml", "parquet", "arrow", "feather")
 
 _FORMAT = re.compile(r"^(?:(?P<text>A)\d*|(?P<int>I)\d*|(?P<float>[FDE])(?:\d+\.(?P<dec>\d+))?)$")
 _BINARY = re.compile(r"^<[if][1248]$")
@@ -110,8 +122,10 @@ class RecordFile(_Model):
     parts: tuple[str, ...] = ()  # in order; empty for a single file
     optional: bool = False  # the source is usable without this file
     description: str = ""  # what is in the file, where a source has several
-    layout: Literal["fixed_width", "delimited", "binary"]
+    layout: Literal["fixed_width", "delimited", "binary", "table"]
+    table: TableMap | None = None  # what the columns mean (table)
     record_bytes: int | None = None  # without the line end (fixed width, binary)
+    trimmed: bool = False  # lines may end after their last field, or go on after the record
     header_bytes: int = 0  # before the first record (binary)
     magic: str = ""  # text that a binary file begins with
     delimiter: str = "|"
@@ -120,15 +134,19 @@ class RecordFile(_Model):
     rows: int | None = None  # records in the whole archive file
     sha256: str | None = None  # of the file as published, where it is known
     urls: tuple[str, ...] = ()  # the preferred first
-    columns: tuple[Column, ...] = Field(min_length=1)  # the record, in order
+    columns: tuple[Column, ...] = ()  # the record, in order; of a table the file has them
 
     @model_validator(mode="after")
     def _check(self) -> RecordFile:
+        if (self.layout == "table") == (self.table is None) or (not self.columns) == (
+            not self.table
+        ):
+            raise ValueError(f"file {self.name}: {self.layout} records need columns, tables a map")
         names = [column.name for column in self.columns]
         repeated = {name for name in names if names.count(name) > 1}
         if repeated:
             raise ValueError(f"file {self.name}: columns named twice: {sorted(repeated)}")
-        if self.layout == "delimited":
+        if self.layout in ("delimited", "table"):
             return self
         if self.record_bytes is None:
             raise ValueError(f"file {self.name}: {self.layout} records need record_bytes")
@@ -154,8 +172,10 @@ class DataSource(_Model):
     citation: str
     licence: str
     reference: str = ""  # the document that the layout was taken from
-    kind: Literal["stars", "variability"] = "stars"  # a catalog, or a table joined to one
-    frame: Literal["ICRS", "FK5", "none"]  # axes of the positions
+    kind: Literal["stars", "variability", "doubles"] = (
+        "stars"  # a catalog, or a table joined to one
+    )
+    frame: Literal["ICRS", "FK5", "FK4", "galactic", "none"]  # axes of the positions
     epoch_jyear: float | None = None  # of the positions, where all records share it
     bands: tuple[str, ...] = ()  # of the magnitudes, the default first
     urls_retrieved: str  # when and how the addresses were last tried
@@ -167,11 +187,24 @@ class DataSource(_Model):
         counts = [file.rows for file in self.files]
         return None if None in counts else sum(filter(None, counts))
 
+    @property
+    def table(self) -> TableMap | None:
+        """The map, where the source is a table of one's own."""
+        return self.files[0].table
+
 
 def read_source(path: Path) -> DataSource:
-    """Read one data-source file."""
+    """Read one data-source file, or the map of a table."""
     try:
-        return DataSource.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        return DataSource.model_validate(content) if "files" in content else mapped(content)
+    except FileNotFoundError:
+        raise FileMissing(
+            f"{path}: no such map; 'starcat sources --draft FILE' proposes one for a table"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        why = reason(error) if isinstance(error, OSError) else error
+        raise ConfigError(f"{path.name}: not a readable TOML file: {why}") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not a TOML file: {error}") from error
     except ValidationError as error:
@@ -179,20 +212,120 @@ def read_source(path: Path) -> DataSource:
         raise ConfigError(f"{path.name}: {key}: {found}", key=key) from error
 
 
+def mapped(content: Mapping[str, Any]) -> DataSource:
+    """Return the source that a map makes of a table."""
+    table = TableMap.model_validate(content)
+    usual = tuple(f"{table.name}.{ending}" for ending in _ENDINGS)
+    names = table.file_names or usual
+    return DataSource(
+        name=table.name,
+        title=table.title or table.name,
+        identifier=table.identifier or "a table of one's own",
+        citation=table.citation,
+        licence=table.licence,
+        frame=table.frame,
+        epoch_jyear=table.epoch_jyear,
+        bands=tuple(table.magnitudes),
+        urls_retrieved="no address",
+        files=(RecordFile(name=table.name, file_names=names, layout="table", table=table),),
+    )
+
+
 @cache
-def source_names() -> tuple[str, ...]:
-    """Return the names of all data sources that ship with starcat, sorted."""
+def _shipped_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in resource_folder("data_sources").glob("*.toml")))
 
 
 @cache
-def data_source(name: str) -> DataSource:
-    """Return the data source called ``name``."""
-    if name not in source_names():
-        hint = suggest(name, source_names())
-        raise ConfigError(
-            f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}",
-            key="source",
-            value=name,
-        )
+def _shipped(name: str) -> DataSource:
     return read_source(resource_folder("data_sources") / f"{name}.toml")
+
+
+_given: dict[str, DataSource] = {}
+
+
+def _found() -> dict[str, Path]:
+    """Return the maps that ``$STARCAT_SOURCES`` names, by the names of the files."""
+    places = filter(None, os.environ.get(SOURCES_VARIABLE, "").split(os.pathsep))
+    paths = [
+        path
+        for place in map(Path, places)
+        for path in (sorted(place.glob("*.toml")) if place.is_dir() else [place])
+    ]
+    return {path.stem: path for path in reversed(paths)}  # the first of a name counts
+
+
+def source_names() -> tuple[str, ...]:
+    """Return the names of all data sources that are known, sorted."""
+    return tuple(sorted({*_shipped_names(), *_given, *_found()}))
+
+
+def star_sources() -> tuple[str, ...]:
+    """Return the names of those that are star catalogs."""
+    return tuple(name for name in source_names() if data_source(name).kind == "stars")
+
+
+def data_source(name: str) -> DataSource:
+    """Return the data source of a name, or of the map at a path, which is known from then on."""
+    if name in _shipped_names():
+        return _shipped(name)
+    if name in _given:
+        return _given[name]
+    if name in (found := _found()):
+        source = _own(found[name])
+        if source.name != name:
+            raise ConfigError(
+                f"{found[name]}: name: the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
+                f"file is called after its source: rename it to {source.name}.toml",
+                key="name",
+                value=source.name,
+            )
+        return source
+    if name.endswith(".toml"):
+        return give_map(Path(name))
+    hint = suggest(name, source_names())
+    raise ConfigError(
+        f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}. A table of "
+        f"your own becomes one by a map: --source MAP.toml, or the map in ${SOURCES_VARIABLE}",
+        key="source",
+        value=name,
+    )
+
+
+def give_map(path: Path) -> DataSource:
+    """Return the source of a map, which is known by its name from then on."""
+    source = _own(path)
+    _given[source.name] = source
+    return source
+
+
+def _own(path: Path) -> DataSource:
+    """Return the source of a map of the user's."""
+    source = read_source(path)
+    if source.table is None:
+        raise ConfigError(f"{path}: describes an archive; a map has [columns] and [magnitudes]")
+    if source.name in _shipped_names():
+        raise ConfigError(
+            f"{path}: name: {source.name} is a source of starcat; choose another name",
+            key="name",
+            value=source.name,
+        )
+    return source
+
+
+@contextmanager
+def known_maps(contents: Iterable[Mapping[str, Any]]) -> Iterator[None]:
+    """Know the sources of maps, as a manifest has them, for a while."""
+    before = dict(_given)
+    try:
+        _given.update({source.name: source for source in map(mapped, contents)})
+        yield
+    finally:
+        _given.clear()
+        _given.update(before)
+
+
+def map_of(name: str) -> dict[str, Any] | None:
+    """Return the map of a source as a manifest holds it; None for those that ship with starcat."""
+    table = None if name in _shipped_names() else data_source(name).table
+    return table.recorded() if table else None

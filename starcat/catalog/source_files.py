@@ -77,7 +77,7 @@ class SourceFiles:
         if not found:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
         # Files may have any names; only those of the archive say what is in them.
-        named = [path for path, _ in found if named_layout(source, path)]
+        named = [] if source.table else [path for path, _ in found if named_layout(source, path)]
         numbered = enumerate(found)
         files = cls(source, tuple(InputFile(*each, source.name, n) for n, each in numbered))
         files._check_duplicates(
@@ -175,12 +175,15 @@ def _few(names: Sequence[str]) -> str:
 
 def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, RecordFile]]:
     found: list[tuple[Path, RecordFile]] = []
+    if source.table is not None and (parts := table_parts(folder)):
+        return [(path, source.files[0]) for path in parts]
     for layout in source.files:
         paths = _layout_in_folder(source, layout, folder)
         if not paths and not layout.optional:
             raise SourceMissing(
-                f"{source.name}: {folder} has no {layout.file_names[0]}[.gz]; fetch it with "
-                f"'starcat fetch {source.name}' or name the file itself",
+                f"{source.name}: {folder} has no {layout.file_names[0]}[.gz]; "
+                + (f"fetch it with 'starcat fetch {source.name}' or " if not source.table else "")
+                + "name the file itself",
                 source=source.name,
                 path=folder,
             )
@@ -204,6 +207,16 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
                 path=folder,
             )
     return []
+
+
+def table_parts(folder: Path) -> list[Path]:
+    """Return the Parquet files of a HATS catalog, collection or folder of parts, in order.
+
+    What else a HATS catalog holds, such as margins and statistics, is no star.
+    """
+    inside = sorted(folder.rglob("dataset/Norder=*/**/*.parquet"))
+    inside = [path for path in inside if "_margin" not in path.relative_to(folder).parts[0]]
+    return inside or sorted(folder.glob("*.parquet"))
 
 
 def cache_folder() -> Path:
@@ -233,7 +246,8 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
     raise SourceMissing(
         f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with --input "
         f"{source_name}=PATH, set ${CATALOGS_VARIABLE} to the folder that has "
-        f"{source.files[0].file_names[-1]}[.gz], or run 'starcat fetch {source_name}'",
+        f"{source.files[0].file_names[-1]}[.gz]"
+        + (f", or run 'starcat fetch {source_name}'" if source.table is None else ""),
         source=source_name,
     )
 

@@ -144,11 +144,13 @@ def rebuild(
 
     Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
+    from starcat.artifact.manifest import read_manifest
+    from starcat.catalog.source import known_maps
+    from starcat.pipeline.rebuild import maps_in
     from starcat.pipeline.rebuild import rebuild as build_again
 
-    given = inputs_by_source(inputs)
-    with progress_bars() as progress:
-        rebuilt = build_again(artifact, given, output, progress)
+    with known_maps(maps_in(read_manifest(artifact))), progress_bars() as progress:
+        rebuilt = build_again(artifact, inputs_by_source(inputs), output, progress)
     show(json, rebuilt.as_dict(), print_rebuilt, rebuilt)
     if not rebuilt.is_identical:
         raise typer.Exit(ProductError.exit_code)

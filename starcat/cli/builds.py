@@ -22,6 +22,7 @@ from starcat.cli.options import (
     Changes,
     Input,
     Json,
+    OwnSources,
     PresetName,
     SpecFile,
     chosen_spec,
@@ -48,6 +49,7 @@ def build(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
+    sources: OwnSources = None,
     output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a different database of that name.")
@@ -120,7 +122,7 @@ def _print_facts(
     folder: Path, outcome: str, manifest: dict[str, Any], facts: dict[str, Any]
 ) -> None:
     report = folder / "report" / "index.html"
-    where = {"artifact": str(folder), "report": str(report), "outcome": outcome}
+    where = {"folder": str(folder), "report": str(report), "outcome": outcome}
     contents = {key: manifest[key] for key in ("sources", "products", "files")}
     print_json({**where, **facts, **contents})
 

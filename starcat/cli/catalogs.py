@@ -11,6 +11,7 @@ import typer
 from starcat.cli.console import print_json, print_table, print_things, progress_bars, say, show
 from starcat.cli.options import (
     Json,
+    OwnSources,
     Scheduler,
     Workers,
     inputs_by_source,
@@ -22,6 +23,7 @@ from starcat.errors import SourceError
 
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
+    from starcat.catalog.table_check import Checked
     from starcat.pipeline.match_summary import Summary
     from starcat.store.ingest import Stored
 
@@ -29,11 +31,28 @@ app = typer.Typer()
 
 
 @app.command()
-def sources(json: Json = False) -> None:
+def sources(
+    file: Annotated[
+        Path | None, typer.Argument(help="A table of your own, for --check or --draft.")
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(metavar="MAP.toml", help="Say what this map makes of the table FILE."),
+    ] = None,
+    draft: Annotated[
+        bool, typer.Option("--draft", help="Propose a map for the table FILE.")
+    ] = False,
+    json: Json = False,
+) -> None:
     """List the catalogs that starcat knows, and where each would be read from.
+
+    With --draft or --check, propose or check the map that makes a table of your own a source.
 
     Example: starcat sources
     """
+    if check is not None or draft or file is not None:
+        _about_table(file, check, draft=draft, as_json=json)
+        return
     found = _source_facts()
     show(json, found, _print_sources, found)
 
@@ -100,8 +119,11 @@ Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that d
 
 @app.command()
 def ingest(
-    source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
     output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
+    source: Annotated[
+        str | None, typer.Argument(help="A star catalog, such as sao; default: that of --source.")
+    ] = None,
+    sources: OwnSources = None,
     inputs: Annotated[
         list[str] | None,
         typer.Option(
@@ -130,6 +152,7 @@ def ingest(
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
+    source = _one_source(source, sources)
     paths = locate(source, inputs_by_source(inputs, source))
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
@@ -154,6 +177,16 @@ def ingest(
     with progress_bars() as progress:
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
     print_stored(stored, as_json=json)
+
+
+def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
+    """Return the source that a command is about: the named one, or that of the first map."""
+    from starcat.catalog.source import data_source
+    from starcat.errors import ConfigError
+
+    if name is None and not maps:
+        raise ConfigError("name a source, such as sao, or a map with --source", key="source")
+    return data_source(name or str((maps or [])[0])).name
 
 
 @app.command()
@@ -210,6 +243,69 @@ def _source_facts() -> list[dict[str, Any]]:
         facts = {fact: getattr(source, fact) for fact in names}
         found.append({**facts, "found_at": place or None})
     return found
+
+
+def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json: bool) -> None:
+    from starcat.catalog.source import give_map
+    from starcat.catalog.table_check import check_map
+    from starcat.catalog.table_draft import draft_map
+    from starcat.errors import ConfigError
+
+    if file is None or draft == (check is not None):
+        raise ConfigError(
+            "a table goes with one of --draft and --check; write 'starcat sources --draft FILE' or "
+            "'starcat sources --check MAP.toml FILE'"
+        )
+    if check is None:
+        made = draft_map(file)
+        show(
+            as_json,
+            {"toml": made.as_toml(), "columns": made.used},
+            typer.echo,
+            made.as_toml().rstrip(),
+        )
+        return
+    source = give_map(check)
+    found = check_map(source, file)
+    show(as_json, found.as_dict(), _print_checked, found)
+
+
+def _print_checked(found: Checked) -> None:
+    cells = [
+        (
+            one["key"],
+            str(one["from"]),
+            " > ".join(dict.fromkeys(filter(None, (one["unit"], one["becomes"])))),
+            "" if one["least"] is None else f"{one['least']:.6g}",
+            "" if one["greatest"] is None else f"{one['greatest']:.6g}",
+            f"{one['missing']:,}" if one["true"] is None else f"true in {one['true']:,}",
+        )
+        for one in found.values
+    ]
+    head = ("value", "from", "unit", "least", "greatest", "missing")
+    print_table(f"{found.source} ({found.form})", head, cells, numbers=(3, 4, 5))
+    rows = [
+        (
+            str(row["row"]),
+            row["designation"] or row["reason"],
+            *(_short(row[name]) for name in ("ra_deg", "dec_deg", "epoch_jyear")),
+            *(_short(row[f"pm_{axis}_mas_yr"]) for axis in ("ra_cosdec", "dec")),
+            _short(row["mag"]) + (f" {row['band']}" if row["band"] else ""),
+            row["detail"] or " ".join(k for k in ("double", "variable") if row[f"is_flagged_{k}"]),
+        )
+        for row in found.first
+    ]
+    told = ("row", "star", "ra_deg", "dec_deg", "epoch", "pm_ra", "pm_dec", "mag", "")
+    print_table("First rows, in ICRS", told, rows, numbers=(0, 2, 3, 4, 5, 6, 7))
+    if found.unused:
+        say(f"columns that the map does not name: {', '.join(found.unused)}")
+    facts = found.as_dict()
+    facts = {**facts, "rows_read": facts["rows"], "notes": ()}
+    _print_records(facts, f"{found.source}: understood", as_json=False)
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{value:.5f}".rstrip("0").rstrip(".")
 
 
 def _print_sources(found: Sequence[dict[str, Any]]) -> None:

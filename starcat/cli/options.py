@@ -49,6 +49,23 @@ Input = Annotated[
     list[str] | None,
     typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
 ]
+
+
+def _know(maps: list[Path] | None) -> list[Path] | None:
+    from starcat.catalog.source import give_map
+
+    for path in maps or []:
+        give_map(path)
+    return maps
+
+
+OwnSources = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--source", metavar="MAP.toml", callback=_know, is_eager=True,
+        help="Map of a table of your own, which is a source from then on. Repeatable.",
+    ),
+]  # fmt: skip
 SpecFile = Annotated[Path | None, typer.Argument(help="A build spec (TOML).")]
 PresetName = Annotated[str | None, typer.Option(help="A spec that ships with starcat.")]
 Changes = Annotated[

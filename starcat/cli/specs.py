@@ -22,6 +22,7 @@ from starcat.cli.options import (
     Changes,
     Input,
     Json,
+    OwnSources,
     PresetName,
     SpecFile,
     camera_of_options,
@@ -79,6 +80,7 @@ def estimate(
     preset: PresetName = None,
     changes: Changes = None,
     inputs: Input = None,
+    sources: OwnSources = None,
     json: Json = False,
 ) -> None:
     """Say what a spec will give without building it: guide stars, fields, files, time, memory.

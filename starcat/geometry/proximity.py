@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import chord_from_separation, separation
@@ -38,7 +38,7 @@ def nearest_chords(
     of stars, where there is no other star.
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
-    tree = cKDTree(stars, leafsize=16, balanced_tree=False)
+    tree = scipy.spatial.cKDTree(stars, leafsize=16, balanced_tree=False)
     chord, found = _nearest(tree, points, 3, workers)
     # Nearly always a point finds itself, one star and, farther away, another.
     best, index = chord[:, 1].copy(), found[:, 1].copy()
@@ -60,7 +60,7 @@ def nearest_chords(
 
 
 def _nearest(
-    tree: cKDTree, points: Directions, count: int, workers: int
+    tree: scipy.spatial.cKDTree, points: Directions, count: int, workers: int
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return chords and rows of the nearest stars of each point.
 
@@ -94,7 +94,7 @@ def pairs_within(
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
     # The search is a little wider than asked, and its result is trimmed by separation.
     radius = chord_from_separation(max_separation_rad) * (1.0 + 1e-9) + 1e-15
-    found = cKDTree(directions).query_pairs(radius, output_type="ndarray")
+    found = scipy.spatial.cKDTree(directions).query_pairs(radius, output_type="ndarray")
     # Both rows are packed into one number, as sorting numbers is several times faster.
     key = np.sort((found[:, 0].astype(np.int64) << 32) | found[:, 1])
     pairs = np.stack([key >> 32, key & 0xFFFFFFFF], axis=-1)

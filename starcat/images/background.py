@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.special import erf, ndtri
 
 from starcat.arrays import Array, Mask
 from starcat.errors import ConfigError
@@ -102,7 +101,7 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
     if max(excess) < _WHITE_EXCESS:
         return levels  # white, within what a few boxes tell
     # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
-    smooth = gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
+    smooth = scipy.ndimage.gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
     for box in _BOXES_PX:
         levels = _in_boxes(raw, smooth, mask, least, box)
         fine, coarse = _excess(levels)
@@ -132,7 +131,7 @@ def _excess(levels: Levels) -> tuple[float, float]:
     boxes = _sample(levels)
     fine, coarse = _EXCESS_SIGMA_PX
     smooth = _smooth_boxes(boxes, fine)
-    star = maximum_filter(np.abs(smooth), (1, 9, 9)) > _STAR_NOISE * _white(fine)
+    star = scipy.ndimage.maximum_filter(np.abs(smooth), (1, 9, 9)) > _STAR_NOISE * _white(fine)
     sky = star.mean(axis=(1, 2)) < 0.5
     if not sky.any():
         return 1.0, np.inf
@@ -148,7 +147,7 @@ def _white(sigma: float) -> float:
 
 
 def _smooth_boxes(boxes: NDArray[Any], sigma: float) -> NDArray[np.float32]:
-    smooth = gaussian_filter(boxes, (0.0, sigma, sigma), mode="reflect", truncate=3.0)
+    smooth = scipy.ndimage.gaussian_filter(boxes, (0.0, sigma, sigma), mode="reflect", truncate=3.0)
     return np.asarray(smooth, dtype=np.float32)
 
 
@@ -205,12 +204,14 @@ def _noise_above_black(values: Grey) -> float:
     beyond = (1.0 - cut) * float((left > value).mean())
     if not beyond:
         return 0.0
-    return float((value - black) / (ndtri(1.0 - beyond) - ndtri(cut)))
+    return float((value - black) / (scipy.special.ndtri(1.0 - beyond) - scipy.special.ndtri(cut)))
 
 
 def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     """Replace single bright pixels by the mean of their neighbours."""
-    centre, square = (erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5))
+    centre, square = (
+        scipy.special.erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5)
+    )
     y, x = np.nonzero(levels.above > _HOT_NOISE * levels.noise)
     around = pixels_around(levels.above, x, y).astype(np.float64)
     pixel = around[:, 1, 1]

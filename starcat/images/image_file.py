@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import convolve1d
 
 from starcat.arrays import Array
 from starcat.errors import ConfigError, FileMissing, reason
@@ -317,7 +317,7 @@ def grey_of_mosaic(image: NDArray[Any]) -> NDArray[Any]:
     """Return the light of a mosaic of colour filters, at the mosaic's own resolution."""
     grey = np.asarray(image, dtype=np.float64)
     for axis in (0, 1):
-        grey = convolve1d(grey, _BINOMIAL, axis=axis, mode="mirror")
+        grey = scipy.ndimage.convolve1d(grey, _BINOMIAL, axis=axis, mode="mirror")
     return np.asarray(grey)
 
 

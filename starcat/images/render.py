@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
@@ -73,7 +73,7 @@ def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's light in the pixels along one axis, and the first of these pixels."""
     first = np.floor(np.clip(centre, -1e9, 1e9) - _REACH_SIGMA * sigma).astype(np.int64)
     edges = first[:, None] + np.arange(int(np.ceil(2.0 * _REACH_SIGMA * sigma)) + 2)
-    below = 0.5 * erf((edges - centre[:, None]) / (np.sqrt(2.0) * sigma))
+    below = 0.5 * scipy.special.erf((edges - centre[:, None]) / (np.sqrt(2.0) * sigma))
     return np.diff(below, axis=1), first
 
 

@@ -18,13 +18,14 @@ import pyarrow as pa
 
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
+from starcat.catalog.doubles import PairTable, read_wds
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.observed import with_observed
 from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import validity, with_span
 from starcat.catalog.stars import directions_of, sort_rows
-from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
+from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.errors import BuildError, ConfigError
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
@@ -60,6 +61,8 @@ from starcat.storage.schema import product_schema
 from starcat.store.reading import read_catalog
 
 Inputs = Mapping[str, Sequence[Path]]
+
+JoinTable = AmplitudeTable | PairTable
 
 WITHOUT_MAGNITUDES = 50
 """So many frames of each kind are also identified without magnitudes, at the most: where that is
@@ -137,10 +140,10 @@ def _make(
     progress: Progress,
 ) -> Built:
     """Go through all stages up to the manifest, in a folder that has no name yet."""
-    catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+    catalog, joins = read_sources(spec, inputs, workers, progress)
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
-    stars, joined = join_all(catalog.stars, amplitudes)
+    stars, joined = join_all(catalog.stars, joins, spec)
     in_band = in_band_of(stars, spec, inputs, workers, progress)
     stars = with_observed(in_band.stars, spec.selection.observed)
     stars = with_span(stars, spec.span_jyear)
@@ -159,7 +162,7 @@ def _make(
     rates = run_self_test(partial, spec, progress)
     clock.lap("self-test")
     progress("report", 0, None)
-    star_source, *others = all_source_facts(catalog, selected, amplitudes, joined)
+    star_source, *others = all_source_facts(catalog, selected, joins, joined)
     sources = [star_source, *motion_sources(motions, products), *others]
     sources += [*in_band.sources, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
@@ -189,9 +192,8 @@ def _make(
 
 def read_sources(
     spec: BuildSpec, inputs: Inputs, workers: int, progress: Progress
-) -> tuple[Ingested, list[AmplitudeTable]]:
-    """Read the star catalog and the sources of amplitudes."""
-    joins = spec.selection.variables.join
+) -> tuple[Ingested, list[JoinTable]]:
+    """Read the star catalog and the sources of amplitudes and doubles."""
     check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
     paths = {name: locate(name, inputs) for name in spec.sources}
@@ -205,7 +207,10 @@ def read_sources(
         workers=workers,
         progress=progress,
     )
-    return catalog, [read_amplitudes(name, paths[name], progress) for name in joins]
+    selection, tables = spec.selection, list[JoinTable]()
+    tables += [read_amplitudes(name, paths[name], progress) for name in selection.variables.join]
+    tables += [read_wds(paths[name], progress) for name in selection.doubles.join]
+    return catalog, tables
 
 
 def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
@@ -221,12 +226,12 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
 
 
 def join_all(
-    stars: pa.Table, amplitudes: Sequence[AmplitudeTable]
+    stars: pa.Table, tables: Sequence[JoinTable], spec: BuildSpec
 ) -> tuple[pa.Table, dict[str, int]]:
-    """Join amplitudes to a star table."""
+    """Join amplitudes and doubles to a star table."""
     joined: dict[str, int] = {}
-    for table in amplitudes:
-        stars, joined[table.source] = join_amplitudes(stars, table)
+    for table in tables:
+        stars, joined[table.source] = table.join(stars, spec.selection)
     return stars, joined
 
 

@@ -70,9 +70,9 @@ def read_snapshot(
     spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> CatalogSnapshot:
     """Read the catalogs of a spec, as its build does."""
-    catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+    catalog, joins = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
-    stars, _ = join_all(joined.catalog.stars, amplitudes)
+    stars, _ = join_all(joined.catalog.stars, joins, spec)
     in_band = in_band_of(stars, spec, inputs, workers, progress)
     stars = with_observed(in_band.stars, spec.selection.observed)
     stars = with_span(stars, spec.span_jyear)
@@ -96,6 +96,8 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
+    if spec.selection.doubles.join:  # what it flags depends on what the sensor tells apart
+        wanted["doubles"] = content["selection"]["doubles"]
     if spec.selection.observed != Observed():
         wanted["observed"] = content["selection"]["observed"]
     if spec.camera.response.name is not None:

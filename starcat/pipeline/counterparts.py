@@ -25,6 +25,7 @@ from starcat.artifact.other_catalogs import (
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
@@ -176,7 +177,8 @@ def read_and_match(
 def source_facts(read: Ingested, role: str) -> SourceFacts:
     """Return what the manifest says of a catalog of which all stars are used."""
     rejected = read.rejected_by_reason
-    return SourceFacts(read.source, role, read.files, read.rows_read, len(read.stars), rejected)
+    counted = (read.rows_read, len(read.stars), rejected)
+    return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
 
 
 def _in_order(tables: Sequence[pa.Table]) -> pa.Table:

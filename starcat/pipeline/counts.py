@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+import scipy
 
 from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation
@@ -109,13 +108,13 @@ def _neighbours_within(directions: Array, radii_rad: set[float]) -> Mapping[floa
     """Return the number of neighbours within each radius of some of the stars."""
     some = directions[:: -(-len(directions) // SAMPLE)]
     found: dict[float, Array] = {}
-    trees: dict[int, cKDTree] = {}
+    trees: dict[int, scipy.spatial.cKDTree] = {}
     for radius in radii_rad:
         # Wide circles hold so many stars that some of these tell of all.
         share = 0.5 * (1.0 - np.cos(min(radius, np.pi)))
         thinning = 1 + int(len(directions) * max(share * len(some) / MOST_MET, 1.0 / MOST_IN_TREE))
         if thinning not in trees:
-            trees[thinning] = cKDTree(directions[::thinning])
+            trees[thinning] = scipy.spatial.cKDTree(directions[::thinning])
         near = trees[thinning].query_ball_point(some, _chord(radius), return_length=True)
         # Every star finds itself, in a tree of all of them.
         found[radius] = np.maximum(thinning * near - 1.0, 0.0)
@@ -152,7 +151,7 @@ def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[flo
     if not records:
         return 0.0, 0.0
     held = np.ones(len(star), dtype=np.int32)
-    of_field = csr_array((held, star, offsets), shape=(len(size), stars))
+    of_field = scipy.sparse.csr_array((held, star, offsets), shape=(len(size), stars))
     of_star = of_field.T.tocsr()
     generator = np.random.default_rng(0)
     field = generator.choice(len(size), SAMPLE, p=each / records)

@@ -10,7 +10,7 @@ from typing import Any
 from starcat.artifact.diff import Change, changes_between
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.catalog.source import data_source
+from starcat.catalog.source import data_source, known_maps
 from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
@@ -52,11 +52,18 @@ def rebuild(
     old = open_artifact(artifact)
     spec = old.spec
     check_inputs(spec, inputs)
-    found = _same_inputs(old, inputs, progress)
-    if output is not None:
-        return _compare(old, build(spec, found, output, progress=progress).folder)
-    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-        return _compare(old, build(spec, found, Path(folder), progress=progress).folder)
+    # A table of one's own is read as its map was when the database was built.
+    with known_maps(maps_in(old.manifest)):
+        found = _same_inputs(old, inputs, progress)
+        if output is not None:
+            return _compare(old, build(spec, found, output, progress=progress).folder)
+        with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+            return _compare(old, build(spec, found, Path(folder), progress=progress).folder)
+
+
+def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the maps of a manifest."""
+    return [facts["map"] for facts in manifest["sources"] if "map" in facts]
 
 
 def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:

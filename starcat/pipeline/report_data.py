@@ -13,6 +13,7 @@ from starcat.arrays import Directions
 from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
+from starcat.catalog.doubles import PairTable
 from starcat.catalog.ingest import Ingested, count_by_reason
 from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
@@ -80,7 +81,7 @@ def coverage_report(
 def all_source_facts(
     catalog: Ingested,
     selected: Selected,
-    amplitudes: Sequence[AmplitudeTable],
+    joins: Sequence[AmplitudeTable | PairTable],
     joined: Mapping[str, int],
 ) -> list[SourceFacts]:
     """Return what went into a build as the manifest has it."""
@@ -94,14 +95,14 @@ def all_source_facts(
         *(
             SourceFacts(
                 table.source,
-                "variability",
+                table.role,
                 table.files,
                 sum(file.rows for file in table.files),
                 table.kept,
                 table.rejected,
                 joined[table.source],
             )
-            for table in amplitudes
+            for table in joins
         ),
     ]
 

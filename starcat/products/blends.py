@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import chndtr
 
 from starcat.arrays import Array, Mask, Rows
 
@@ -117,7 +117,7 @@ def blends(
     centroid = _settled(start, star, offset, light, widths.both)
     apart = np.sum(((offset - centroid[star]) / widths.spot) ** 2, axis=1)
     alone = -np.expm1(-0.5 * APERTURE_SIGMA**2)
-    part = light * chndtr(APERTURE_SIGMA**2, 2.0, apart) / alone
+    part = light * scipy.special.chndtr(APERTURE_SIGMA**2, 2.0, apart) / alone
     total = np.bincount(star, part, count).astype(np.float64)  # whole numbers of no stars
     own = part[:count]  # the stars themselves are first
     return Blends(centroid, total, 1.0 - own / total, is_lost)

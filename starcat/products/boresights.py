@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions, Mask
 from starcat.geometry.sphere import (
@@ -99,8 +99,8 @@ def stars_in_fields(
         none = np.zeros(len(boresights) + 1, dtype=np.int64)
         return FieldStars(boresights, none, np.empty(0, dtype=np.int32))
     chord = chord_from_separation(radius) * (1.0 + 1e-9)
-    near = cKDTree(boresights).sparse_distance_matrix(
-        cKDTree(directions), chord, output_type="ndarray"
+    near = scipy.spatial.cKDTree(boresights).sparse_distance_matrix(
+        scipy.spatial.cKDTree(directions), chord, output_type="ndarray"
     )
     tile, star = near["i"], near["j"]
     if field == "circular":

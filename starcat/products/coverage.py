@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions, separation
@@ -158,8 +158,8 @@ def covering_radius(directions: Directions) -> tuple[float, Array]:
     54.736
     """
     try:
-        hull = ConvexHull(directions)
-    except QhullError:  # fewer than 4 directions, or all in one plane
+        hull = scipy.spatial.ConvexHull(directions)
+    except scipy.spatial.QhullError:  # fewer than 4 directions, or all in one plane
         return _farthest(_opposite_to_circle(directions), directions)
     centres = hull.equations[:, :3]
     radii = separation(centres, directions[hull.simplices[:, 0]])
@@ -178,7 +178,7 @@ def _widest(centres: Array, radii: Array) -> tuple[float, Array]:
 
 
 def _farthest(candidates: Array, directions: Directions) -> tuple[float, Array]:
-    _, nearest = cKDTree(directions).query(candidates)
+    _, nearest = scipy.spatial.cKDTree(directions).query(candidates)
     return _widest(candidates, separation(candidates, directions[nearest]))
 
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation, separation
@@ -172,7 +172,7 @@ def _near(query: Array, radii: Array, others: Array) -> Iterator[tuple[Rows, Row
     A piece is searched with the largest of its radii, at most half as wide again as its least:
     most radii are nearly the same, and the few wide ones do not slow down the others.
     """
-    tree = cKDTree(others, leafsize=32, balanced_tree=False)
+    tree = scipy.spatial.cKDTree(others, leafsize=32, balanced_tree=False)
     order = np.argsort(radii, kind="stable")
     ascending = radii[order]
     start = 0
@@ -180,7 +180,7 @@ def _near(query: Array, radii: Array, others: Array) -> Iterator[tuple[Rows, Row
         alike = int(np.searchsorted(ascending, 1.5 * ascending[start], side="right"))
         end = min(alike, start + CHUNK)
         piece = order[start:end]
-        part = cKDTree(query[piece], leafsize=32, balanced_tree=False)
+        part = scipy.spatial.cKDTree(query[piece], leafsize=32, balanced_tree=False)
         chord = _chord(float(ascending[end - 1]))
         found = part.sparse_distance_matrix(tree, chord, output_type="ndarray")
         yield piece[found["i"]], found["j"].astype(np.int64)

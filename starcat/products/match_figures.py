@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions, Mask
 from starcat.geometry.sphere import saff_kuijlaars
@@ -150,10 +150,10 @@ def tiles_of(directions: Directions) -> Rows:
 
 
 @cache
-def _tiles() -> tuple[cKDTree, Rows]:
+def _tiles() -> tuple[scipy.spatial.cKDTree, Rows]:
     """Return a tree of the tiles' middles, and the tiles around each."""
     middles = saff_kuijlaars(TILES)
-    tree = cKDTree(middles)
+    tree = scipy.spatial.cKDTree(middles)
     return tree, np.asarray(tree.query(middles, k=TILES_AVERAGED)[1], dtype=np.int64)
 
 

@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array
 from starcat.products.match_figures import Figures, MatchModel, MovingStars, Pairs, tiles_of
@@ -197,8 +196,8 @@ def _small_rings(star: Rows, candidate: Rows) -> Iterator[Rows]:
     stars, i = np.unique(star, return_inverse=True)
     candidates, j = np.unique(candidate, return_inverse=True)
     nodes = len(stars) + len(candidates)
-    edges = coo_array((np.ones(len(i)), (i, len(stars) + j)), shape=(nodes, nodes))
-    _, label = connected_components(edges, directed=False)
+    edges = scipy.sparse.coo_array((np.ones(len(i)), (i, len(stars) + j)), shape=(nodes, nodes))
+    _, label = scipy.sparse.csgraph.connected_components(edges, directed=False)
     of_pair = np.asarray(label, dtype=np.int64)[i]
     order = np.argsort(of_pair, kind="stable")
     first, pairs = runs(of_pair[order])

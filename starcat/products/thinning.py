@@ -11,8 +11,8 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.attitude import information_terms
@@ -85,8 +85,8 @@ def cell_areas(directions: Directions) -> tuple[Array, NDArray[np.int64]]:
     """
     areas = np.zeros(len(directions))
     try:
-        hull = ConvexHull(directions)
-    except QhullError:
+        hull = scipy.spatial.ConvexHull(directions)
+    except scipy.spatial.QhullError:
         return np.full(len(directions), 4.0 * np.pi / len(directions)), np.empty((0, 3), np.int64)
     centre, corners = hull.equations[:, :3], hull.simplices.astype(np.int64)
     ends = [directions[corners[:, k]] for k in range(3)]

@@ -41,7 +41,7 @@ class Pulled:
         release = self.release
         return {
             "outcome": self.outcome,
-            "artifact": str(self.folder),
+            "folder": str(self.folder),
             "registry": self.registry,
             "name": release.name,
             "version": release.version,

@@ -13,8 +13,8 @@ from functools import cache, lru_cache
 from html import escape
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, saff_kuijlaars
@@ -69,7 +69,7 @@ def nearest_raster(boresights: Array, values: Array | Counts, width: int) -> Arr
     inside = np.abs(east) <= np.pi
     ra_deg = np.degrees(-east)[inside]
     dec_deg = np.degrees(np.broadcast_to(dec, east.shape))[inside]
-    _, nearest = cKDTree(boresights).query(directions_from_radec(ra_deg, dec_deg))
+    _, nearest = scipy.spatial.cKDTree(boresights).query(directions_from_radec(ra_deg, dec_deg))
     raster = np.full((height, width), np.nan)
     raster[inside] = values[nearest]
     return raster
@@ -364,5 +364,5 @@ def _groups(fields: int, dots: int) -> Counts:
     """Return the dot that each field of a tiling belongs to."""
     if fields == dots:
         return np.arange(fields)
-    _, nearest = cKDTree(saff_kuijlaars(dots)).query(saff_kuijlaars(fields))
+    _, nearest = scipy.spatial.cKDTree(saff_kuijlaars(dots)).query(saff_kuijlaars(fields))
     return np.asarray(nearest, dtype=np.int64)

@@ -18,7 +18,7 @@ import numpy as np
 from cachetools import LRUCache
 
 from starcat.catalog.parts import CATALOGS
-from starcat.catalog.source import DataSource, data_source
+from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
@@ -100,7 +100,7 @@ class Catalogs:
         with self._lock:
             known = [catalog for _, catalog in self._read.values()]
         found = []
-        for name in CATALOGS:
+        for name in (*CATALOGS, *filter(is_here, set(star_sources()) - set(CATALOGS))):
             read = tuple(one for one in known if one.source == name)
             found.append(Offered(data_source(name), is_here(name), read))
         return sorted(found, key=lambda one: not one.is_here)
@@ -257,7 +257,7 @@ def _check_size(spec: BuildSpec) -> None:
 
 def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
     """Return the sources that an estimate reads: counterparts are none of them."""
-    names = (spec.catalog.source, *spec.catalog.motions, *spec.selection.variables.join)
+    names = (spec.catalog.source, *spec.catalog.motions, *spec.joins)
     return tuple(dict.fromkeys(names))
 
 

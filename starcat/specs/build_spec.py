@@ -19,6 +19,7 @@ from starcat.specs.camera_exposure import (
     with_limits,
 )
 from starcat.specs.camera_response import CameraResponse
+from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
 from starcat.specs.neighbour_rule import NeighbourRule
 from starcat.specs.product_sections import (
@@ -36,7 +37,7 @@ MOST_BINS = 10_000_000
 
 LATER_KEYS = (
     *("products.levels", "catalog.motions", "selection.neighbours"),
-    *("selection.thinning", "selection.observed"),
+    *("selection.thinning", "selection.observed", "selection.doubles.join"),
     *("camera.response", "camera.exposure", "selection.max_drift_arcsec"),
 )
 """Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
@@ -61,7 +62,7 @@ class Catalog(Section):
     read_limit_mag: Mag | None = Field(
         None, description="fainter records, and those without magnitude, are counted and left out"
     )
-    motions: tuple[Literal["hipparcos", "tycho2"], ...] = Field(
+    motions: tuple[Literal["hipparcos", "hipparcos2", "tycho2"], ...] = Field(
         (),
         strict=False,  # a list in TOML
         description="catalogs that supply missing proper motions, in order of preference; found "
@@ -78,51 +79,6 @@ class Catalog(Section):
         if len(set(self.motions)) != len(self.motions):
             raise ValueError(f"motions: a catalog is named twice: {', '.join(self.motions)}")
         return self
-
-
-class Doubles(Section):
-    """Stars too close for the sensor to tell apart."""
-
-    min_separation_deg: float = Field(
-        0.047, ge=0.0, le=10.0, description="stars that are closer are a double"
-    )
-    max_delta_mag: float | None = Field(
-        None,
-        ge=0.0,
-        le=30.0,
-        description="a companion fainter by more does not count; default: every one counts",
-    )
-    companion_limit_mag: Mag | None = Field(
-        None, description="stars up to here count as companions; default: faint_limit_mag"
-    )
-    action: Literal["remove", "merge", "keep"] = Field(
-        "remove", description="remove both, merge them into their photocentre, or keep them"
-    )
-    flags: Literal["ignore", "unresolved", "strict"] = Field(
-        "unresolved",
-        description="what an archive's flag of a double means: nothing; a rejection if the "
-        "separation is below the limit or unknown and the magnitudes are known to be close; or "
-        "always a rejection",
-    )
-
-
-class Variables(Section):
-    """Stars whose brightness cannot be relied on."""
-
-    max_amplitude_mag: float | None = Field(
-        0.6, ge=0.0, le=30.0, description="stars with a larger amplitude are rejected"
-    )
-    flags: Literal["ignore", "known", "strict"] = Field(
-        "ignore",
-        description="what an archive's flag of a variable means: nothing; a rejection of those "
-        "without a known amplitude; or always a rejection",
-    )
-    join: tuple[Literal["hipparcos", "tycho1", "gcvs"], ...] = Field(
-        (),
-        strict=False,  # a list in TOML
-        description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number",
-        examples=[["hipparcos"]],
-    )
 
 
 class Observed(Section):
@@ -471,11 +427,16 @@ class BuildSpec(Section):
         return middle_of(self.epoch_jyear)
 
     @property
+    def joins(self) -> tuple[str, ...]:
+        """Names of the sources that say what stars are doubles or vary, in the order of joining."""
+        return *self.selection.variables.join, *self.selection.doubles.join
+
+    @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        joined = (*self.selection.variables.join, *self.camera.response.photometry)
-        names = [self.catalog.source, *self.catalog.motions, *joined]
+        names = [self.catalog.source, *self.catalog.motions, *self.joins]
+        names += self.camera.response.photometry
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:

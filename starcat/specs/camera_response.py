@@ -52,7 +52,9 @@ class CameraResponse(Section):
     )
     optics_wavelength_nm: Column = Field((), description="wavelengths of the optics, rising")
     optics_transmission: Column = Field((), description="transmission at each, of any scale")
-    photometry: tuple[Literal["gaia", "hipparcos", "tycho1", "tycho2", "2mass"], ...] = Field(
+    photometry: tuple[
+        Literal["gaia", "hipparcos", "hipparcos2", "tycho1", "tycho2", "2mass"], ...
+    ] = Field(
         (),
         strict=False,  # a list in TOML
         description="catalogs whose bands and colours are used as well, found as "

@@ -157,7 +157,9 @@ class Crossmatch(Product):
     """Counterparts of the guide stars in other catalogs."""
 
     enabled: bool = Field(False, description="whether the database has this product")
-    catalogs: tuple[Literal["sao", "hipparcos", "tycho1", "tycho2", "2mass", "gaia"], ...] = Field(
+    catalogs: tuple[
+        Literal["sao", "hipparcos", "hipparcos2", "tycho1", "tycho2", "2mass", "gaia"], ...
+    ] = Field(
         (),
         strict=False,  # a list in TOML
         description="star catalogs to look for counterparts in",

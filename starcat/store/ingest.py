@@ -21,7 +21,7 @@ import numpy as np
 
 from starcat.catalog.ingest import ingest_options
 from starcat.catalog.parts import NAMED_PROBLEMS
-from starcat.catalog.source import data_source
+from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
@@ -128,6 +128,7 @@ def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
     reading = plan.ingest
     return {
         "source": reading.source_name,
+        "map": map_of(reading.source_name),
         "band": reading.band,
         "epoch_jyear": reading.epoch_jyear,
         "read_limit_mag": reading.read_limit_mag,

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.catalog.parts import IngestOptions
+from starcat.catalog.source import map_of
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.storage.digests import json_bytes
@@ -164,6 +165,7 @@ def make_manifest(
     return {
         "store_version": MANIFEST_VERSION,
         "source": options.source_name,
+        **({"map": table_map} if (table_map := map_of(options.source_name)) else {}),
         "band": options.band,
         "epoch_jyear": options.epoch_jyear,
         "read_limit_mag": options.read_limit_mag,

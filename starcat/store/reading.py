@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 
 from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
+from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts
 from starcat.catalog.stars import Columns, floats_of, move_to_epoch, table_from_columns
 from starcat.catalog.verdict import Reason
@@ -53,7 +54,9 @@ _PLACE = (
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
     """Read a star catalog from a store or from archive files; what is chosen is as for `ingest`."""
-    if not any(path.is_dir() and is_store(path) for path in paths):
+    stores = [path for path in paths if path.is_dir() and is_store(path)]
+    is_mapped = data_source(source_name).table is not None
+    if not stores or (is_mapped and not any(open_store(path).is_ours for path in stores)):
         return ingest(source_name, paths, **chosen)
     if len(paths) > 1:
         raise ConfigError(
@@ -142,18 +145,19 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
     limit, wanted = manifest["read_limit_mag"], options.read_limit_mag
     fits = {
         "source": manifest["source"] == options.source_name,
+        "map": manifest.get("map") == map_of(options.source_name),
         "band": manifest["band"] == options.band,
         "epoch_jyear": manifest["epoch_jyear"] in (None, options.epoch_jyear),
         "read_limit_mag": limit is None or (wanted is not None and wanted <= limit),
     }
     for key in (key for key, does in fits.items() if not does):
-        asked = options.source_name if key == "source" else getattr(options, key)
+        asked = {"source": options.source_name, "map": "another"}.get(key) or getattr(options, key)
         option = f" --band '{options.band}'" if key == "band" else ""
         raise ConfigError(
-            f"{store.folder}: the store has {key} {manifest[key]}, {asked} is asked for; make one "
-            f"that fits with 'starcat ingest {options.source_name} --to hats{option} -o DIR'",
+            f"{store.folder}: the store has {key} {manifest.get(key)}, {asked} is asked for; make "
+            f"one that fits with 'starcat ingest {options.source_name} --to hats{option} -o DIR'",
             key=key,
-            value=manifest[key],
+            value=manifest.get(key),
         )
 
 

@@ -1,4 +1,4 @@
-"""Archives of stars that do not exist, in the true layout of all seven sources.
+"""Archives of stars that do not exist, in the true layout of all ten sources.
 
 ``archive_records`` writes the stars of a sky as the records of an archive, field by field from
 the layout in ``data_sources``. The same star has the same HIP and HD number in every archive, so
@@ -362,9 +362,93 @@ def _gcvs(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
     return {"gcvs": _rows(columns)}
 
 
+def _hipparcos2(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    then = sky.at(1991.25)
+    is_double, varies = sky.rho_arcsec > 0, sky.amplitude_mag > 0.2
+    columns = {
+        "hip": sky.hip,
+        "sn": 10 * (is_double.astype(int) + 2 * varies) + 5,
+        "so": 3 * is_double,
+        "nc": 1 + is_double,
+        "ra_rad": np.minimum(np.radians(then.ra_deg % 360.0), 6.2831853),
+        "de_rad": np.radians(then.dec_deg),
+        "plx": [5.0] * len(sky),
+        "pm_ra": sky.pm_ra_cosdec_mas_yr,
+        "pm_de": sky.pm_dec_mas_yr,
+        **_full(len(sky), e_ra=0.5, e_de=0.4, e_plx=0.6, e_pm_ra=0.7, e_pm_de=0.5),
+        "hp_mag": sky.v_mag + 0.1,
+        "e_hp_mag": [0.001] * len(sky),
+        "s_hp": [0.01] * len(sky),
+        "va": varies.astype(int),
+        "b_v": sky.b_v,
+        "v_i": 1.1 * sky.b_v,
+    }
+    return {"hip2": _rows(columns)}
+
+
+def _place(sky: Sky) -> list[str]:
+    """Return places as WDS writes them."""
+    tenths = np.rint(np.abs(sky.dec_deg) * 36_000.0).astype(np.int64)
+    cs = np.rint(sky.ra_deg * 24_000.0).astype(np.int64) % 8_640_000
+    return [
+        f"{a // 360_000:02d}{a // 6_000 % 60:02d}{a % 6_000 / 100:05.2f}"
+        f"{_sign(s)}{d // 36_000:02d}{d // 600 % 60:02d}{d % 600 / 10:04.1f}"
+        for a, d, s in zip(cs, tenths, sky.dec_deg, strict=True)
+    ]
+
+
+def _wds(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """The doubles, those with HIP numbers also in a file without magnitudes."""
+    some = sky.where(np.flatnonzero(sky.rho_arcsec > 0.0))
+    place = _place(some)
+    names = [f"{one[:4]}{int(float(one[4:9]) / 6)}{one[9:14]}" for one in place]
+    by_hip = {
+        "hip": some.hip.tolist(),
+        "wds": names,
+        "year": [2015] * len(some),
+        "pa": [316] * len(some),
+        "sep": [f"{rho:.1f}" for rho in some.rho_arcsec],
+    }
+    whole = {
+        "wds": names,
+        "discoverer": [f"SYN{n % 10_000:4d}" for n in range(len(some))],
+        **_full(len(some), obs_first=1900, obs_last=2015, n_obs=9, pa_first="310", pa_last="316"),
+        "sep_first": [f"{rho:5.1f}" for rho in some.rho_arcsec],
+        "sep_last": [f"{rho:5.1f}" for rho in some.rho_arcsec],
+        "mag_first": [f"{mag:5.2f}" for mag in some.v_mag],
+        "mag_second": [f"{mag + 0.66:5.2f}" for mag in some.v_mag],
+        "place": place,
+    }
+    return {"wds_hip": _rows(by_hip), "wds": _rows(whole)}
+
+
+def _vsx(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """The variables; of every third the minimum is an amplitude, in brackets."""
+    some = sky.where(np.flatnonzero(sky.amplitude_mag > 0.0))
+    row = np.arange(len(some))
+    is_amplitude = row % 3 == 0
+    columns = {
+        "oid": row + 1,
+        "name": [f"V{n + 100} Syn" for n in row],
+        "var_flag": [0] * len(some),
+        "ra_deg": np.minimum(some.ra_deg, 359.99999),
+        "de_deg": some.dec_deg,
+        "var_type": np.where(row % 2 == 0, "EA", "M").tolist(),
+        "mag_max": [f"{m:6.3f}" for m in some.v_mag],
+        "n_max": ["V"] * len(some),
+        "f_min": _given(is_amplitude, "("),
+        "mag_min": [
+            f"{a if own else m + a:6.3f}"
+            for a, m, own in zip(some.amplitude_mag, some.v_mag, is_amplitude, strict=True)
+        ],
+    }
+    return {"vsx": _rows(columns)}
+
+
 _WRITERS: dict[str, Callable[[Sky], dict[str, Iterator[dict[str, Any]]]]] = {
     "sao": _sao, "hipparcos": _hipparcos, "tycho1": _tycho1, "tycho2": _tycho2,
-    "2mass": _twomass, "gaia": _gaia, "gcvs": _gcvs,
+    "2mass": _twomass, "gaia": _gaia, "gcvs": _gcvs, "hipparcos2": _hipparcos2, "wds": _wds,
+    "vsx": _vsx,
 }  # fmt: skip
 
 
@@ -387,7 +471,7 @@ def file_header(layout: RecordFile, count: int) -> bytes:
     if layout.layout == "binary":
         header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
         return header.ljust(layout.header_bytes, b"\0")
-    return b"# Variable stars that do not exist\n" if layout.comment else b""
+    return b"# Stars that do not exist\n" if layout.comment else b""
 
 
 def plain_sao(count: int, faintest_mag: float = 6.4) -> list[bytes]:

@@ -95,6 +95,9 @@ def write_catalog_folder(folder: Path) -> None:
         "gcvs.tsv.gz": [
             file_header(data_source("gcvs").files[0], 0), *archive_records("gcvs", sky)["gcvs"]
         ],
+        "wds_hip.dat.gz": [
+            file_header(data_source("wds").files[0], 0), *archive_records("wds", sky)["wds_hip"]
+        ],
         "sky2000_v6.5.edb.gz": _sky2000(sky.where(np.arange(len(sky)) % 4 == 0)),
     }  # fmt: skip
     (folder / "samples").mkdir(parents=True, exist_ok=True)

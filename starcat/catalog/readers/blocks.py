@@ -12,7 +12,7 @@ from typing import cast
 
 from isal import igzip, isal_zlib
 
-from starcat.catalog.readers.records import line_ends
+from starcat.catalog.readers.records import Rows, line_ends
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
@@ -27,12 +27,13 @@ MAX_LINE_BYTES = 1 << 24
 
 @dataclass(frozen=True)
 class Block:
-    """Whole lines (or whole binary records) of one file."""
+    """Whole lines (or binary records, or rows of a table) of one file."""
 
     file: InputFile
     data: bytes
     first_line: int  # 1-based number of its first line (or record) in the file
     bytes_read: int = 0  # of the file as it lies on disk, when the block was whole
+    rows: Rows | None = None  # of a table, in place of the data
 
 
 class DigestReader(io.FileIO):

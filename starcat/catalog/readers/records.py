@@ -15,6 +15,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
@@ -39,12 +40,33 @@ class Problem:
     byte_range: tuple[int, int] | None  # of the field, 1-based inclusive
     found: str
     expected: str
+    what: str = "line"  # what is numbered
 
     def __str__(self) -> str:
         where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
-        return (
-            f"line {self.line}{where}, {self.field}: found {self.found}; expected {self.expected}"
-        )
+        place = f"{self.what} {self.line}{where}, {self.field}"
+        return f"{place}: found {self.found}; expected {self.expected}"
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """What a file says of one of its columns."""
+
+    name: str
+    is_text: bool = False
+    unit: str = ""
+    ucd: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some rows of a table."""
+
+    columns: dict[str, TableColumn]  # of the file
+    table: pa.Table  # the columns that were asked for
+    number: NDArray[np.int64]  # 1-based, of each row in the file
+    problems: list[Problem] = field(default_factory=list)  # rows that could not be read
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,15 @@ from starcat.service.api.databases import difference_of, fields_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
 from starcat.service.pages.downloads import image_choices
-from starcat.service.pages.facts import MANIFEST_DIGEST, database_rows, products_of, report_of
-from starcat.service.pages.notebook import Notebook, database_code, query_code
+from starcat.service.pages.facts import (
+    MANIFEST_DIGEST,
+    database_rows,
+    products_of,
+    rejections_of,
+    report_of,
+    star_columns,
+)
+from starcat.service.pages.notebook import Notebook, database_code, difference_code, query_code
 from starcat.service.pages.rendering import address_of, page_router, render
 from starcat.service.pages.sky import CACHED, view_of
 from starcat.service.service import Service, TheService
@@ -76,6 +83,7 @@ def one_database(
         **_head(service, database, "overview"),
         report=report_of(database),
         products=products_of(manifest),
+        rejections=rejections_of(manifest),
         image=image_choices(database),
         notebook=Notebook(database.title, database_code(address_of(request, service), database.id)),
         methods=[
@@ -117,6 +125,7 @@ def coverage_page(
         report=report_of(database),
         sky_map=sky_map(fields),
         fields=[field_at(fields, number) for number in numbers],
+        star_columns=["designation", "mag", *star_columns(database.manifest)],
         fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
         view=view_of(database, fields=f"/databases/{database.id}/fields.json"),
         order=order,
@@ -229,6 +238,8 @@ def _comparison(
 ) -> Response:
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
+    later = service.library.database(other) if other else None
+    code = difference_code(address_of(request, service), database.id, other)
     versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
@@ -236,8 +247,9 @@ def _comparison(
         **_head(service, database, "compare"),
         others=others,
         suggested=other or (versions[-1] if versions else ""),
-        later=service.library.database(other) if other else None,
+        later=later,
         difference=difference,
+        notebook=Notebook(f"{database.title}-{later.title}", code) if later else None,
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
     )

@@ -31,8 +31,11 @@ MOST_CHARACTERS = 12_000
 """Of an address: servers on the way refuse longer ones."""
 
 
-def query_of(draft: Draft, chosen: str, pinned: str = "") -> str:
-    """Return the query of the address of a design: empty, or with its question mark."""
+def query_of(draft: Draft, chosen: str, pinned: str = "") -> str | None:
+    """Return the query of the address of a design: empty, or with its question mark.
+
+    None where it is too long for an address, as one with a large table of a response is.
+    """
     base = chosen if chosen in preset_names() else preset_names()[0]
     query = {PRESET: base} if base != preset_names()[0] else {}
     changes = _changes(draft, base)
@@ -41,7 +44,7 @@ def query_of(draft: Draft, chosen: str, pinned: str = "") -> str:
         query[PINNED] = pinned
     text = urlencode(query, safe="/:, ").replace(" ", "+")
     if len(text) > MOST_CHARACTERS:
-        return ""
+        return None
     return f"?{text}" if text else ""
 
 

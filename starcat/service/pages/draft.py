@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +20,7 @@ from tomlkit.exceptions import TOMLKitError
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.service.pages.naming import followed, value_at
+from starcat.service.pages.response import FILE, NAME, keys_of_another, responses_of
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
 from starcat.specs.reading import all_that_is_wrong, content_of_toml, put_key, spec_from_dict
@@ -48,6 +50,13 @@ FIELDS = (
     "selection.doubles.action",
     "boresights.count",
     "boresights.brightest",
+    "camera.response.name",
+    "selection.max_drift_arcsec",
+    "selection.thinning",
+    "selection.neighbours.psf_sigma_px",
+    "selection.neighbours.max_offset_px",
+    "selection.neighbours.max_contamination",
+    "selection.neighbours.action",
 )
 """Keys that the form has a field for, by the same names."""
 
@@ -67,6 +76,11 @@ _OF_LENS = {"field": ("camera.focal_length_mm", "camera.pixel_um"), "focal": ("c
 
 _USUAL_PIXEL_UM = 5.5
 
+_SPAN = re.compile(
+    r"\[?\s*([0-9]{1,6}(?:\.[0-9]*)?)\s*(?:-|–|,|to)\s*([0-9]{1,6}(?:\.[0-9]*)?)\s*\]?"
+)
+"""The years of a mission: 2027-2042."""
+
 _KEYS: Mapping[str, SpecKey] = {key.path: key for part in spec_sections() for key in part.keys}
 
 
@@ -79,6 +93,7 @@ class Draft:
     lens: str  # "field" or "focal": the camera is told by its field, or by its lens
     products: dict[str, bool]  # which are made
     bands: tuple[str, ...]  # of the catalog
+    responses: list[tuple[str, str]]  # of the sensor: name, text
     content: Mapping[str, Any]  # what the text says; nothing where it cannot be read
     spec: BuildSpec | None  # None: something is wrong
     wrong: tuple[ConfigError, ...] = ()
@@ -99,7 +114,7 @@ class Draft:
 
     def _beside(self, error: ConfigError) -> dict[str, str]:
         key = error.key or ""
-        named = [name for name in self.values if name == key]
+        named = [name for name in (*self.values, FILE) if name == key]
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
         words = str(error).removeprefix(f"{ORIGIN}: ")
         told = [name for name in inside if name.rpartition(".")[2] in words]
@@ -158,12 +173,14 @@ def _edited(draft: Draft, edit: _Edit) -> Draft:
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
     """Return a draft whose text cannot be read with the fields as they were."""
+    values = {key: form.get(key, value) for key, value in draft.values.items()}
     return replace(
         draft,
-        values={key: form.get(key, value) for key, value in draft.values.items()},
+        values=values,
         lens="focal" if form.get(LENS) == "focal" else "field",
         products={name: f"products.{name}.{ENABLED}" in form for name in PRODUCTS},
         bands=bands_of(form.get("catalog.source", "")),
+        responses=responses_of(values[NAME]),
     )
 
 
@@ -197,12 +214,14 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
         name: value_at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS
     }
     source = value_at(content, "catalog.source")
+    values = {key: _shown(key, content) for key in FIELDS}
     return Draft(
         text=text,
-        values={key: _shown(key, content) for key in FIELDS},
+        values=values,
         lens="focal" if has_focal else "field",
         products=enabled,
         bands=bands_of(source) if isinstance(source, str) else (),
+        responses=responses_of(values[NAME]),
         content=content,
         spec=spec,
         wrong=wrong,
@@ -226,6 +245,8 @@ def _shown(key: str, content: Mapping[str, Any]) -> str:
         value = "" if default is REQUIRED or default is None else default
     if key == "selection.bright_limit_mag" and value == _KEYS[key].default:
         return ""  # No star is that bright: there is no limit.
+    if key == "epoch_jyear" and isinstance(value, list) and len(value) == 2:
+        value = "-".join(f"{one:.12g}" if isinstance(one, float) else str(one) for one in value)
     if isinstance(value, int) and value.bit_length() > 1000:  # more digits than Python writes
         return hex(value)[:40]
     return f"{value:.12g}" if isinstance(value, float) else str(value)
@@ -268,6 +289,9 @@ def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
         bands = bands_of(form["catalog.source"])
         if value_at(content, "catalog.band") not in bands:
             edit.put("catalog.band", bands[0] if bands else None)
+    if NAME in edit.changes:
+        for key in keys_of_another(content, form[NAME].strip()):
+            edit.put(key, None)
     lens = form.get(LENS)
     if lens in _OF_LENS:
         _change_lens(edit, lens)
@@ -305,6 +329,8 @@ def _number(content: Mapping[str, Any], key: str) -> float | None:
 
 def _typed(key: str, text: str) -> Any:
     """Return what was typed as the kind of value that a key has; else the text, to be refused."""
+    if key == "epoch_jyear" and (span := _SPAN.fullmatch(text)):
+        return [float(span[1]), float(span[2])]
     kind = _KEYS[key].kind
     try:
         if text and kind in ("whole number", "number"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.catalog.verdict import Reason
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
 from starcat.service.library import Database
@@ -19,6 +21,15 @@ from starcat.storage.schema import product_schema
 
 REPORT = "report/report.json"
 MANIFEST_DIGEST = "manifest_sha256"  # key of a manifest with the digest of all the others
+NOT_LISTED = (Reason.beyond_read_limit.name,)
+"""Reasons whose records are counted and not in the product ``rejected``."""
+
+_ROWS = """\
+SELECT designation, mag, band, ra_deg, dec_deg, reason, amplitude_mag, star_id
+FROM rejected
+WHERE reason = '{}'
+ORDER BY mag, star_id"""
+
 MAX_JOBS = 1000  # jobs that are looked through for the time of a build
 
 
@@ -71,6 +82,42 @@ def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
             "in_database": facts.get("in_database", False),
         }
         for name, facts in manifest["products"].items()
+    ]
+
+
+def star_columns(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the columns of ``stars`` with errors and blends that the database knows."""
+    spec = manifest["spec"]
+    schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
+    known = ["mag_error", "position_error_end_arcsec"]
+    if not isinstance(spec["epoch_jyear"], int | float):
+        known.append("drift_arcsec")
+    if spec["selection"].get("neighbours"):
+        known += ["centroid_offset_arcsec", "contamination", "blend_mag"]
+    columns = {column.name for column in schema.columns}
+    return [name for name in known if name in columns]
+
+
+def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return why records of the catalogs are no guide stars, the most frequent reason first.
+
+    Each has its number of records, what it means, and a query for its rows; None where they are not
+    listed.
+    """
+    counts: Counter[str] = Counter()
+    for source in manifest["sources"]:
+        if source["role"] == "stars":
+            counts.update(source["rejected"])
+    words = {reason.name: reason.value for reason in Reason}
+    return [
+        {
+            "name": name.replace("_", " "),
+            "records": count,
+            "meaning": words.get(name, ""),
+            "query": None if name in NOT_LISTED or name not in words else _ROWS.format(name),
+        }
+        for name, count in sorted(counts.items(), key=lambda one: (-one[1], one[0]))
+        if count
     ]
 
 

@@ -62,10 +62,11 @@ def names_of(content: Mapping[str, Any]) -> dict[str, str]:
     if not isinstance(source, str) or not is_number or not abs(limit) < 100.0:
         return {}
     width = f"{camera.fov_x_deg:.3g}".replace(".", "-")
-    band = value_at(content, "catalog.band") or "magnitude"
+    band = value_at(content, "camera.response.name") or value_at(content, "catalog.band")
+    limit_text = f"{band or 'magnitude'} <= {limit:.4g}"
     return {
         "name": f"{source}-{width}deg",
-        "description": f"{source}, {band} <= {limit:.4g}, for a {camera.fov_x_deg:.4g} x "
+        "description": f"{source}, {limit_text}, for a {camera.fov_x_deg:.4g} x "
         f"{camera.fov_y_deg:.4g} deg camera of {camera.width_px} x {camera.height_px} px",
     }
 

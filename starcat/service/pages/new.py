@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 from urllib.parse import quote
 
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import ValidationError
+from starlette.datastructures import UploadFile
 
 from starcat.catalog.source import data_source
-from starcat.errors import SourceMissing, StarcatError
+from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.pipeline.starter import advice
 from starcat.service.access import Reader, principal_of
 from starcat.service.catalogs import is_here
@@ -41,6 +43,7 @@ from starcat.service.pages.rendering import (
     render,
     size_text,
 )
+from starcat.service.pages.response import FILE, MOST_BYTES, PER, keys_of_file
 from starcat.service.pages.wording import in_page_words, page_problem
 from starcat.service.problems import Problem, ProblemDetails
 from starcat.service.service import Service, TheService
@@ -48,19 +51,31 @@ from starcat.service.settings import Role
 from starcat.specs.build_spec import CameraSpec
 from starcat.specs.reading import preset, preset_names
 
-MOST_FIELDS = 100  # fields of a form; this one has 33
+MOST_FIELDS = 100  # fields of a form; this one has 41
 MOST_KEYS = 200  # of an address
 
 router = page_router()
 
 
-async def form_of(request: Request) -> dict[str, str]:
-    """Return the fields of the form that a request brings; files are none of them."""
+@dataclass(frozen=True)
+class Sent:
+    """What a form was sent with."""
+
+    fields: dict[str, str]
+    file: tuple[str, bytes] | None  # name and content of the CSV file of a response
+
+
+async def sent_form(request: Request) -> Sent:
+    """Return what a request brings; of a file no more is read than may be taken."""
     async with request.form(max_files=1, max_fields=MOST_FIELDS) as form:
-        return {name: value for name, value in form.items() if isinstance(value, str)}
+        fields = {name: value for name, value in form.items() if isinstance(value, str)}
+        file = form.get(FILE)
+        if not isinstance(file, UploadFile) or not file.filename:
+            return Sent(fields, None)
+        return Sent(fields, (file.filename, await file.read(MOST_BYTES + 1)))
 
 
-Form = Annotated[dict[str, str], Depends(form_of)]
+Form = Annotated[Sent, Depends(sent_form)]
 
 
 @router.get("/new")
@@ -93,10 +108,10 @@ def _spec_of(service: Service, job: str | None, database: str | None) -> dict[st
 
 
 @router.post("/new")
-def sent_page(request: Request, service: TheService, form: Form, _: Reader) -> Response:
+def sent_page(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
     """Build what the form has, or show what it would give."""
-    draft, told = _asked(service, form)
-    if form.get("do") != "build" or draft.spec is None:
+    (draft, told), form = _asked(service, sent), sent.fields
+    if form.get("do") != "build" or draft.spec is None or draft.wrong:
         return _page(request, service, draft, form, told)
     who = principal_of(request)
     try:
@@ -109,9 +124,9 @@ def sent_page(request: Request, service: TheService, form: Form, _: Reader) -> R
 
 
 @router.post("/new/preview")
-def preview(request: Request, service: TheService, form: Form, _: Reader) -> Response:
+def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
     """Tell a script what the form has become, and what that would give."""
-    draft, told = _asked(service, form)
+    (draft, told), form = _asked(service, sent), sent.fields
     found = _shown(service, draft, form, told)
     content: dict[str, Any] = {
         "toml": draft.text,
@@ -119,6 +134,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "lens": draft.lens,
         "products": draft.products,
         "bands": draft.bands,
+        "responses": draft.responses,
         **{name: found[name] for name in ("errors", "summary", "address", "pinned_query")},
         "wrong": ENVIRONMENT.get_template("new_wrong.html").render(found),
         "result": ENVIRONMENT.get_template("new_result.html").render(found),
@@ -138,11 +154,20 @@ def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Res
     return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _asked(service: Service, form: dict[str, str]) -> tuple[Draft, list[str]]:
+def _asked(service: Service, sent: Sent) -> tuple[Draft, list[str]]:
     """Return the design that a form asks for, and what is to be said of it."""
+    form = sent.fields
     draft = draft_of_form(form)
+    if sent.file is not None:
+        try:
+            return draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), []
+        except ConfigError as error:
+            return replace(draft, wrong=(*draft.wrong, error)), []
     if form.get("do") == "pin":
-        form[PINNED] = query_of(draft, form.get(PRESET, "")).removeprefix("?") or f"{PRESET}="
+        query = query_of(draft, form.get(PRESET, ""))
+        if query is None:
+            return draft, ["This design is too long to be pinned: keep its text instead."]
+        form[PINNED] = query.removeprefix("?") or f"{PRESET}="
     elif form.get("do") == "unpin":
         form[PINNED] = ""
     elif form.get("do") == "suggest":
@@ -161,7 +186,8 @@ def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
         return draft, ["No limits can be suggested before the fields of the camera are right."]
     starter = service.catalogs.starter("camera", camera)
     limit = starter.spec.selection.faint_limit_mag
-    if draft.spec is not None and draft.spec.catalog.source != starter.spec.catalog.source:
+    own = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
+    if draft.spec is not None and own != (starter.spec.catalog.source, None):
         limit, _ = service.catalogs.enough_limit(draft.spec)
     selection, boresights = starter.spec.selection, starter.spec.boresights
     changes: dict[str, Any] = {
@@ -245,7 +271,9 @@ def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, An
 
 
 def _address(draft: Draft, form: dict[str, str]) -> str:
-    return f"/new{query_of(draft, form.get(PRESET, ''), form.get(PINNED, ''))}"
+    """Return the address of a design; empty where it is too long for one."""
+    query = query_of(draft, form.get(PRESET, ""), form.get(PINNED, ""))
+    return "" if query is None else f"/new{query}"
 
 
 def _taken(service: Service, draft: Draft) -> dict[str, str]:
@@ -312,9 +340,10 @@ def _page(
         is_first=is_first,
         presets=_presets(),
         chosen=form.get(PRESET, ""),
+        response_per=form.get(PER, ""),
         sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
-        sign_in=f"/sign-in?next={quote(str(found['address']), safe='')}",
+        sign_in=f"/sign-in?next={quote(str(found['address']) or '/new', safe='')}",
         text_error=found["errors"].get(TEXT),
     )
 

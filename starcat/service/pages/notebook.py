@@ -71,6 +71,18 @@ def query_code(
     )
 
 
+def difference_code(address: str, database_id: str, other_id: str) -> str:
+    """Return Python that compares two databases."""
+    return (
+        _begun(address)
+        + f'found = service.difference("{database_id}", "{other_id}")\n'
+        + 'print("the same" if found["is_same"] else found["counts"])\n'
+        'for kind in ("came", "went"):\n'
+        "    for star in found[kind]:\n"
+        '        print(kind, star["designation"], star["mag"], star["reason"], sep="\\t")\n'
+    )
+
+
 def identify_code(
     address: str, database_id: str, frame: Mapping[str, Any], options: Mapping[str, Any]
 ) -> str:

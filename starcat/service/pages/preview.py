@@ -130,7 +130,7 @@ _OTHERS = "a deeper catalog or a wider field"
 
 
 def _band(spec: BuildSpec) -> str:
-    return spec.catalog.band or "magnitude"
+    return spec.camera.response.name or spec.catalog.band or "magnitude"
 
 
 def _percent(share: float) -> str:

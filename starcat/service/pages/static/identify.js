@@ -2,6 +2,7 @@
 // becomes that of the answer.
 
 import { goTo } from "./address.js";
+import { droppable } from "./drop.js";
 import { startSliders } from "./sliders.js";
 import { announce } from "./starcat.js";
 
@@ -9,28 +10,11 @@ const form = document.getElementById("identify");
 const answer = document.getElementById("answer");
 
 if (form) {
-  const drop = document.getElementById("drop");
   const file = document.getElementById("file");
   const centroids = document.getElementById("centroids");
-  document.getElementById("drop-words").hidden = false;
   startSliders(form);
 
-  const over = (event) => {
-    if (![...event.dataTransfer.types].includes("Files")) return;
-    event.preventDefault();
-    drop.classList.add("over");
-  };
-  drop.addEventListener("dragenter", over);
-  drop.addEventListener("dragover", over);
-  drop.addEventListener("dragleave", () => drop.classList.remove("over"));
-  drop.addEventListener("drop", (event) => {
-    event.preventDefault();
-    drop.classList.remove("over");
-    if (!event.dataTransfer.files.length) return;
-    file.files = event.dataTransfer.files;
-    centroids.value = "";
-    announce([...file.files].map((one) => one.name).join(", "));
-  });
+  droppable(document.getElementById("drop"), file, () => { centroids.value = ""; });
 
   // A file goes before what was pasted: whoever pastes means that.
   centroids.addEventListener("input", () => { if (centroids.value) file.value = ""; });

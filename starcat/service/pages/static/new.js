@@ -1,6 +1,7 @@
 // New database: sliders, the spec and what it would give, kept in step by the server.
 
 import { goTo } from "./address.js";
+import { droppable } from "./drop.js";
 import { announce, copy } from "./starcat.js";
 import { startMap } from "./sky.js";
 import { follow, startSliders } from "./sliders.js";
@@ -15,6 +16,8 @@ const summary = document.getElementById("summary");
 const pinned = document.getElementById("pinned");
 const share = document.getElementById("share");
 const build = document.getElementById("build");
+const response = document.getElementById("response_file");
+const sensor = document.getElementById("sensor-fields");
 const FIELDS_AFTER_MS = 120;
 const TEXT_AFTER_MS = 450;
 const BUSY_AFTER_MS = 2500;
@@ -33,17 +36,23 @@ function showErrors(errors) {
     if (told.textContent !== message) told.textContent = message;
     const control = document.getElementById(key);
     (control?.closest(".field") ?? control?.closest(".copybox"))?.classList.toggle("wrong", message !== "");
+    if (message && sensor.contains(told)) sensor.open = true;
     if (message) control?.setAttribute("aria-invalid", "true");
     else control?.removeAttribute("aria-invalid");
   }
 }
 
+// Gives a list other choices, each a value and its text, where they have changed.
+function offer(id, choices) {
+  const list = document.getElementById(id);
+  if ([...list.options].map((one) => one.value).join("\n") === choices.map(([value]) => value).join("\n")) return;
+  list.replaceChildren(...choices.map(([value, words]) => new Option(words, value)));
+}
+
 function showValues(state) {
-  const bands = document.getElementById("catalog.band");
-  const names = state.values["catalog.band"] === "" ? ["", ...state.bands] : state.bands;
-  if ([...bands.options].map((one) => one.value).join("\n") !== names.join("\n")) {
-    bands.replaceChildren(...names.map((name) => new Option(name || "the catalog's first", name)));
-  }
+  const bands = state.bands.map((name) => [name, name]);
+  offer("catalog.band", state.values["catalog.band"] === "" ? [["", "the catalog's first"], ...bands] : bands);
+  offer("camera.response.name", state.responses);
   for (const [key, value] of Object.entries(state.values)) {
     const control = document.getElementById(key);
     if (control && control !== document.activeElement && control.value !== value) control.value = value;
@@ -85,6 +94,8 @@ function show(state) {
   if (summary.textContent !== state.summary) summary.textContent = state.summary;
   if (build) build.disabled = !state.can_build;
   pinned.value = state.pinned_query;
+  share.hidden = state.address === "";  // too long: its table of a response is in the text only
+  if (share.hidden) return;
   share.href = state.address;
   goTo(new URL(share.href).search);
 }
@@ -95,8 +106,10 @@ async function ask(wanted = "preview") {
   clearTimeout(waiting);
   asked = new AbortController();
   result.setAttribute("aria-busy", "true");
-  const sent = new URLSearchParams(new FormData(form));
-  sent.set("do", wanted);
+  const fields = new FormData(form);
+  fields.set("do", wanted);
+  const hasFile = response.files.length > 0;
+  const sent = hasFile ? fields : new URLSearchParams([...fields].filter(([, value]) => typeof value === "string"));
   try {
     const answer = await fetch(form.dataset.preview, {
       method: "POST", body: sent, signal: asked.signal,
@@ -106,6 +119,7 @@ async function ask(wanted = "preview") {
       throw new Error(problem?.detail ?? `the service answers ${answer.status}`);
     }
     const state = await answer.json();
+    if (hasFile) response.value = "";  // its numbers are in the text now
     show(state);
     if (state.is_busy) {
       waiting = setTimeout(ask, BUSY_AFTER_MS, wanted);
@@ -124,6 +138,7 @@ form.addEventListener("input", (event) => {
   clearTimeout(waiting);
   waiting = setTimeout(ask, event.target === text ? TEXT_AFTER_MS : FIELDS_AFTER_MS);
 });
+droppable(document.getElementById("drop"), response, () => form.dispatchEvent(new Event("input")));
 text.addEventListener("blur", () => { if (text.value !== before.value && text.value.trim() === before.value.trim()) text.value = before.value; });
 // What a browser kept of a page that was left is newer than what the server sent.
 document.getElementById("update").hidden = true;

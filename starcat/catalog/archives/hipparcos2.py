@@ -1,0 +1,79 @@
+"""Hipparcos, the New Reduction (I/311, hip2): what its records mean.
+
+Positions are ICRS at J1991.25, in radians, with errors at that epoch. Magnitudes are Hp. The
+digits of the type of the solution tell doubles and variables, without separations and amplitudes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from starcat.arrays import Array
+from starcat.catalog.readers.records import Records
+from starcat.catalog.stars import Columns, join_flags, known, numbered
+from starcat.catalog.verdict import Quality, Verdicts, quality_flags
+
+COLUMNS = {
+    "hip2": (
+        "hip", "sn", "nc", "ra_rad", "de_rad", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx",
+        "e_pm_ra", "e_pm_de", "hp_mag", "e_hp_mag", "va", "b_v", "v_i",
+    ),
+}  # fmt: skip
+
+_DOUBLE, _VARIABLE, _PHOTOCENTRE = 1, 2, 4
+_SINGLE_SOLUTION = 5  # five parameters; others move or scatter as companions make stars do
+
+
+def magnitudes(records: Records, _: str) -> Array:
+    """Return the magnitudes of records of the new reduction, all of which are Hp."""
+    return records["hp_mag"]
+
+
+def stars(records: Records, band: str, _: Verdicts) -> Columns:
+    """Return the star-table columns of records of the new reduction."""
+    number, kind = records.integers("hip"), np.nan_to_num(records["sn"]).astype(np.int64)
+    told, solution = kind // 10, kind % 10
+    is_odd = (kind > 0) & (solution != _SINGLE_SOLUTION)
+    is_double = is_odd | ((told & _DOUBLE) > 0) | (records["nc"] > 1)
+    annex = np.nan_to_num(records["va"]).astype(np.int64)
+    is_variable, in_annex = (told & _VARIABLE) > 0, annex > 0
+    code = kind.astype("S3")
+    return {
+        "star_id": number,
+        "designation": numbered("HIP", number),
+        "ra_deg": np.degrees(records["ra_rad"]),
+        "dec_deg": np.degrees(records["de_rad"]),
+        "epoch_jyear": 1991.25,
+        "pm_ra_cosdec_mas_yr": records["pm_ra"],
+        "pm_dec_mas_yr": records["pm_de"],
+        "parallax_mas": records["plx"],
+        "parallax_error_mas": known(records["e_plx"]),
+        **_errors(records),
+        "mag": magnitudes(records, band),
+        "mag_error": known(records["e_hp_mag"]),
+        "band": band,
+        "colour_mag": records["b_v"],
+        "colour_bands": "B-V",
+        "second_colour_mag": records["v_i"],
+        "second_colour_bands": "V-I",
+        "double_flag": join_flags({"Sn": (is_double, code)}),
+        "is_flagged_double": is_double,
+        "variable_flag": join_flags(
+            {"Sn": (is_variable, code), "VA": (in_annex, annex.astype("S1"))}
+        ),
+        "is_flagged_variable": is_variable | in_annex,
+        "hip_number": number,
+        "quality_flags": quality_flags(
+            len(records), {Quality.PHOTOCENTRE: (told & _PHOTOCENTRE) > 0}
+        ),
+    }
+
+
+def _errors(records: Records) -> Columns:
+    """Return the errors of positions, which are at the epoch of the positions, and of motions."""
+    columns: Columns = {}
+    for axis, own, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):
+        columns[f"{axis}_error_mas"] = known(records[own])
+        columns[f"{axis}_central_jyear"] = 1991.25
+        columns[f"pm_{axis}_error_mas_yr"] = known(records[motion])
+    return columns

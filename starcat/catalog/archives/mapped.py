@@ -1,0 +1,446 @@
+"""Tables of one's own: what their rows mean, as the map says.
+
+Rows become records with one column a value of the map, in the units of the star table and still
+in the frame of the map; then positions and proper motions become ICRS.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Mask
+from starcat.catalog.frames import icrs_from
+from starcat.catalog.readers.expressions import columns_in, evaluate
+from starcat.catalog.readers.records import Problem, Records, Rows, TableColumn
+from starcat.catalog.readers.tables import BLANKS, OpenTable
+from starcat.catalog.source_files import InputFile
+from starcat.catalog.stars import Columns, known, where_known
+from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
+from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
+from starcat.errors import ConfigError, quoted
+
+_WHOLE = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
+_SEXAGESIMAL = (
+    r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
+    r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
+)
+_TEXTS = ("columns.star_id", "columns.designation", "columns.spectral_type")
+
+
+@dataclass(frozen=True)
+class Understood:
+    """A value of a map, found in a file."""
+
+    value: Value
+    columns: tuple[str, ...]  # of the file that it is made from
+    is_column: bool  # one of them, as it is; else an expression or a number
+    unit: str  # of what is found; empty for texts, conditions and pure numbers
+    convert: Callable[[Array], Array]  # to the unit of the star table
+
+
+def understand(
+    table: TableMap, columns: Mapping[str, TableColumn], where: str
+) -> dict[str, Understood]:
+    """Find all that a map names among the columns of a file."""
+    found = {}
+    for key, value in table.values.items():
+        if isinstance(value.value, str):
+            named, is_column = columns_in(value.value, list(columns), key, where)
+        else:
+            named, is_column = (), False
+        unit, convert = "", cast(Callable[[Array], Array], _as_is)
+        if target(key) is not None:
+            unit, convert = _unit(key, value, columns[named[0]] if is_column else None, where)
+        found[key] = Understood(value, named, is_column, unit, convert)
+    return found
+
+
+def target(key: str) -> str | None:
+    """Return the unit of the star table of a value; None where it has none."""
+    kind, _, name = key.partition(".")
+    return "mag" if kind.startswith("magnitude") else UNITS.get(name) or None
+
+
+def _unit(
+    key: str, value: Value, column: TableColumn | None, where: str
+) -> tuple[str, Callable[[Array], Array]]:
+    from astropy import units
+
+    kind, _, name = key.partition(".")
+    told = column.unit if column and ":" not in column.unit else ""
+    text = value.unit or told or ("mag" if kind.startswith("magnitude") else ASSUMED.get(name, ""))
+    wanted = target(key)
+    if not text:
+        raise ConfigError(
+            f"{key}: neither {where} nor the map states a unit; write it, such as "
+            f'{{ value = "{value.value}", unit = "{str(wanted).replace(" ", "")}" }}',
+            key=key,
+        )
+    try:
+        found = unit_of(text)
+        if kind == "magnitudes" and found.physical_type == "spectral flux density":
+            return text, lambda flux: _ab_magnitudes(flux, found)
+        if kind == "magnitudes" and isinstance(found, units.MagUnit):
+            return text, _as_is
+        # An hour or a second of right ascension is 15 degrees or 15 arcsec.
+        second, arcsec = units.s, units.Unit(15.0 * units.arcsec)
+        same = [(second, arcsec), (second / units.yr, arcsec / units.yr)]
+        turns = same if name in ("ra", "ra_error", "pm_ra", "pm_ra_cosdec", "pm_ra_error") else []
+        factor = float(found.to(unit_of(str(wanted)), 1.0, equivalencies=turns))
+        return text, lambda values: np.asarray(values * factor)
+    except (units.UnitConversionError, ValueError) as error:
+        raise ConfigError(
+            f"{key}: unit {text!r} ({'of the map' if value.unit else f'of {where}'}) cannot be "
+            f"turned into {wanted}; state the right one with 'unit' in the map",
+            key=key,
+            value=text,
+        ) from error
+
+
+def _floats(values: pa.Array) -> Array:
+    known = values.cast(pa.float64(), safe=False)
+    return np.array(pc.fill_null(known, float("nan")), dtype=np.float64)
+
+
+def _as_is(values: Array) -> Array:
+    return values
+
+
+def _ab_magnitudes(flux: Array, unit: Any) -> Array:
+    from astropy import units
+
+    positive = np.where(flux > 0.0, flux, np.nan)
+    return np.asarray((positive * unit).to_value(units.ABmag), dtype=np.float64)
+
+
+def names_wanted(table: TableMap, opened: OpenTable, *, where: str) -> list[str]:
+    """Return the columns of a file that a map needs."""
+    found = understand(table, opened.columns, where)
+    return list(dict.fromkeys(name for one in found.values() for name in one.columns))
+
+
+class _Reading:
+    """Rows of a table while they become records."""
+
+    def __init__(self, table: TableMap, rows: Rows, where: str) -> None:
+        self.map = table
+        self.rows = rows
+        self.count = len(rows.number)
+        self.found = understand(table, rows.columns, where)
+        self.bad = np.zeros(self.count, dtype=bool)
+        self.problems: list[Problem] = []
+        self._nulls = {str(one) for one in table.null} | set(BLANKS)
+        self._null_numbers = [float(one) for one in table.null if _is_number(one)]
+
+    def column(self, name: str, key: str, *, as_text: bool = False) -> pa.Array:
+        """Return a column with nulls where it has no value.
+
+        Texts of numbers become numbers where they are not asked for as texts.
+        """
+        values = self.rows.table[name].combine_chunks()
+        if pa.types.is_string(values.type):
+            values = pc.utf8_trim_whitespace(values)
+            values = self._blanked(values, pc.is_in(values, pa.array(sorted(self._nulls))))
+            if as_text or self.rows.columns[name].is_text:
+                return values
+            return self._numbers(values, key)
+        if pa.types.is_floating(values.type):
+            values = self._blanked(values, pc.is_nan(values))
+        if pa.types.is_floating(values.type) or pa.types.is_integer(values.type):
+            return self._no_number(values)
+        return values
+
+    @staticmethod
+    def _blanked(values: pa.Array, where: pa.Array) -> pa.Array:
+        return pc.if_else(pc.fill_null(where, False), pa.scalar(None, values.type), values)
+
+    def _numbers(self, texts: pa.Array, key: str) -> pa.Array:
+        """Return the numbers that texts are; those that are none are malformed."""
+        with suppress(pa.ArrowInvalid):
+            return self._no_number(texts.cast(pa.int64()))
+        try:
+            numbers = texts.cast(pa.float64())
+        except pa.ArrowInvalid:
+            is_number = pc.match_substring_regex(texts, r"^[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$")
+            wrong = pc.invert(pc.fill_null(is_number, True))
+            self.refuse(wrong.to_numpy(zero_copy_only=False), key, texts, "a number")
+            numbers = self._blanked(texts, wrong).cast(pa.float64())
+        return self._no_number(self._blanked(numbers, pc.is_nan(numbers)))
+
+    def _no_number(self, numbers: pa.Array) -> pa.Array:
+        """Return numbers with nulls for those that the map says mean no value."""
+        if not self._null_numbers:
+            return numbers
+        same = pc.is_in(numbers.cast(pa.float64(), safe=False), pa.array(self._null_numbers))
+        return self._blanked(numbers, same)
+
+    def refuse(self, wrong: Mask, key: str, values: pa.Array, expected: str) -> None:
+        """Leave out rows whose value cannot be."""
+        for i in np.flatnonzero(wrong & ~self.bad):
+            text = quoted(str(values[i].as_py()))
+            row = int(self.rows.number[i])
+            self.problems.append(Problem(row, key, None, text, expected, what="row"))
+        self.bad |= wrong
+
+    def value(self, key: str, *, as_text: bool = False) -> pa.Array:
+        """Return what a column, an expression or a number of the map gives for every row."""
+        found = self.found[key]
+        if not isinstance(found.value.value, str):
+            return pa.repeat(pa.scalar(float(found.value.value)), self.count)
+        if found.is_column:
+            return self.column(found.columns[0], key, as_text=as_text)
+        columns = {name: self.column(name, key) for name in found.columns}
+        return evaluate(found.value.value, columns, self.count, key)
+
+    def numbers(self, key: str) -> Array:
+        """Return numbers in the unit of the star table, NaN where there is none."""
+        values = self.value(key)
+        is_angle = key in ("columns.ra", "columns.dec") and pa.types.is_string(values.type)
+        if is_angle:
+            return self._angles(values, key)
+        if pa.types.is_string(values.type) and self.found[key].is_column:
+            values = self._numbers(values, key)
+        if not (pa.types.is_floating(values.type) or pa.types.is_integer(values.type)
+                or pa.types.is_decimal(values.type) or pa.types.is_null(values.type)):  # fmt: skip
+            raise ConfigError(
+                f"{key}: {self.found[key].value.value!r} gives {values.type}; expected numbers",
+                key=key,
+            )
+        array = _floats(values)
+        array[np.isinf(array)] = np.nan
+        return self.found[key].convert(array)
+
+    def _angles(self, texts: pa.Array, key: str) -> Array:
+        """Return angles of sexagesimal or decimal texts; right ascensions are in hours."""
+        parts = pc.extract_regex(texts, _SEXAGESIMAL)
+        is_split = np.asarray(pc.is_valid(parts))
+        number = {
+            name: np.array(pc.struct_field(parts, name).cast(pa.float64()).fill_null(0.0))
+            for name in ("whole", "minutes", "seconds")
+        }
+        size = number["whole"] + number["minutes"] / 60.0 + number["seconds"] / 3600.0
+        negative = np.array(pc.fill_null(pc.equal(pc.struct_field(parts, "sign"), "-"), False))
+        found = self.found[key]
+        plain = self._numbers(
+            pc.if_else(parts.is_valid(), pa.scalar(None, pa.string()), texts), key
+        )
+        decimal = found.convert(_floats(plain))
+        is_hours = key == "columns.ra" and self.map.frame != "galactic" and found.value.unit is None
+        signed = np.where(negative, -size, size)
+        return np.where(is_split, 15.0 * signed if is_hours else found.convert(signed), decimal)
+
+    def texts(self, key: str) -> NDArray[Any]:
+        """Return texts, None where there is none."""
+        values = self.value(key, as_text=True)
+        if pa.types.is_floating(values.type):
+            rounded = pc.round(values)
+            if pc.all(pc.equal(rounded, values)).as_py() is not False:
+                values = rounded.cast(pa.int64())
+        return np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
+
+    def holds(self, key: str) -> Mask:
+        """Return where a condition holds."""
+        values = self.value(key)
+        try:
+            values = values.cast(pa.bool_())
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+            raise ConfigError(
+                f"{key}: {self.found[key].value.value!r} gives texts; write a condition, such as "
+                f"{self.found[key].columns[0]} = 'D'",
+                key=key,
+            ) from error
+        return np.asarray(pc.fill_null(values, False).to_numpy(zero_copy_only=False), dtype=bool)
+
+    def identities(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """Return the numbers of stars, 0 where there is none, and their texts."""
+        values = self.value("columns.star_id", as_text=True)
+        if pa.types.is_floating(values.type):
+            array = np.array(pc.fill_null(values, 0.0), dtype=np.float64)
+            wrong = (array != np.trunc(array)) | (np.abs(array) > 2.0**53)
+            self.refuse(wrong, "columns.star_id", values, "a whole number, or a text")
+            values = pa.array(
+                np.where(wrong, 0.0, array).astype(np.int64), mask=np.asarray(values.is_null())
+            )
+        texts = np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
+        if pa.types.is_integer(values.type) and values.type != pa.uint64():
+            return np.array(pc.fill_null(values.cast(pa.int64()), 0)), texts
+        return np.array([identity(text) for text in texts], dtype=np.int64), texts
+
+
+def identity(text: str | None) -> int:
+    """Return the permanent number of a star that is named by a text; 0 for no text.
+
+    Digits are the number that they write; any other text is 62 bits of its SHA-256.
+    """
+    if text is None:
+        return 0
+    if whole := _WHOLE.fullmatch(text):
+        return int(whole[1])
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 2
+
+
+def _is_number(value: str | float) -> bool:
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True
+
+
+def records_of(table: TableMap, rows: Rows, file: InputFile) -> Records:
+    """Return rows as records: the values of the map by their keys, in the map's frame."""
+    reading = _Reading(table, rows, file.path.name)
+    columns: dict[str, NDArray[Any]] = {}
+    columns["columns.star_id"], columns["star_text"] = reading.identities()
+    for key in reading.found:
+        if key == "columns.star_id":
+            continue
+        if key.split(".")[0] in ("flags", "reject", "quality"):
+            columns[key] = reading.holds(key)
+        elif key in _TEXTS:
+            columns[key] = reading.texts(key)
+        else:
+            columns[key] = reading.numbers(key)
+    records = Records(table.name, rows.number, columns, rows.problems)
+    return records.without(reading.bad, reading.problems)
+
+
+@dataclass(frozen=True)
+class MappedTable:
+    """What the records of a table mean (an `Archive`)."""
+
+    table: TableMap
+    COLUMNS: Mapping[str, Sequence[str]]
+
+    def magnitudes(self, records: Records, band: str, /) -> Array:
+        """Return the magnitudes of records."""
+        return np.asarray(records[f"magnitudes.{band}"])
+
+    def stars(self, records: Records, band: str, verdicts: Verdicts, /) -> Columns:
+        """Return the star-table columns of records, and reject those that are no stars."""
+        verdicts.reject(_is_missing(records["star_text"]), Reason.no_identity)
+        for key, reason in _reasons(records, "reject"):
+            verdicts.reject(records[key], Reason[reason])
+        columns = _placed(self.table, records, verdicts)
+        for key in ("parallax", "parallax_error", "radial_velocity"):
+            unit = {"radial_velocity": "_km_s"}.get(key, "_mas")
+            columns[key + unit] = _number(records, f"columns.{key}")
+        flags = {Quality[name.upper()]: records[key] for key, name in _reasons(records, "quality")}
+        columns["quality_flags"] = quality_flags(len(records), flags)
+        return {**columns, **self._light(records, band), **self._remarks(records)}
+
+    def _light(self, records: Records, band: str) -> Columns:
+        bands = list(self.table.magnitudes)
+        columns: Columns = {
+            "mag": self.magnitudes(records, band),
+            "mag_error": known(_number(records, f"magnitude_errors.{band}")),
+            "band": band,
+        }
+        others = [other for other in bands if other != band]
+        if others:
+            columns |= {"second_mag": self.magnitudes(records, others[0]), "second_band": others[0]}
+        if self.table.colour_bands:
+            first, second = (self.magnitudes(records, one) for one in self.table.colour_bands)
+            columns |= {"colour_mag": first - second, "colour_bands": str(self.table.colour)}
+        return columns
+
+    def _remarks(self, records: Records) -> Columns:
+        amplitude = _number(records, "columns.amplitude")
+        own = records["star_text"]
+        names = records.columns.get("columns.designation", np.full(len(own), None, dtype=object))
+        columns: Columns = {
+            "star_id": records["columns.star_id"],
+            "designation": pa.array(
+                [a or f"{self.table.name} {b}" for a, b in zip(names, own, strict=True)],
+                pa.string(),
+            ),
+            "amplitude_mag": amplitude,
+            "amplitude_source": where_known(amplitude, self.table.name),
+            "companion_separation_arcsec": _number(records, "columns.companion_separation"),
+            "companion_delta_mag": _number(records, "columns.companion_delta_mag"),
+            "ruwe": _number(records, "columns.ruwe"),
+            "hip_number": _number(records, "columns.hip_number"),
+            "hd_number": _number(records, "columns.hd_number"),
+        }
+        if "columns.spectral_type" in records.columns:
+            columns["spectral_type"] = pa.array(records["columns.spectral_type"], pa.string())
+        for kind in ("double", "variable"):
+            key = f"flags.{kind}"
+            if key in records.columns:
+                where = pa.array(records[key])
+                text = str(self.table.values[key].value)
+                columns[f"is_flagged_{kind}"] = where
+                columns[f"{kind}_flag"] = pc.if_else(where, text, pa.scalar(None, pa.string()))
+        return columns
+
+
+def _number(records: Records, key: str) -> Array:
+    found = records.columns.get(key)
+    return np.full(len(records), np.nan) if found is None else np.asarray(found)
+
+
+def _is_missing(texts: NDArray[Any]) -> Mask:
+    return np.array([text is None for text in texts], dtype=bool)
+
+
+def _reasons(records: Records, kind: str) -> list[tuple[str, str]]:
+    return [(key, key.split(".", 1)[1]) for key in records.columns if key.startswith(f"{kind}.")]
+
+
+def _placed(table: TableMap, records: Records, verdicts: Verdicts) -> Columns:
+    """Return positions, proper motions and their errors in ICRS; the errors keep their axes."""
+    ra, dec = records["columns.ra"], records["columns.dec"]
+    outside = (np.abs(ra) > 360.0) | (np.abs(dec) > 90.0)
+    verdicts.reject(outside, Reason.impossible_value)
+    ra, dec = np.where(outside, np.nan, ra % 360.0), np.where(outside, np.nan, dec)
+    epoch: float | Array = table.epoch_jyear or _epochs(table, records["epoch"])
+    pm_ra, pm_dec = _number(records, "columns.pm_ra_cosdec"), _number(records, "columns.pm_dec")
+    if table.columns.pm_ra is not None:
+        pm_ra = records["columns.pm_ra"] * np.cos(np.radians(dec))
+    errors = {
+        f"{key}{unit}": known(_number(records, f"columns.{key}"))
+        for key, unit in (
+            *(("ra_error", "_mas"), ("dec_error", "_mas")),
+            *(("pm_ra_error", "_mas_yr"), ("pm_dec_error", "_mas_yr")),
+        )
+    }
+    if table.frame == "galactic":  # the axes are others: the larger error holds for both
+        for pair in (
+            ("ra_error_mas", "dec_error_mas"),
+            ("pm_ra_error_mas_yr", "pm_dec_error_mas_yr"),
+        ):
+            errors |= dict.fromkeys(pair, np.fmax(errors[pair[0]], errors[pair[1]]))
+    if table.frame != "ICRS":
+        ra, dec, pm_ra, pm_dec = icrs_from(table, ra, dec, epoch, pm_ra, pm_dec)
+    central = np.where(np.isnan(errors["ra_error_mas"]), np.nan, epoch)
+    return {
+        "ra_deg": ra,
+        "dec_deg": dec,
+        "epoch_jyear": np.broadcast_to(epoch, len(ra)),
+        "pm_ra_cosdec_mas_yr": pm_ra,
+        "pm_dec_mas_yr": pm_dec,
+        "ra_central_jyear": central,
+        "dec_central_jyear": central,
+        **errors,
+    }
+
+
+def _epochs(table: TableMap, values: Array) -> Array:
+    """Return moments as Julian years."""
+    from astropy.time import Time
+
+    if table.epoch.scale == "jyear":
+        return values
+    usual = {"byear": 1950.0, "jd": 2451545.0, "mjd": 51544.5}[table.epoch.scale]
+    moments = Time(np.where(np.isnan(values), usual, values), format=table.epoch.scale, scale="tt")
+    return np.where(np.isnan(values), np.nan, moments.jyear)

@@ -1,0 +1,199 @@
+"""Doubles from another source than the star table that they are joined to.
+
+The Washington Double Star Catalog has a record for each pair of stars: of the file of Hipparcos
+stars by HIP number, without magnitudes, of the whole catalog by the place of the first star. A
+pair counts where the sensor cannot tell its stars apart.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Directions, Mask
+from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, with_code
+from starcat.catalog.readers.records import Records
+from starcat.catalog.source_files import FileFacts
+from starcat.catalog.stars import floats_of, with_columns
+from starcat.catalog.verdict import Reason
+from starcat.geometry.sphere import directions_from_radec
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import Selection
+from starcat.specs.doubtful_stars import Doubles
+
+WDS_COLUMNS = {
+    "wds_hip": ("hip", "wds", "sep"),
+    "wds": (
+        "wds",
+        "obs_first",
+        "sep_first",
+        "sep_last",
+        "mag_first",
+        "mag_second",
+        "notes",
+        "place",
+    ),
+}
+
+SAME_PAIR_ARCSEC = 1.0
+"""Separations that differ by less are of one pair, seen in other years."""
+
+UNRESOLVED_ARCSEC = 5.0
+"""A pair without magnitudes counts only if it is closer. Of such pairs of naked-eye stars 78 %
+differ by 3 mag or less; a wider companion as bright is in the catalog of the stars itself."""
+
+_PLACE = re.compile(r"(\d\d)(\d\d)(\d\d\.?\d*)([+-])(\d\d)(\d\d)(\d\d\.?\d*)")
+_DUBIOUS = b"X"
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """Pairs of stars by what their first star is known by, arrays of shape (M,)."""
+
+    source: str
+    files: tuple[FileFacts, ...]
+    kept: int  # records that could be used
+    rejected: dict[str, int]  # the others, by reason
+    separation_arcsec: Array
+    delta_mag: Array  # of the second star minus the first; NaN where unknown
+    name: NDArray[np.object_]  # the source's name of the system
+    keys: Keys
+    role = "doubles"  # in the manifest
+
+    def join(self, stars: pa.Table, selection: Selection) -> tuple[pa.Table, int]:
+        """Join them to the stars that the source knows."""
+        return join_pairs(stars, self, selection.doubles)
+
+
+def read_wds(paths: Sequence[Path], progress: Progress = no_progress) -> PairTable:
+    """Read the Washington Double Star Catalog."""
+    read = read_records("wds", paths, WDS_COLUMNS, progress)
+    systems = [_BY_LAYOUT[part.layout](part) for part in read.parts]
+    hip, separation, delta, is_dubious = (
+        np.concatenate([getattr(one, name) for one in systems])
+        for name in ("hip", "separation_arcsec", "delta_mag", "is_dubious")
+    )
+    places = np.concatenate([one.places for one in systems])
+    unknown = np.isnan(separation) | ((hip == 0) & np.isnan(places).any(axis=1))
+    kept = ~(is_dubious | unknown)
+    names = np.array([name for one in systems for name in one.names], dtype=object)
+    counts = {
+        Reason.deleted.name: int(np.count_nonzero(is_dubious)),
+        Reason.no_position.name: int(np.count_nonzero(unknown & ~is_dubious)),
+    }
+    return PairTable(
+        "wds",
+        read.files,
+        int(np.count_nonzero(kept)),
+        read.rejected(**counts),
+        separation[kept],
+        delta[kept],
+        names[kept],
+        Keys({"hip_number": hip[kept]}, places[kept]),
+    )
+
+
+@dataclass(frozen=True)
+class _Systems:
+    """The records of a block, arrays of shape (N,)."""
+
+    hip: NDArray[np.int64]  # 0 where unknown
+    places: Directions  # of the first star at J2000; NaN where unknown
+    separation_arcsec: Array  # NaN where none was measured
+    delta_mag: Array
+    is_dubious: Mask
+    names: list[str]
+
+
+def _by_hip(part: Records) -> _Systems:
+    nothing = np.full(len(part), np.nan)
+    separation = np.where(part["sep"] >= 0.0, part["sep"], np.nan)
+    places = np.stack([nothing] * 3, axis=1)
+    is_dubious = np.zeros(len(part), dtype=bool)
+    return _Systems(
+        part.integers("hip"), places, separation, nothing, is_dubious, texts_of(part["wds"])
+    )
+
+
+def _by_place(part: Records) -> _Systems:
+    first, last = (numbers_in(texts_of(part[f"sep_{when}"])) for when in ("first", "last"))
+    separation = np.where(last >= 0.0, last, np.where(first >= 0.0, first, np.nan))
+    mags = [numbers_in(texts_of(part[f"mag_{which}"]), "mag") for which in ("first", "second")]
+    is_dubious = np.char.find(part["notes"], _DUBIOUS) >= 0
+    radec = np.array([_radec(text) for text in texts_of(part["place"])]).reshape(-1, 2)
+    hip = np.zeros(len(part), dtype=np.int64)
+    delta = mags[1] - mags[0]
+    places = directions_from_radec(*radec.T)
+    return _Systems(hip, places, separation, delta, is_dubious, texts_of(part["wds"]))
+
+
+_BY_LAYOUT = {"wds_hip": _by_hip, "wds": _by_place}
+
+
+def _radec(text: str) -> tuple[float, float]:
+    """Return the degrees of a place such as 000006.64+752859.8; NaN where the text is none."""
+    found = _PLACE.fullmatch(text)
+    if found is None:
+        return np.nan, np.nan
+    hours, minutes, seconds, sign, degrees, arcmin, arcsec = found.groups()
+    ra_deg = 15.0 * (int(hours) + int(minutes) / 60.0 + float(seconds) / 3600.0)
+    dec_deg = int(degrees) + int(arcmin) / 60.0 + float(arcsec) / 3600.0
+    if ra_deg > 360.0 or dec_deg > 90.0:
+        return np.nan, np.nan
+    return ra_deg, -dec_deg if sign == "-" else dec_deg
+
+
+def join_pairs(stars: pa.Table, table: PairTable, doubles: Doubles) -> tuple[pa.Table, int]:
+    """Flag the stars that have a pair closer than the sensor can tell apart.
+
+    Such a star has the separation and the magnitude difference of that of its pairs whose stars
+    are the most alike, a pair without magnitudes before all others; of equals that of the closest
+    one. What the star's own catalog says is one of them. Wide pairs without magnitudes are not.
+    """
+    own_apart = floats_of(stars, "companion_separation_arcsec")
+    own_delta = floats_of(stars, "companion_delta_mag")
+    apart, delta = own_apart.copy(), own_delta.copy()
+    code = np.array(stars["double_flag"].to_pylist(), dtype=object)
+    flagged = np.array(stars["is_flagged_double"])
+    limit = 3600.0 * doubles.min_separation_deg
+    star, row = (np.concatenate(rows) for rows in zip(*table.keys.match(stars), strict=True))
+    their_apart, their_delta = table.separation_arcsec[row], table.delta_mag[row]
+    # The star's own catalog may have the magnitudes of the same pair.
+    is_own = ~(np.abs(own_apart[star] - their_apart) > SAME_PAIR_ARCSEC)
+    their_delta = np.where(np.isnan(their_delta) & is_own, own_delta[star], their_delta)
+    close = their_apart <= np.where(np.isnan(their_delta), min(limit, UNRESOLVED_ARCSEC), limit)
+    star, row = star[close], row[close]
+    their_apart, their_delta = their_apart[close], their_delta[close]
+    counts = flagged & (own_apart <= limit)
+    best = np.where(counts, np.nan_to_num(own_delta), np.inf)
+    order = np.lexsort((their_apart, np.nan_to_num(their_delta), star))
+    for s, r, a, d in zip(
+        *(values[order] for values in (star, row, their_apart, their_delta)), strict=True
+    ):
+        code[s] = with_code(code[s], f"{table.source}:{table.name[r]}")
+        if np.nan_to_num(d) < best[s]:
+            best[s], apart[s], delta[s] = np.nan_to_num(d), a, d
+    flagged[star] = True
+    columns = {
+        "companion_separation_arcsec": apart,
+        "companion_delta_mag": delta,
+        "double_flag": pa.array(code, pa.string()),
+        "is_flagged_double": flagged,
+    }
+    return with_columns(stars, columns), len(np.unique(star))
+
+
+def is_joined(stars: pa.Table, doubles: Doubles) -> Mask:
+    """Return which stars a joined source says to be close doubles."""
+    found = np.zeros(len(stars), dtype=bool)
+    for source in doubles.join:
+        named = pc.match_substring(stars["double_flag"], f"{source}:")
+        found |= pc.fill_null(named, False).to_numpy()
+    return found

@@ -1,0 +1,168 @@
+"""Which star of a table a record of a joined source is about: by number, or by place.
+
+A number is a star's own in another catalog; a place is that of J2000, to which the stars are
+moved for it. What a source says of its stars is the matter of `variability.py` and `doubles.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcat.arrays import Array, Directions
+from starcat.catalog.parts import FileReading, read_files
+from starcat.catalog.proper_motion import Motion, propagate_directions
+from starcat.catalog.readers.blocks import Block
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.fixed_width import parse_fixed_width
+from starcat.catalog.readers.records import Records, number_from_text
+from starcat.catalog.source import RANGES, data_source
+from starcat.catalog.source_files import FileFacts, SourceFiles
+from starcat.catalog.stars import floats_of
+from starcat.catalog.verdict import Reason
+from starcat.geometry.sphere import chord_from_separation
+from starcat.progress import Progress, no_progress
+
+MATCH_ARCSEC = 3.0
+"""A place belongs to the nearest star within so much. Places of double and variable stars are good
+to an arcsecond or two, and 0.02 % of them have another star of the Gaia sky to G = 12 as near."""
+
+PLACES_JYEAR = 2000.0
+"""The epoch of places."""
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Keys:
+    """How the stars of a source are known; arrays with a row for each record."""
+
+    numbers: dict[str, NDArray[np.int64]]
+    """By name, ``hip_number``, ``hd_number``, ``tyc`` or ``gaia``; 0 where unknown."""
+    places: Directions | None = None  # ICRS; NaN where unknown
+
+    def match(self, stars: pa.Table) -> Iterator[tuple[Rows, Rows]]:
+        """Give rows of stars and of records that are about them; the first ones count."""
+        for name, keys in self.numbers.items():
+            yield _same_number(_star_numbers(stars, name), keys)
+        if self.places is not None:
+            yield _same_place(stars, self.places)
+
+
+def _same_place(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
+    motion = Motion(
+        *(floats_of(stars, name) for name in ("ra_deg", "dec_deg")),
+        *(floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
+    )
+    _, then = propagate_directions(motion, PLACES_JYEAR - floats_of(stars, "epoch_jyear"))
+    known = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(stars) or not len(known):
+        return known[:0], known[:0]
+    within = float(chord_from_separation(np.radians(MATCH_ARCSEC / 3600.0)))
+    chord, star = cKDTree(then).query(places[known], distance_upper_bound=within)
+    is_found = np.isfinite(chord)
+    return np.asarray(star, dtype=np.int64)[is_found], known[is_found]
+
+
+def _star_numbers(stars: pa.Table, key: str) -> NDArray[np.int64]:
+    """Return the stars' own numbers of a kind; 0 where they have none."""
+    if key in {"hip_number", "hd_number"}:
+        return whole_numbers(stars, key)
+    catalog = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia",)}[key]
+    of_kind = np.isin(np.array(stars["catalog"].to_pylist(), dtype=object), catalog)
+    return np.where(of_kind, np.maximum(stars["star_id"].to_numpy(), 0), 0)
+
+
+def whole_numbers(stars: pa.Table, name: str) -> NDArray[np.int64]:
+    """Return a column of whole numbers with 0 for null."""
+    return np.array(pc.fill_null(stars[name], 0), dtype=np.int64)
+
+
+def _same_number(wanted: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[Rows, Rows]:
+    """Return the rows of stars and of records that share a number other than 0."""
+    order = np.argsort(keys, kind="stable")
+    low = np.searchsorted(keys[order], wanted, side="left")
+    high = np.searchsorted(keys[order], wanted, side="right")
+    count = np.where(wanted > 0, high - low, 0)
+    star = np.repeat(np.arange(len(wanted)), count)
+    step = np.arange(len(star)) - np.repeat(np.cumsum(count) - count, count)
+    return star, order[np.repeat(low, count) + step]
+
+
+def with_code(codes: str | None, code: str) -> str:
+    """Return codes with another one, each once."""
+    if codes is None:
+        return code
+    return codes if code in codes.split(";") else f"{codes};{code}"
+
+
+@dataclass(frozen=True)
+class JoinRecords:
+    """The records of a joined source, in the order of its files."""
+
+    parts: tuple[Records, ...]  # with the good records of a block each
+    files: tuple[FileFacts, ...]
+    malformed: int
+
+    def rejected(self, **others: int) -> dict[str, int]:
+        """Return the counts of rejected records by reason, without those of none."""
+        counts = {Reason.malformed_record.name: self.malformed, **others}
+        return {reason: count for reason, count in counts.items() if count}
+
+
+def read_records(
+    source_name: str,
+    paths: Sequence[Path],
+    columns: Mapping[str, Sequence[str]],
+    progress: Progress = no_progress,
+) -> JoinRecords:
+    """Read the columns of each layout of a joined source."""
+    files = SourceFiles.find(data_source(source_name), paths)
+
+    def parse(block: Block) -> Records:
+        layout = block.file.layout
+        if layout.layout == "delimited":
+            return parse_delimited(block.data, layout, columns[layout.name], block.first_line)
+        data = _padded(block) if layout.trimmed else block.data
+        return parse_fixed_width(data, layout, columns[layout.name], block.first_line)
+
+    parts: list[Records] = []
+    readings: list[FileReading] = []
+    for reading, parsed in read_files(files.files, parse, progress=progress):
+        parts += parsed
+        readings.append(reading)
+    facts = tuple(reading.facts for reading in readings)
+    files.check_contents(facts)
+    return JoinRecords(tuple(parts), facts, sum(reading.malformed for reading in readings))
+
+
+def _padded(block: Block) -> bytes:
+    """Return lines of the length of a record, of which the archive leaves out blanks at the end."""
+    width = block.file.layout.record_bytes or 0
+    lines = block.data.splitlines()
+    return b"".join(line.ljust(width)[:width] + b"\n" if line.strip() else b"\n" for line in lines)
+
+
+def texts_of(values: NDArray[np.bytes_]) -> list[str]:
+    """Return fixed-width bytes as trimmed texts."""
+    return [value.decode("latin-1").strip() for value in values.tolist()]
+
+
+def numbers_in(texts: list[str], unit: str = "") -> Array:
+    """Return numbers, NaN where there is none; a limit sign may stand before one."""
+    values = np.full(len(texts), np.nan)
+    for i, text in enumerate(texts):
+        try:
+            values[i] = number_from_text(text.lstrip("<>(").encode("latin-1"))
+        except ValueError:
+            continue
+    least, greatest = RANGES.get(unit, (-np.inf, np.inf))
+    values[(values < least) | (values > greatest)] = np.nan
+    return values

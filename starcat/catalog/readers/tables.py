@@ -1,0 +1,431 @@
+"""Tables of any format in, rows in blocks out: text, ECSV, FITS, VOTable, Parquet and Arrow.
+
+The format is known by the content. Text files, FITS, Parquet and Arrow are read in blocks; a
+VOTable, and a FITS file that is compressed, are read whole by astropy and take memory as such.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from xml.parsers.expat import ExpatError
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from starcat.catalog.readers.blocks import DigestReader, open_input
+from starcat.catalog.readers.records import Problem, Rows, TableColumn
+from starcat.catalog.source_files import InputFile
+from starcat.catalog.table_map import TableMap
+from starcat.errors import StarcatError, quoted
+
+BLOCK_ROWS, BLOCK_BYTES = 1 << 16, 1 << 22
+HEAD_BYTES, SAMPLE_ROWS = 1 << 20, 1000
+BLANKS = ("", "null", "NULL", "nan", "NaN", "NAN", "N/A", "\\N", "--")
+"""Texts that mean no value in any file."""
+
+FORMATS = "CSV, ECSV, FITS, VOTable, Parquet or Arrow"
+
+
+@dataclass(frozen=True)
+class OpenTable:
+    """A table whose header was read."""
+
+    form: str
+    columns: dict[str, TableColumn]
+    read: Callable[
+        [Sequence[str]], Iterator[tuple[pa.Table, NDArray[np.int64] | None, list[Problem]]]
+    ]
+
+    def rows(self, names: Sequence[str]) -> Iterator[Rows]:
+        """Read the columns of some names."""
+        first = 1
+        for table, number, problems in self.read(names):
+            if number is None:
+                number = np.arange(first, first + len(table))
+            first += len(table)
+            yield Rows(self.columns, table, number, problems)
+
+
+def open_table(file: InputFile) -> OpenTable:
+    """Read the header of a table."""
+    try:
+        head = _head(file.path)
+        how = next((how for magic, how in _OPENERS.items() if head.startswith(magic)), _open_text)
+        opened = how(file, file.layout.table or ANY, head)
+    except StarcatError:
+        raise
+    except _DAMAGE as error:
+        raise damaged(file, error) from error
+    if not opened.columns:
+        raise file.error("has no column that holds one value a row; expected a table of stars")
+    return opened
+
+
+def read_tables(
+    file: InputFile,
+    wanted: Callable[[OpenTable], Sequence[str]],
+    on_end: Callable[[DigestReader], None],
+) -> Iterator[Rows]:
+    """Read a table in blocks of rows, one at least."""
+    opened = open_table(file)
+    names = wanted(opened)
+    count = 0
+    try:
+        for rows in opened.rows(names):
+            count += len(rows.number) + len(rows.problems)
+            if len(rows.number) or rows.problems:
+                yield rows
+    except _DAMAGE as error:
+        raise damaged(file, error) from error
+    if not count:
+        raise file.error(f"the table ({opened.form}) has no row; expected stars")
+    buffer = memoryview(bytearray(1 << 20))
+    with DigestReader(file.path) as raw:
+        while raw.readinto(buffer):
+            pass
+        on_end(raw)
+
+
+def damaged(file: InputFile, error: Exception) -> StarcatError:
+    """Return what to say of a table that a library cannot read."""
+    why = " ".join(str(error).split())[:200] or type(error).__name__
+    return file.error(f"not a table that can be read ({why}); expected {FORMATS}. Get it again")
+
+
+ANY = TableMap.model_validate(
+    {
+        "name": "any",
+        "epoch": 2000,
+        "columns": {"star_id": 0, "ra": 0, "dec": 0},
+        "magnitudes": {"V": 0},
+    }
+)
+"""Opens a table for which there is no map yet."""
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SyntaxError, EOFError),
+    *(ExpatError, pa.ArrowException, csv.Error, LookupError),
+)
+_Part = tuple[pa.Table, NDArray[np.int64] | None, list[Problem]]
+
+
+def _head(path: Path) -> bytes:
+    raw, stream = open_input(path)
+    with raw, stream:
+        return stream.read(HEAD_BYTES)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let astropy not warn of the style of files."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _no_columns(file: InputFile, table: int | str | None, known: Sequence[str]) -> StarcatError:
+    which = "a table" if table is None else f"table {table!r}"
+    return file.error(f"has no {which}; it has {', '.join(known) or 'none'}. Name one with 'table'")
+
+
+def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str, Any]]:
+    """Return the columns that a header in YAML tells, as astropy writes it, and the header."""
+    from astropy.table.meta import get_header_from_yaml
+
+    header = get_header_from_yaml(lines)
+    return {
+        one["name"]: TableColumn(
+            one["name"],
+            str(one.get("datatype", "")) in ("string", "bool"),
+            str(one.get("unit") or ""),
+            str((one.get("meta") or {}).get("ucd", "")),
+            str(one.get("description") or ""),
+        )
+        for one in header["datatype"]
+    }, header
+
+
+def _open_text(file: InputFile, how: TableMap, head: bytes) -> OpenTable:
+    text = head.decode(how.encoding, errors="replace" if len(head) == HEAD_BYTES else "strict")
+    lines = text.removeprefix("\ufeff").splitlines()
+    if "\0" in text:
+        raise file.error(f"is of no format that is known; expected {FORMATS}")
+    start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != "#"), len(lines))
+    told: dict[str, TableColumn] = {}
+    delimiter = how.delimiter
+    if lines and lines[0].startswith("# %ECSV"):
+        comments = [line[2:] for line in lines[1:start]]
+        told, header = _serialized(comments)
+        delimiter = delimiter or header.get("delimiter", " ")
+    first = lines[start] if start < len(lines) else ""
+    if not first:
+        raise file.error("the file is empty; expected a table of stars")
+    delimiter = delimiter or max(",;\t|", key=first.count)
+    names = list(how.names) or [
+        name.strip() for name in next(csv.reader([first], delimiter=delimiter))
+    ]
+    units, after = _lines_below(lines[start + 1 : start + 3], delimiter, len(names))
+    _check_names(file, names, has_header=not how.names)
+    options = _TextOptions(start, after, delimiter, names, how)
+    below = io.StringIO("\n".join(lines[start + (not how.names) + after :]))
+    sample = list(islice(csv.reader(below, delimiter=delimiter), SAMPLE_ROWS))
+    columns = {}
+    for place, name in enumerate(names):
+        values = [row[place].strip() for row in sample if len(row) > place]
+        is_text = not all(_is_number(value) for value in values if value not in BLANKS)
+        plain = TableColumn(name, is_text, units[place].strip() if units else "")
+        columns[name] = told.get(name, plain)
+    return OpenTable("ECSV" if told else "text", columns, lambda wanted: options.read(file, wanted))
+
+
+def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list[str], int]:
+    """Return the units, and how many lines VizieR puts between the header and the first row."""
+    rows = [line.split(delimiter) for line in lines]
+    if len(rows) == 2 and len(rows[1]) == count and all(set(x) == {"-"} for x in rows[1]):
+        return rows[0], 2
+    return [], 0
+
+
+def _check_names(file: InputFile, names: Sequence[str], *, has_header: bool) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise file.error(f"two columns are called {', '.join(twice)}; rename one of each")
+    if has_header and all(_is_number(name) for name in names):
+        raise file.error(
+            f"the first line has no names of columns but {quoted(', '.join(names))}; give them "
+            "with 'names' in the map"
+        )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+@dataclass(frozen=True)
+class _TextOptions:
+    """How a text file is read."""
+
+    skipped: int  # lines before the header
+    after: int  # lines between the header and the first row
+    delimiter: str
+    names: list[str]
+    how: TableMap
+
+    def read(self, file: InputFile, wanted: Sequence[str]) -> Iterator[_Part]:
+        """Read columns as texts, in blocks of lines; lines of another length are problems."""
+        bad: list[Problem] = []
+
+        def note(row: pacsv.InvalidRow) -> str:
+            found = f"{row.actual_columns} fields"
+            bad.append(Problem(row.number or 0, "row", None, found, f"{row.expected_columns}"))
+            return "skip"
+
+        raw, stream = open_input(file.path)
+        with raw, stream:
+            reading = self._begin(stream, wanted, note)
+            first, told = 1, 0
+            for batch in reading:
+                table = pa.Table.from_batches([batch])
+                number, first = self._numbers(first, len(table), [one.line for one in bad])
+                now = [one for one in bad[told:] if one.line < first]
+                told += len(now)
+                yield table, number, now
+            if bad[told:]:
+                none = pa.Table.from_batches([], reading.schema)
+                yield none, np.empty(0, np.int64), bad[told:]
+
+    def _begin(
+        self, stream: io.BufferedIOBase, wanted: Sequence[str], note: Callable[[Any], str]
+    ) -> pacsv.CSVStreamingReader:
+        header = 0 if self.how.names else 1
+        skipped = self.skipped + header + self.after
+        return pacsv.open_csv(
+            pa.PythonFile(stream, "r"),
+            pacsv.ReadOptions(
+                use_threads=False, block_size=BLOCK_BYTES, skip_rows=skipped,
+                column_names=self.names, encoding=self.how.encoding,
+            ),
+            pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=note),
+            pacsv.ConvertOptions(
+                column_types=dict.fromkeys(self.names, pa.string()), include_columns=list(wanted),
+                strings_can_be_null=False,
+            ),
+        )  # fmt: skip
+
+    @staticmethod
+    def _numbers(first: int, count: int, bad: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+        """Return the numbers of the next good rows, and that of the row after them."""
+        beyond = sorted(line for line in bad if line >= first)
+        numbers = np.setdiff1d(np.arange(first, first + count + len(beyond)), beyond)[:count]
+        return numbers, int(numbers[-1]) + 1 if count else first
+
+
+def _open_fits(file: InputFile, how: TableMap, _: bytes) -> OpenTable:
+    from astropy.io import fits
+
+    with _quiet(), fits.open(file.path, memmap=True) as found:
+        tables = {
+            n: hdu
+            for n, hdu in enumerate(found)
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+        }
+        known = [f"{n} {hdu.name}".strip() for n, hdu in tables.items()]
+        chosen = [n for n, hdu in tables.items() if how.table is None or how.table in (n, hdu.name)]
+        if not chosen:
+            raise _no_columns(file, how.table, known)
+        hdu = tables[chosen[0]]
+        columns = {}
+        for column in hdu.columns:
+            kind, width = column.dtype.base.kind, column.dtype.shape
+            if not width and kind in "biufSU":
+                ucd = str(
+                    hdu.header.get(f"TUCD{list(hdu.columns.names).index(column.name) + 1}", "")
+                )
+                columns[column.name] = TableColumn(
+                    column.name, column.format.endswith("A") or kind in "SU", column.unit or "", ucd
+                )
+    return OpenTable("FITS", columns, lambda wanted: _read_fits(file.path, chosen[0], wanted))
+
+
+def _read_fits(path: Path, number: int, wanted: Sequence[str]) -> Iterator[_Part]:
+    from astropy.io import fits
+
+    with fits.open(path, memmap=True) as found:
+        with _quiet():
+            data, columns = found[number].data, found[number].columns
+        for start in range(0, len(data), BLOCK_ROWS):
+            part = data[start : start + BLOCK_ROWS]
+            arrays = {}
+            for name in wanted:
+                values = np.asarray(part[name])
+                blank = columns[name].null
+                is_blank = values == blank if isinstance(blank, int) else None
+                arrays[name] = _arrow(values, is_blank)
+            yield _table(arrays, len(part)), None, []
+
+
+def _arrow(values: NDArray[Any], is_blank: NDArray[np.bool_] | None = None) -> pa.Array:
+    if values.dtype.kind == "S":
+        values = np.char.decode(values, "latin-1")
+    if values.dtype.kind in "UO":
+        return pa.array([str(value).strip() for value in values], pa.string(), mask=is_blank)
+    return pa.array(values.astype(values.dtype.newbyteorder("=")), mask=is_blank)
+
+
+def _table(arrays: dict[str, pa.Array], count: int) -> pa.Table:
+    return pa.table(arrays) if arrays else pa.table({"": pa.nulls(count)})
+
+
+def _open_votable(file: InputFile, how: TableMap, _: bytes) -> OpenTable:
+    from astropy.io.votable import parse
+
+    with _quiet():
+        tables = list(parse(file.path, verify="ignore").iter_tables())
+    names = [str(table.ID or table.name or n) for n, table in enumerate(tables)]
+    chosen = [t for n, t in enumerate(tables) if how.table is None or how.table in (n, names[n])]
+    if not chosen:
+        raise _no_columns(file, how.table, names)
+    held = chosen[0].to_table(use_names_over_ids=True)
+    columns = {}
+    for one, shown in zip(chosen[0].fields, held.colnames, strict=True):
+        if held[shown].ndim == 1:
+            is_text = one.datatype in ("char", "unicodeChar")
+            told = (one.ucd or "", " ".join(str(one.description or "").split()))
+            columns[shown] = TableColumn(shown, is_text, str(one.unit or ""), *told)
+
+    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+        for start in range(0, len(held), BLOCK_ROWS):
+            part = held[start : start + BLOCK_ROWS]
+            arrays = {
+                name: _arrow(np.asarray(part[name]), np.ma.getmaskarray(np.ma.asarray(part[name])))
+                for name in wanted
+            }
+            yield _table(arrays, len(part)), None, []
+
+    return OpenTable("VOTable", columns, read)
+
+
+def _arrow_columns(schema: pa.Schema) -> dict[str, TableColumn]:
+    """Return the columns of one value a row, with what astropy or a field's metadata tell."""
+    told: dict[str, TableColumn] = {}
+    described = (schema.metadata or {}).get(b"table_meta_yaml")
+    if described:
+        told, _ = _serialized(described.decode().splitlines())
+    columns = {}
+    for one in schema:
+        kind = one.type.value_type if pa.types.is_dictionary(one.type) else one.type
+        more = {key.decode(): value.decode() for key, value in (one.metadata or {}).items()}
+        is_text = (
+            pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_binary(kind)
+        )
+        if is_text or pa.types.is_primitive(kind) or pa.types.is_decimal(kind):
+            own = told.get(one.name) or TableColumn(one.name)
+            columns[one.name] = TableColumn(
+                one.name, is_text, more.get("unit", own.unit), more.get("ucd", own.ucd),
+                more.get("description", own.description),
+            )  # fmt: skip
+    return columns
+
+
+def _plain(batch: pa.RecordBatch) -> pa.Table:
+    arrays = []
+    for one in batch.columns:
+        kind = one.type.value_type if pa.types.is_dictionary(one.type) else one.type
+        is_text = pa.types.is_large_string(kind) or pa.types.is_binary(kind)
+        wanted = pa.string() if is_text else pa.float64() if pa.types.is_decimal(kind) else kind
+        arrays.append(pc.cast(one, wanted))
+    return pa.Table.from_arrays(arrays, names=batch.schema.names)
+
+
+def _open_parquet(file: InputFile, _: TableMap, __: bytes) -> OpenTable:
+    with pq.ParquetFile(file.path) as found:
+        columns = _arrow_columns(found.schema_arrow)
+
+    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+        with pq.ParquetFile(file.path) as opened:
+            for batch in opened.iter_batches(BLOCK_ROWS, columns=list(wanted), use_threads=False):
+                yield _plain(batch), None, []
+
+    return OpenTable("Parquet", columns, read)
+
+
+def _open_arrow(file: InputFile, _: TableMap, head: bytes) -> OpenTable:
+    begin = pa.ipc.open_file if head.startswith(b"ARROW1") else pa.ipc.open_stream
+    with pa.memory_map(str(file.path)) as source:
+        columns = _arrow_columns(begin(source).schema)
+
+    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+        with pa.memory_map(str(file.path)) as source:
+            found = begin(source)
+            count = getattr(found, "num_record_batches", None)
+            every = found if count is None else (found.get_batch(n) for n in range(count))
+            for batch in every:
+                for start in range(0, len(batch), BLOCK_ROWS):
+                    yield _plain(batch.slice(start, BLOCK_ROWS).select(list(wanted))), None, []
+
+    return OpenTable("Arrow", columns, read)
+
+
+_OPENERS: dict[bytes, Callable[[InputFile, TableMap, bytes], OpenTable]] = {
+    b"SIMPLE  =": _open_fits,
+    b"<?xml": _open_votable,
+    b"<VOTABLE": _open_votable,
+    b"PAR1": _open_parquet,
+    b"ARROW1": _open_arrow,
+    b"\xff\xff\xff\xff": _open_arrow,
+}

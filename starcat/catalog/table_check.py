@@ -1,0 +1,119 @@
+"""What a map makes of a table: value by value with units and ranges, and the first rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.catalog.archives.mapped import Understood, names_wanted, records_of, target, understand
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.readers.tables import open_table, read_tables
+from starcat.catalog.source import DataSource
+from starcat.catalog.source_files import SourceFiles
+from starcat.errors import ConfigError
+
+FIRST = 5
+SHOWN = ("designation", "ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+
+
+@dataclass
+class _Range:
+    """What the values of a key are, so far."""
+
+    least: float = np.inf
+    greatest: float = -np.inf
+    missing: int = 0
+    yes: int = 0
+
+    def add(self, values: np.ndarray[Any, Any]) -> None:
+        """Take the values of some rows."""
+        if values.dtype == bool:
+            self.yes += int(values.sum())
+        elif values.dtype == object:
+            self.missing += sum(value is None for value in values)
+        else:
+            known = values[~np.isnan(values.astype(np.float64))]
+            self.missing += len(values) - len(known)
+            self.least = min(self.least, float(known.min(initial=np.inf)))
+            self.greatest = max(self.greatest, float(known.max(initial=-np.inf)))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a map makes of a table."""
+
+    source: str
+    form: str  # of the first file
+    values: list[dict[str, Any]]  # key, columns, units, range, and how many rows lack it
+    unused: list[str]  # columns that the map does not name
+    first: list[dict[str, Any]]  # what became of the first rows
+    read: Ingested
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as plain values."""
+        return {
+            "source": self.source, "format": self.form, "rows": self.read.rows_read,
+            "kept": len(self.read.stars), "rejected": self.read.rejected_by_reason,
+            "values": self.values, "first_rows": self.first, "unused_columns": self.unused,
+            "problems": list(self.read.problems),
+        }  # fmt: skip
+
+
+def check_map(source: DataSource, path: Path) -> Checked:
+    """Read a table by its map, and say what was understood."""
+    table = source.table
+    if table is None:
+        raise ConfigError(f"{source.name} is an archive, not a map of a table", key="source")
+    files = SourceFiles.find(source, [path]).files
+    opened = open_table(files[0])
+    found = understand(table, opened.columns, files[0].path.name)
+    ranges = {key: _Range() for key in found}
+    for file in files:
+        wanted = partial(names_wanted, table, where=file.path.name)
+        for rows in read_tables(file, wanted, lambda _: None):
+            records = records_of(table, rows, file)
+            for key, values in ranges.items():
+                values.add(records["star_text" if key == "columns.star_id" else key])
+    read = ingest(source.name, [path], neighbours=False)
+    used = {name for one in found.values() for name in one.columns}
+    return Checked(
+        source.name,
+        opened.form,
+        [_told(key, one, ranges[key]) for key, one in found.items()],
+        [name for name in opened.columns if name not in used],
+        _first_rows(read),
+        read,
+    )
+
+
+def _told(key: str, found: Understood, values: _Range) -> dict[str, Any]:
+    is_number = np.isfinite(values.least)
+    return {
+        "key": key,
+        "from": found.value.value,
+        "unit": found.unit,
+        "becomes": (target(key) or "").replace(" ", ""),
+        "least": values.least if is_number else None,
+        "greatest": values.greatest if is_number else None,
+        "missing": values.missing,
+        "true": values.yes if key.split(".")[0] in ("flags", "reject", "quality") else None,
+    }
+
+
+def _first_rows(read: Ingested) -> list[dict[str, Any]]:
+    names = ["source_file", "source_line", *SHOWN, "mag", "band", "is_flagged_double"]
+    names.append("is_flagged_variable")
+    stars = read.stars.select(names)
+    rejected = read.rejected.select(["source_file", "source_line", "reason", "detail"])
+    both = pa.concat_tables([stars, rejected], promote_options="default")
+    order = pc.sort_indices(both, [("source_file", "ascending"), ("source_line", "ascending")])
+    return [
+        {"row": row.pop("source_line"), **{k: v for k, v in row.items() if k != "source_file"}}
+        for row in both.take(order[:FIRST]).to_pylist()
+    ]

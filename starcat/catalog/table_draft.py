@@ -1,0 +1,324 @@
+"""A map proposed for a table, from the names, UCDs, units and first rows of its columns."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from starcat.catalog.readers.records import TableColumn
+from starcat.catalog.readers.tables import ANY, SAMPLE_ROWS, open_table
+from starcat.catalog.source import RecordFile
+from starcat.catalog.source_files import InputFile, table_parts
+from starcat.catalog.table_map import UNITS, unit_of
+from starcat.errors import SourceMissing
+
+_WHEN = r"(deg|rad|h|hr|hours?|hms|dms|mean|icrs|fk4|fk5|j|b|ep|epoch|[12][0-9]{3})*"
+_ID = (
+    "(gaia|source|src|obj|object|star|main|cat|catalog)?(id|no|nr|num|number|identifier|ident|name)"
+)
+_RULES = (
+    ("ra", r"pos\.eq\.ra", rf"(ra|alpha|rightascension){_WHEN}"),
+    ("dec", r"pos\.eq\.dec", rf"(de|decl?|delta|declination){_WHEN}"),
+    ("ra", r"pos\.galactic\.lon", r"(glon|gall|lii|l|galacticlongitude)(deg|rad)?"),
+    ("dec", r"pos\.galactic\.lat", r"(glat|galb|bii|galacticlatitude)(deg|rad)?"),
+    ("pm_ra_cosdec", r"pos\.pm.*(\.ra|\.lon)", r"(pm|mu)(ra|alpha|a|l|glon)(star|cos(de?c?|b))?"),
+    ("pm_dec", r"pos\.pm.*(\.dec|\.lat)", r"(pm|mu)(de|dec|decl|delta|d|b|glat)"),
+    ("parallax", r"pos\.parallax", r"plx|parallax|prlx"),
+    ("radial_velocity", r"spect\.dopplerveloc", r"h?rv|vrad|rad(ial)?vel(ocity)?"),
+    ("epoch", r"time\.epoch", r"(obs|mean|ref)*(mjd|jd|jdate|epoch|ep|jyear|year)"),
+    ("spectral_type", r"src\.sptype", r"sp|spt|sptype|spectral(type|class)?|spectype|mk"),
+    ("ruwe", "", r"ruwe"),
+    ("amplitude", r"src\.var\.amplitude", r"(var)?amp(l|litude)?"),
+    ("hip_number", "", r"hip(no|id|number)?"),
+    ("hd_number", "", r"hd(no|id|number)?"),
+    (
+        "flags.double",
+        r"meta\.code\.multip",
+        r"dup|dbl|(is)?double|mult(iple|flag)?|binary|nonsinglestar|ccdm",
+    ),
+    ("flags.variable", r"src\.var", r"(is)?var(iable)?(flag)?|vflag|photvariableflag|variability"),
+    ("star_id", r"meta\.id", rf"{_ID}|recno|seq|tyc|sao|ptskey|designation"),
+)
+"""Key, UCD and name (in small letters and digits) of what a column may be, in this order."""
+
+_BANDS = (
+    r"phot_(?P<band>g|bp|rp)_mean_mag",
+    r"(?P<band>[a-z]{1,2}[0-9]?)_?(t)?mag(nitude)?( .*)?",
+    r"m(ag(nitude)?)?_?(?P<band>[a-z]{1,3})",
+    r"(psf)?_?flux_?(?P<band>[a-z]{1,2})(_.*)?",
+    r"(?P<band>[jhk])_m",
+)
+_ERROR = re.compile(r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom)$")
+_USUAL = {"radial_velocity": "km/s", "pm_ra": "mas/yr", "parallax_error": "mas"}
+
+
+@dataclass
+class Draft:
+    """What is proposed for the columns of a table."""
+
+    path: Path
+    columns: dict[str, TableColumn]
+    sample: pa.Table
+    found: dict[str, str] = field(default_factory=dict)  # key to TOML value
+    notes: dict[str, str] = field(default_factory=dict)  # key to what to look at
+    used: dict[str, str] = field(default_factory=dict)  # column to key
+    top: dict[str, str] = field(default_factory=dict)  # keys above the sections
+
+    def as_toml(self) -> str:
+        """Return the map as TOML."""
+        name = re.sub(r"[^a-z0-9_-]+", "-", self.path.name.lower().split(".")[0]).strip("-")[:32]
+        lines = [
+            f"# A map proposed for {self.path.name}. Look through it, and check it with",
+            f"# starcat sources --check MAP.toml {self.path.name}",
+            f'name = "{name or "mine"}"',
+        ]
+        lines += [f"{key} = {value}" for key, value in self.top.items()]
+        for section in ("columns", "magnitudes", "magnitude_errors", "flags"):
+            keys = [key for key in self.found if key.split(".")[0] == section]
+            needed = {"columns": ("columns.star_id", "columns.ra", "columns.dec")}.get(section, ())
+            lacks = [key for key in needed if key not in self.found]
+            if section == "magnitudes" and not keys:
+                lacks = ["magnitudes.V"]
+            if keys or lacks:
+                lines += ["", f"[{section}]"]
+            for key in lacks:
+                lines.append(f'# {key.split(".")[1]} = ""  # no column looks like it: name one')
+            for key in keys:
+                note = self.notes.get(key, "")
+                short = json.dumps(key.split(".", 1)[1])
+                short = short[1:-1] if re.fullmatch(r'"[A-Za-z0-9_-]+"', short) else short
+                lines.append(f"{short} = {self.found[key]}{f'  # {note}' if note else ''}")
+        rest = [name for name in self.columns if name not in self.used]
+        lines += ["", f"# Not used: {', '.join(rest)}" if rest else "# All columns are used."]
+        return "\n".join(lines) + "\n"
+
+    def values(self, name: str) -> list[Any]:
+        """Return the first values of a column that has one there."""
+        held = self.sample[name].to_pylist()
+        return [one for one in held if one not in (None, "") and one == one]
+
+    def numbers(self, name: str) -> list[float]:
+        """Return those that are numbers."""
+        found = []
+        for one in self.values(name):
+            try:
+                found.append(float(one))
+            except (TypeError, ValueError):
+                continue
+        return found
+
+
+def draft_map(path: Path) -> Draft:
+    """Propose a map for a table."""
+    parts = table_parts(path) if path.is_dir() else [path]
+    if not parts or not parts[0].exists():
+        raise SourceMissing(f"{path}: no table there; give a file, or the folder of a HATS catalog")
+    layout = RecordFile(name="table", file_names=(parts[0].name,), layout="table", table=ANY)
+    opened = open_table(InputFile(parts[0], layout, "table"))
+    rows = next(opened.rows(list(opened.columns)), None)
+    names = list(opened.columns)
+    sample = rows.table.slice(0, SAMPLE_ROWS) if rows else pa.table({name: [] for name in names})
+    made = Draft(path, opened.columns, sample)
+    _split_angles(made)
+    for key, name in _guesses(made):
+        _take(made, key, name)
+    _place_and_time(made)
+    return made
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+
+
+def _guesses(made: Draft) -> Iterator[tuple[str, str]]:
+    """Give keys and the columns that may be them, the likeliest first."""
+    for by_ucd in (True, False):
+        for key, ucd, pattern in _RULES:
+            for name, column in made.columns.items():
+                told = column.ucd.lower()
+                base = _ERROR.sub("", name.lower())
+                is_error = base != name.lower() or told.startswith("stat.error")
+                fits = (
+                    re.match(ucd, told.removeprefix("stat.error;"))
+                    if by_ucd and ucd and told
+                    else None
+                )
+                if fits is None and not by_ucd:
+                    fits = re.fullmatch(pattern, _plain(base))
+                if fits and (not is_error or f"{key}_error" in UNITS or key == "pm_ra_cosdec"):
+                    error = key.replace("_cosdec", "") + "_error" if is_error else key
+                    yield error, name
+        yield from _magnitudes(made, by_ucd=by_ucd)
+    if "columns.star_id" not in made.found:
+        for key in ("columns.hip_number", "columns.hd_number"):
+            if key in made.found:
+                made.found["columns.star_id"] = made.found[key]
+                name = next(one for one, short in made.used.items() if f"columns.{short}" == key)
+                made.used[name] = "star_id"
+                return
+
+
+def _magnitudes(made: Draft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
+    for name, column in made.columns.items():
+        lower = re.sub(r"\s*[\[(].*?[\])]", "", name.lower())
+        base = _ERROR.sub("", lower)
+        is_error = base != lower or column.ucd.startswith("stat.error")
+        told = re.search(r"phot\.(mag|flux).*em\.[a-z]+\.([A-Za-z]+)$", column.ucd)
+        if by_ucd:
+            band = told[2] if told else ""
+        else:
+            fits = (re.fullmatch(pattern, base) for pattern in _BANDS)
+            match = next(filter(None, fits), None)
+            band = (
+                name[base.index(match["band"]) :][: len(match["band"])]
+                if match and not is_error
+                else (match["band"] if match else "")
+            )
+        if band:
+            yield f"{'magnitude_errors' if is_error else 'magnitudes'}.{_band(band)}", name
+
+
+def _band(text: str) -> str:
+    known = {"vis": "V", "hp": "Hp", "k": "K", "ks": "Ks"}
+    if text.lower() in known:
+        return known[text.lower()]
+    if len(text) == 1:
+        return text.upper() if text in "ubvjhg" else text
+    return text.upper() if text.lower() in ("bp", "rp", "bt", "vt") else text
+
+
+def _take(made: Draft, key: str, name: str) -> None:
+    """Make a column the value of a key, if neither has another yet."""
+    kind, _, band = key.partition(".")
+    if name in made.used:
+        return
+    if kind == "magnitude_errors" and f"magnitudes.{band}" not in made.found:
+        return
+    if not band:
+        key = f"columns.{key}"
+    if kind == "epoch":
+        scale = next((s for s in ("mjd", "jd", "byear") if s in name.lower()), "jyear")
+        made.top.setdefault("epoch", f'{{ value = {json.dumps(name)}, scale = "{scale}" }}')
+        made.used[name] = "epoch"
+        return
+    if key in made.found and kind == "magnitudes":
+        key = f"magnitudes.{re.sub(r'[^A-Za-z0-9]', '', name)}"
+    if key in made.found:
+        return
+    made.used[name] = key.removeprefix("columns.")
+    if kind == "flags":
+        made.found[key], made.notes[key] = _condition(made, name), "look at the condition"
+        return
+    unit, note = _unit(made, key, name)
+    if key == "columns.pm_ra_cosdec" and unit.startswith("s"):
+        key = "columns.pm_ra"
+        made.used[name] = "pm_ra"
+    quoted = json.dumps(name, ensure_ascii=False)
+    made.found[key] = f'{{ value = {quoted}, unit = "{unit}" }}' if unit else quoted
+    made.notes[key] = "; ".join(filter(None, (made.columns[name].description[:60], note)))
+
+
+def _unit(made: Draft, key: str, name: str) -> tuple[str, str]:
+    """Return the unit to state, empty where none is needed, and what to look at."""
+    kind, _, short = key.partition(".")
+    wanted = "mag" if kind.startswith("magnitude") else UNITS.get(short, "")
+    told = made.columns[name].unit
+    if not wanted or (told and ":" not in told and _is_unit(told)):
+        return "", ""
+    for text in re.findall(r"[\[(](.+?)[\])]", name):
+        if _is_unit(text):
+            return text, ""
+    for text in name.split("_")[1:]:
+        if _is_unit(text) and unit_of(text).physical_type in _KINDS:
+            return text, ""
+    numbers = made.numbers(name)
+    largest = max(map(abs, numbers), default=0.0)
+    if short == "ra" and numbers and largest <= 24.0 and not made.columns[name].is_text:
+        return ("rad", "radians?") if largest <= 6.2832 else ("hourangle", "hours?")
+    if short == "dec" and numbers and largest <= 1.5708:
+        return "rad", "radians?"
+    if short in ("ra", "dec"):
+        return "", ""
+    if wanted == "mag":
+        return ("mmag", "mmag?") if kind == "magnitudes" and largest > 100.0 else ("", "")
+    return wanted.replace(" ", ""), "the unit is a guess"
+
+
+_KINDS = (
+    *("angle", "angular speed", "angular frequency", "frequency", "speed", "unknown"),
+    "spectral flux density",
+)
+
+
+def _is_unit(text: str) -> bool:
+    try:
+        unit_of(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _condition(made: Draft, name: str) -> str:
+    """Return a condition for which values of a flag mean yes."""
+    column, values = made.columns[name], made.values(name)
+    shown = name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) else f'"{name}"'
+    if made.sample[name].type == pa.bool_() or {str(v).lower() for v in values} <= {
+        "true",
+        "false",
+    }:
+        return json.dumps(shown)
+    if not column.is_text:
+        return json.dumps(f"{shown} > 0")
+    yes = sorted({v for v in values if re.match(r"[dmvyt1cb]", str(v).lower())})[:8]
+    if len(values) < len(made.sample) or not yes:
+        return json.dumps(f"{shown} IS NOT NULL")
+    return json.dumps(f"{shown} IN ({', '.join(repr(str(one)) for one in yes)})")
+
+
+def _split_angles(made: Draft) -> None:
+    """Take hours and degrees that are apart from their minutes and seconds, as the CDS has them."""
+    names = {name.lower(): name for name in made.columns}
+    hours = [names.get(one, "") for one in ("rah", "ram", "ras")]
+    if all(hours):
+        made.found["columns.ra"] = f'{{ value = "{_sum(hours)}", unit = "hourangle" }}'
+        made.used |= dict.fromkeys(hours, "ra")
+    degrees = [names.get(one, "") for one in ("ded", "dem", "des")]
+    if all(degrees):
+        sign = names.get("de-", "")
+        text = f"({_sum(degrees)})"
+        if sign:
+            text = f"CASE WHEN \"{sign}\" = '-' THEN -1 ELSE 1 END * {text}"
+            made.used[sign] = "dec"
+        made.found["columns.dec"] = f'{{ value = {json.dumps(text)}, unit = "deg" }}'
+        made.used |= dict.fromkeys(degrees, "dec")
+
+
+def _sum(names: Sequence[str]) -> str:
+    return f"{names[0]} + {names[1]} / 60 + {names[2]} / 3600"
+
+
+def _place_and_time(made: Draft) -> None:
+    """Propose frame, equinox and epoch."""
+    place = " ".join(name.lower() for name, key in made.used.items() if key in ("ra", "dec"))
+    year = re.search(r"(1[89][0-9]{2}|20[0-9]{2})", place)
+    top: dict[str, str] = {}
+    if re.search(r"glon|gall|galactic|lii", place):
+        top["frame"] = '"galactic"'
+    elif year and year[1] == "1950":
+        top["frame"] = '"FK4"'
+    elif year and year[1] != "2000":
+        top |= {"frame": '"FK5"', "equinox": f'"J{year[1]}"'}
+    elif "fk5" in place:
+        top["frame"] = '"FK5"'
+    if "epoch" not in made.top:
+        is_gaia = any(name.startswith("phot_g") for name in made.columns)
+        system = "B" if top.get("frame") == '"FK4"' else "J"
+        moment = f'"{system}{year[1]}"' if year else "2016.0" if is_gaia else "2000.0"
+        top["epoch"] = f"{moment}  # a guess: the table does not say it"
+    made.top = {**top, **made.top}

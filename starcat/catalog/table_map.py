@@ -1,0 +1,230 @@
+"""The map of a table of one's own: which columns of a file mean what, in which units and frame.
+
+A map is a TOML file of the user's, or one that ships for a table of others. It names columns, or
+expressions of columns, for the values of a star. This module reads no star; the rows of a table
+get their meaning in `starcat.catalog.archives.mapped`.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+UNITS = {
+    "ra": "deg",
+    "dec": "deg",
+    "pm_ra_cosdec": "mas / yr",
+    "pm_ra": "mas / yr",
+    "pm_dec": "mas / yr",
+    "ra_error": "mas",
+    "dec_error": "mas",
+    "pm_ra_error": "mas / yr",
+    "pm_dec_error": "mas / yr",
+    "parallax": "mas",
+    "parallax_error": "mas",
+    "radial_velocity": "km / s",
+    "amplitude": "mag",
+    "companion_separation": "arcsec",
+    "companion_delta_mag": "mag",
+    "epoch": "",
+    "ruwe": "",
+    "hip_number": "",
+    "hd_number": "",
+}
+"""The numbers of [columns], and the unit that each is turned into."""
+
+ASSUMED = {"ra": "deg", "dec": "deg", "amplitude": "mag", "companion_delta_mag": "mag"}
+"""Units of numbers for which neither the map nor the file states one; others have to be stated."""
+
+REJECTS = ("deleted", "duplicate_record", "minor_planet", "extended", "artifact")
+QUALITIES = (
+    *("saturated", "photocentre", "blended", "poor_photometry", "dubious_position"),
+    *("contaminated", "perhaps_not_a_star"),
+)
+NAME = r"^[a-z0-9][a-z0-9_-]{0,31}$"
+_MOMENT = re.compile(r"[JB]?\d{4}(\.\d*)?|\d{4}-\d\d-\d\d([T ].*)?")
+_EQUINOX = re.compile(r"[JB]\d{4}(\.\d*)?")
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Value(_Model):
+    """What a value of a star is made from."""
+
+    value: str | float  # a column, an expression of columns, or one number for all rows
+    unit: str | None = None  # as astropy.units writes it; default: the unit that the file states
+    scale: Literal["jyear", "byear", "jd", "mjd"] = "jyear"  # of an epoch that is a column
+
+    @model_validator(mode="after")
+    def _check(self) -> Value:
+        if self.value == "":
+            raise ValueError("is empty; name a column or write an expression, or leave the key out")
+        if self.unit is not None:
+            unit_of(self.unit)
+        return self
+
+
+def _as_value(given: Any) -> Any:
+    return {"value": given} if isinstance(given, str | int | float) else given
+
+
+Given = Annotated[Value, BeforeValidator(_as_value)]
+
+
+def unit_of(text: str) -> Any:
+    """Return the unit of astropy that a text means; `ValueError` where it means none."""
+    from astropy import units
+
+    for form in (None, "cds", "vounit", "fits"):
+        try:
+            return units.Unit(text, format=form)
+        except (ValueError, TypeError):
+            continue
+    raise ValueError(f"{text!r} is no unit of astropy; write it like deg, mas/yr, hourangle, mag")
+
+
+class StarColumns(_Model):
+    """The values of a star; a key that is left out is unknown for all stars."""
+
+    star_id: Given = Field(description="its permanent identifier: a whole number, or a text")
+    ra: Given = Field(description="right ascension, or galactic longitude; may be sexagesimal")
+    dec: Given = Field(description="declination, or galactic latitude; may be sexagesimal")
+    designation: Given | None = Field(None, description="its name; default: map's name and star_id")
+    pm_ra_cosdec: Given | None = Field(None, description="proper motion along ra, on the sky")
+    pm_ra: Given | None = Field(None, description="the same as a change of the coordinate")
+    pm_dec: Given | None = Field(None, description="proper motion along dec")
+    ra_error: Given | None = Field(None, description="standard error along ra, on the sky")
+    dec_error: Given | None = Field(None, description="standard error along dec")
+    pm_ra_error: Given | None = Field(None, description="standard error of pm_ra_cosdec")
+    pm_dec_error: Given | None = Field(None, description="standard error of pm_dec")
+    parallax: Given | None = Field(None, description="parallax")
+    parallax_error: Given | None = Field(None, description="standard error of parallax")
+    radial_velocity: Given | None = Field(None, description="radial velocity, away is positive")
+    ruwe: Given | None = Field(None, description="Gaia's unit weight error")
+    spectral_type: Given | None = Field(None, description="spectral type")
+    amplitude: Given | None = Field(None, description="amplitude of a variable star")
+    companion_separation: Given | None = Field(None, description="separation of a companion")
+    companion_delta_mag: Given | None = Field(None, description="how much fainter a companion is")
+    hip_number: Given | None = Field(None, description="Hipparcos number")
+    hd_number: Given | None = Field(None, description="Henry Draper number")
+
+
+class Flags(_Model):
+    """Conditions, such as ``flag = 'D'``."""
+
+    double: str = Field("", description="where it holds, the star is flagged double")
+    variable: str = Field("", description="where it holds, the star is flagged variable")
+
+
+class TableMap(_Model):
+    """What the columns of a table mean."""
+
+    name: str = Field(pattern=NAME, description="of the source, in commands and specs")
+    title: str = Field("", description="what the table is")
+    identifier: str = Field("", description="where it is catalogued")
+    citation: str = Field("", description="what to cite")
+    licence: str = Field("", description="on what terms it may be passed on")
+    file_names: tuple[str, ...] = Field(
+        (), description="names to look for in folders; default: the map's name with any ending"
+    )
+    table: int | str | None = Field(
+        None, description="number or name of the table in a FITS file or VOTable; default: first"
+    )
+    delimiter: str | None = Field(
+        None, min_length=1, max_length=1, description="of a text file; default: the header's"
+    )
+    names: tuple[str, ...] = Field((), description="columns of a text file without a header")
+    encoding: str = Field("utf8", description="of a text file")
+    null: tuple[str | float, ...] = Field((), description="texts and numbers that mean no value")
+    frame: Literal["ICRS", "FK5", "FK4", "galactic"] = Field("ICRS", description="axes of ra, dec")
+    equinox: str | None = Field(None, description="default: J2000 of FK5, B1950 of FK4")
+    epoch: Given = Field(description="of the positions: 2016.0, J2000, B1950, a date, or a column")
+    columns: StarColumns = Field(description="the values of a star")
+    magnitudes: dict[str, Given] = Field(
+        min_length=1, description="by band, the default first; fluxes become AB magnitudes"
+    )
+    magnitude_errors: dict[str, Given] = Field({}, description="standard errors by band")
+    colour: str | None = Field(None, description="two of the bands, such as BP-RP")
+    flags: Flags = Flags(double="", variable="")
+    reject: dict[
+        Literal["deleted", "duplicate_record", "minor_planet", "extended", "artifact"], str
+    ] = Field({}, description="conditions on which a row is rejected, by reason")
+    quality: dict[str, str] = Field({}, description=f"conditions by bit: {', '.join(QUALITIES)}")
+
+    @model_validator(mode="after")
+    def _check(self) -> TableMap:
+        if self.equinox is not None and self.frame not in ("FK4", "FK5"):
+            raise ValueError(f"equinox: {self.frame} has none; leave it out, or use FK4 or FK5")
+        if self.equinox is not None and not _EQUINOX.fullmatch(self.equinox):
+            raise ValueError(f"equinox: {self.equinox!r} is not like J2000 or B1950")
+        if self.columns.pm_ra is not None and self.columns.pm_ra_cosdec is not None:
+            raise ValueError("columns: give either pm_ra_cosdec or pm_ra, not both")
+        has_ra = self.columns.pm_ra is not None or self.columns.pm_ra_cosdec is not None
+        if has_ra != (self.columns.pm_dec is not None):
+            raise ValueError("columns: a proper motion has two parts; give both or none")
+        bands = tuple(self.magnitudes)
+        for band in self.magnitude_errors:
+            if band not in bands:
+                raise ValueError(
+                    f"magnitude_errors.{band}: no such band; it has {', '.join(bands)}"
+                )
+        if self.colour is not None and self.colour_bands is None:
+            raise ValueError(f"colour: {self.colour!r} is not two of the bands {', '.join(bands)}")
+        for bit in self.quality:
+            if bit not in QUALITIES:
+                raise ValueError(f"quality.{bit}: no such bit; choose of {', '.join(QUALITIES)}")
+        for text in (*self.quality.values(), *self.reject.values()):
+            if not text.strip():
+                raise ValueError("quality, reject: a condition is empty; write it, or leave it out")
+        return self
+
+    @property
+    def colour_bands(self) -> tuple[str, str] | None:
+        """The two bands of the colour."""
+        pairs = ((a, b) for a in self.magnitudes for b in self.magnitudes)
+        return next((pair for pair in pairs if "-".join(pair) == self.colour), None)
+
+    @property
+    def moment(self) -> float | str | None:
+        """The epoch, where it is the same for all rows."""
+        given = self.epoch.value
+        if isinstance(given, str) and not _MOMENT.fullmatch(given):
+            return None
+        return given
+
+    @property
+    def epoch_jyear(self) -> float | None:
+        """The same as a Julian year."""
+        from astropy.time import Time
+
+        moment = self.moment
+        if not isinstance(moment, str):
+            return moment
+        if moment.replace(".", "", 1).isdigit():
+            return float(moment)
+        return float(Time(moment, scale="tt").jyear)
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """All values and conditions by what they are called in messages."""
+        found: dict[str, Value] = {}
+        for key in StarColumns.model_fields:
+            given = getattr(self.columns, key)
+            if given is not None:
+                found[f"columns.{key}"] = given
+        if self.moment is None:
+            found["epoch"] = self.epoch
+        for kind in ("magnitudes", "magnitude_errors"):
+            found |= {f"{kind}.{band}": value for band, value in getattr(self, kind).items()}
+        conditions = {"double": self.flags.double, "variable": self.flags.variable}
+        found |= {f"flags.{key}": Value(value=text) for key, text in conditions.items() if text}
+        found |= {f"reject.{key}": Value(value=text) for key, text in self.reject.items()}
+        return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the map as a manifest holds it."""
+        return self.model_dump(mode="json", exclude_defaults=True)
