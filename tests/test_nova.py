@@ -97,6 +97,18 @@ def test_a_picture_is_solved(client, frame, small_artifact):
     assert truth.separation(middle).arcsec < 60
 
 
+def test_centroids_are_solved_whichever_way_y_counts(client, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    x, y = frame.centroids_px.T + 0.5
+    size = {"image_width": camera.width_px, "image_height": camera.height_px}
+    for rows in (y, camera.height_px + 1 - y):
+        answer = sent(client, "/api/upload", {"x": x.tolist(), "y": rows.tolist(), **size}).json()
+        found = client.get(f"/api/jobs/{answer['subid']}/calibration").json()
+        ra_deg, dec_deg, _ = radec_roll_from_matrix(frame.matrix)
+        truth = SkyCoord(ra_deg, dec_deg, unit="deg")
+        assert truth.separation(SkyCoord(found["ra"], found["dec"], unit="deg")).arcsec < 60
+
+
 @pytest.mark.parametrize("turn_deg", [-170.0, -30.0, 0.0, 75.0])
 @pytest.mark.parametrize("parity", [1.0, -1.0])
 def test_a_calibration_says_where_up_is(turn_deg, parity):
@@ -121,7 +133,9 @@ def test_a_calibration_says_where_up_is(turn_deg, parity):
 @pytest.mark.parametrize(
     ("address", "given", "files", "status", "said"),
     [
-        ("/api/upload", {}, {}, 422, "send one as 'file'"),
+        ("/api/upload", {}, {}, 422, "send a picture as 'file'"),
+        ("/api/upload", {"x": [1, 2], "y": [1]}, {}, 422, "lists 'x' and 'y' of a length"),
+        ("/api/upload", {"x": [1, "a"], "y": [1, 2]}, {}, 422, "expected numbers"),
         ("/api/upload", [], {}, 422, "expected an object"),
         ("/api/upload", {}, {"file": ("a.fits", b"nothing")}, 422, "a.fits"),
         ("/api/url_upload", {"url": "http://127.0.0.1/"}, {}, 422, "fetches nothing"),
@@ -181,7 +195,7 @@ def test_astroquery_solves_photographs(tmp_path):
         client = AstrometryNet()
         client.URL, client.API_URL, client.api_key = served.address, f"{served.address}/api", "any"
         for path in sorted((NIGHTS / "spel").iterdir())[:20]:
-            found = client.solve_from_image(path, force_image_upload=True, verbose=False)
+            found = client.solve_from_image(path, verbose=False)
             wcs = WCS(found, naxis=2)
             width = found["IMAGEW"]
             left, other = wcs.pixel_to_world([0, width - 1], [0, 0])

@@ -7,6 +7,7 @@ A session is what a sign-in on the page has, and travels in the JSON of a reques
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import secrets
@@ -97,9 +98,10 @@ async def upload(request: Request, service: TheService) -> Response:
         async with request.form(max_files=1, max_fields=4) as form:
             given, file = _given(form), form.get("file")
             _check_session(request, given)
-            if not isinstance(file, UploadFile):
-                raise Problem(422, "no file: this service solves pictures, send one as 'file'")
-            frames = FrameUpload.of_form(file, service.settings.upload_mib)
+            if isinstance(file, UploadFile):
+                frames = FrameUpload.of_form(file, service.settings.upload_mib)
+            else:
+                frames = _centroids(given)
             solution = await service.sandbox.run(_solve, service, frames, given)
     except (Problem, StarcatError) as error:
         problem = problem_of(error)
@@ -228,14 +230,39 @@ def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solu
     """Solve a picture; where it only matches mirrored, its rows are taken the other way."""
     database = _database(service)
     fov_deg = _fields_of(database, given)
+    size_px = None if fov_deg is None else _size_of(given)
     for flip in (None, True, False):
         frames.content.seek(0)
-        options = IdentifyOptions(fov_deg=fov_deg, flip=flip)
+        options = IdentifyOptions(fov_deg=fov_deg, size_px=size_px, flip=flip)
         found, _ = identify_upload(service, database.id, frames, options, None, for_page=True)
         [frame], [more] = found["frames"], found["more"]
         if (frame.get("refusal") or {}).get("reason") != "mirrored":
             break
     return Solution(frames.name, more["wcs"] or "", frame)
+
+
+def _centroids(given: dict[str, Any]) -> FrameUpload:
+    """Return the frame of those who have found the stars themselves."""
+    x, y = given.get("x"), given.get("y")
+    if not (isinstance(x, list) and isinstance(y, list) and len(x) == len(y)):
+        raise Problem(
+            422, "send a picture as 'file', or centroids as lists 'x' and 'y' of a length"
+        )
+    try:  # the first pixel has its middle at 1
+        centroids = [[float(a) - 0.5, float(b) - 0.5] for a, b in zip(x, y, strict=True)]
+    except (TypeError, ValueError):
+        raise Problem(422, "x, y: expected numbers") from None
+    return FrameUpload("frame.json", io.BytesIO(json.dumps({"centroids_px": centroids}).encode()))
+
+
+def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the size of a picture whose centroids alone were sent."""
+    if "x" not in given:
+        return None
+    width, height = given.get("image_width"), given.get("image_height")
+    if not (isinstance(width, int) and isinstance(height, int)):
+        raise Problem(422, "image_width, image_height: expected whole numbers of pixels")
+    return width, height
 
 
 def _database(service: Service) -> Database:
