@@ -27,7 +27,7 @@ from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build, join_all, join_notes
 from starcat.pipeline.catalog_snapshot import reading_keys
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec, Selection
@@ -353,6 +353,17 @@ def test_catalogs_are_read_anew_where_other_pairs_would_count():
     assert one == other
     one, other = (reading_keys(preset("gaia-12deg", each)) for each in (joined, wide | joined))
     assert one != other
+
+
+def test_a_source_that_knows_no_star_is_told(ingested, catalogs):
+    spec = preset("sao-12deg", {"selection.doubles.join": '["wds"]'})
+    stars = ingested("sao", "sao.dat.gz").stars
+    _, joined = join_all(stars, [read_wds([catalogs / FILES["wds"]])], spec)
+    assert joined == {"wds": 0}  # SAO has HD numbers
+    assert [note[:39] for note in join_notes(joined, spec)] == [
+        "wds says nothing of any star of sao: a "
+    ]
+    assert join_notes({"wds": 1}, spec) == ()
 
 
 def test_the_key_is_recorded_only_where_it_is_used():
