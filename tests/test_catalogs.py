@@ -32,6 +32,7 @@ SAO_PLACE = (15 * (39 / 60 + 47.119 / 3600), 82 + 29 / 60 + 37.80 / 3600)  # of 
 FILES = {
     "sao": "sao.dat",
     "hipparcos": "hip_main.dat",
+    "hipparcos2": "hip2.dat",
     "tycho1": "tyc_main.dat",
     "tycho2": "tyc2.dat",
     "2mass": "psc_aaa",
@@ -564,6 +565,53 @@ def test_records_that_are_no_stars(row, read, source, fields, reason):
         assert found.rejected["star_id"].to_pylist() == [{"sao": 107, "tycho2": 1_000_331}[source]]
         named = {"sao": "SAO 107", "tycho2": "TYC 1-33-1"}[source]
         assert found.rejected["designation"].to_pylist() == [named]
+
+
+# Hipparcos-2, of which there are no genuine records here
+
+NEW = {
+    "hip": 87937, "sn": 5, "so": 0, "nc": 1, "ra_rad": 4.7028571021, "de_rad": 0.0814779868,
+    "plx": 548.31, "pm_ra": -798.58, "pm_de": 10328.12, "e_ra": 1.39, "e_de": 1.05, "e_plx": 1.51,
+    "e_pm_ra": 1.72, "e_pm_de": 1.22, "hp_mag": 9.4901, "e_hp_mag": 0.0024, "va": 0, "b_v": 1.57,
+    "v_i": 2.79,
+}  # fmt: skip
+
+
+def new_record(**changes: float) -> bytes:
+    return record(data_source("hipparcos2").files[0], {**NEW, **changes}).rstrip(b"\n")
+
+
+def test_a_record_of_hipparcos2(row):
+    star = row("hipparcos2", new_record())
+    assert (star["designation"], star["hip_number"], star["band"]) == ("HIP 87937", 87937, "Hp")
+    assert star["ra_deg"] == pytest.approx(np.degrees(4.7028571021), abs=1e-12)
+    assert star["dec_deg"] == pytest.approx(np.degrees(0.0814779868), abs=1e-12)
+    assert (star["pm_ra_cosdec_mas_yr"], star["pm_dec_mas_yr"]) == (-798.58, 10328.12)
+    assert (star["epoch_jyear"], star["parallax_mas"]) == (1991.25, 548.31)
+    assert (star["ra_error_mas"], star["ra_central_jyear"]) == (1.39, 1991.25)
+    assert (star["mag"], star["colour_mag"], star["second_colour_mag"]) == (9.4901, 1.57, 2.79)
+    assert star["double_flag"] is None is star["variable_flag"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "double", "variable", "is_photocentre"),
+    [
+        ({"sn": 15}, "Sn=15", None, False),
+        ({"sn": 55}, "Sn=55", None, True),
+        ({"sn": 25}, None, "Sn=25", False),
+        ({"sn": 7}, "Sn=7", None, False),
+        ({"sn": 1}, "Sn=1", None, False),
+        ({"nc": 2}, "Sn=5", None, False),
+        ({"va": 2}, None, "VA=2", False),
+        ({"sn": 35, "va": 1}, "Sn=35", "Sn=35;VA=1", False),
+    ],
+)
+def test_doubles_and_variables_of_hipparcos2(row, changes, double, variable, is_photocentre):
+    star = row("hipparcos2", new_record(**changes))
+    assert (star["double_flag"], star["variable_flag"]) == (double, variable)
+    assert star["is_flagged_double"] == (double is not None)
+    assert star["is_flagged_variable"] == (variable is not None)
+    assert bool(star["quality_flags"] & Quality.PHOTOCENTRE) == is_photocentre
 
 
 # Tycho-1

@@ -27,7 +27,8 @@ from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build, join_all, join_notes
+from starcat.pipeline.catalog_snapshot import reading_keys
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec, Selection
 from starcat.specs.doubtful_stars import Doubles
@@ -323,6 +324,46 @@ def test_a_build_with_joined_doubles(tmp_path, catalogs):
     before = plain.manifest["sources"][0]["rejected"]["flagged_double"]
     assert 0 < stars["rejected"]["flagged_double"] - before <= doubles["joined"]
     assert doubles["kept"] + sum(doubles["rejected"].values()) == doubles["rows_read"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_build_of_hipparcos2_with_everything_by_place(tmp_path, made):
+    folder, _ = made
+    changes = {
+        "catalog.source": "hipparcos2", "catalog.band": "Hp", "boresights.count": "500",
+        "camera.response.name": "silicon-cmos", "epoch_jyear": "[2027.0, 2042.0]",
+        "selection.doubles.join": '["wds"]', "selection.variables.join": '["vsx"]',
+        "self_test.frames": "10", "self_test.min_identified": "0.0",
+    }  # fmt: skip
+    inputs = {name: [folder] for name in ("hipparcos2", "vsx")}
+    inputs["wds"] = [folder / "wdsweb_summ2.txt"]
+    built = build(preset("gaia-12deg", changes), inputs, tmp_path)
+    check_artifact(built.folder)
+    stars, variables, doubles = built.manifest["sources"]
+    assert [one["role"] for one in (variables, doubles)] == ["variability", "doubles"]
+    assert min(variables["joined"], doubles["joined"]) > 50
+    assert stars["rejected"]["variable"] > 0 < stars["rejected"]["flagged_double"]
+
+
+def test_catalogs_are_read_anew_where_other_pairs_would_count():
+    wide = {"selection.doubles.min_separation_deg": "0.1"}
+    joined = {"selection.doubles.join": '["wds"]'}
+    one, other = (reading_keys(preset("gaia-12deg", each)) for each in ({}, wide))
+    assert one == other
+    one, other = (reading_keys(preset("gaia-12deg", each)) for each in (joined, wide | joined))
+    assert one != other
+
+
+def test_a_source_that_knows_no_star_is_told(ingested, catalogs):
+    spec = preset("sao-12deg", {"selection.doubles.join": '["wds"]'})
+    stars = ingested("sao", "sao.dat.gz").stars
+    _, joined = join_all(stars, [read_wds([catalogs / FILES["wds"]])], spec)
+    assert joined == {"wds": 0}  # SAO has HD numbers
+    assert [note[:39] for note in join_notes(joined, spec)] == [
+        "wds says nothing of any star of sao: a "
+    ]
+    assert join_notes({"wds": 1}, spec) == ()
 
 
 def test_the_key_is_recorded_only_where_it_is_used():

@@ -61,7 +61,13 @@ def built(spec: BuildSpec, folder: Path) -> tuple[Built, Cost]:
 def check_fields(fov_deg: float, folder: Path) -> None:
     """Build what `init` chooses; 1 deg is as deep as the embedded sky is, and no deeper."""
     starter = started(fov_deg)
-    made, cost = built(starter.spec, folder)
+    spec = starter.spec
+    if fov_deg == 1.0:
+        with pytest.raises(BuildError, match=r"self_test\.min_identified asks for 90"):
+            build(spec, {}, folder)
+        test = spec.self_test.model_copy(update={"min_identified": 0.7})
+        spec = spec.model_copy(update={"self_test": test})
+    made, cost = built(spec, folder)
     assert cost == starter.cost or cost.rows == starter.cost.rows
     assert sum(rate.wrong for rate in made.rates) == 0
     clean, hard, bare, bare_hard = (rate.identified_share for rate in made.rates)

@@ -24,6 +24,7 @@ from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
 from starcat.report import coverage_map
 from starcat.report.coverage_map import project
+from starcat.service.pages.facts import star_columns
 from starcat.service.pages.rendering import time_text
 from starcat.service.pages.wording import in_page_words
 
@@ -108,6 +109,25 @@ def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_
         assert f"{axis} the boresight {told}" in text_of(text.replace("><", "> <"))
     [picture] = re.findall(r'<img src="([^"]*attitude_error.png)"', text)
     assert client.get(picture).headers["content-type"] == "image/png"
+
+
+def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, small_artifact):
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    manifest["spec"]["epoch_jyear"] = [2027.0, 2042.0]
+    manifest["spec"]["selection"]["neighbours"] = {"psf_sigma_px": 1.0}
+    assert star_columns(manifest)[2:5] == [
+        "drift_arcsec",
+        "centroid_offset_arcsec",
+        "contamination",
+    ]
+    page = client.get(f"{PAGE}/coverage?order=most").text
+    link = re.findall(r'href="([^"]*)" aria-label="Stars of field', page)[0]
+    answer = client.get(link)
+    assert answer.status_code == 200
+    words = text_of(answer.text)
+    assert "mag_error" in words
+    assert "position_error_end_arcsec" in words
+    assert "drift_arcsec" not in words.partition("Answer")[2].partition("Named queries")[0]
 
 
 def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):

@@ -204,6 +204,7 @@ def test_a_query_that_is_begun_again_has_the_same_answer(pool, small_artifact, m
         while not held.waiting(""):
             assert not running.done()
             await asyncio.sleep(0.01)
+        assert len(pool._open._idle) == 1, "its process was interrupted, and serves others"
         held.release("a")
         return await running
 

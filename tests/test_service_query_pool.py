@@ -11,7 +11,7 @@ import pytest
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
-from starcat.service.sandbox.pool import IDLE, QueryPool
+from starcat.service.sandbox.pool import QueryPool
 from starcat.service.settings import Settings
 
 COUNT = "SELECT count(*) > 100 FROM stars"
@@ -88,10 +88,11 @@ def test_one_that_was_left_halfway_is_thrown_away(sessions, small_artifact):
 
 def test_only_some_are_kept(sessions, artifact_version):
     processes = []
-    for number in range(IDLE + 1):
+    sessions._open._most_idle = 2
+    for number in range(3):
         with sessions.session([artifact_version(f"1.0.{number}")]) as session:
             processes.append(process_of(session))
-    assert [is_there(one) for one in processes] == [False] + [True] * IDLE
+    assert [is_there(one) for one in processes] == [False, True, True]
 
 
 def test_a_target_that_was_replaced_is_opened_anew(sessions, small_artifact, tmp_path):

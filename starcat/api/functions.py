@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.catalog.ingest import Ingested
     from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
+    from starcat.exchange.solvers.write import ExportedSolver
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database
@@ -371,24 +372,24 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
 
 def export(
     database: PathLike, form: str, output: PathLike | None = None, **options: Any
-) -> Exported | ExportedImage:
-    """Write tables of a database for other tools, or its image for flight software.
+) -> Exported | ExportedImage | ExportedSolver:
+    """Write tables of a database, its image for flight software, or another solver's database.
 
     Parameters
     ----------
     database : str or path-like
         The folder of a database.
     form : str
-        As ``--to`` of ``starcat export``: csv, fits, votable, ... or onboard, c.
+        As ``--to`` of ``starcat export``: csv, fits, votable, ... onboard, c, or a solver.
     output : str or path-like, optional
-        A folder for tables, by default ``export``, or the file of an image.
+        A folder for tables, by default ``export``, or for a solver's files; the file of an image.
     **options
         ``products``, ``replace``, ``max_partition_rows`` for tables; ``method``, ``endian``,
-        ``max_bytes``, ``replace`` for an image.
+        ``max_bytes``, ``replace`` for an image; ``replace`` for a solver.
 
     Returns
     -------
-    Exported or ExportedImage
+    Exported, ExportedImage or ExportedSolver
         What was written.
 
     Raises
@@ -397,12 +398,15 @@ def export(
         As the command line says them.
     """
     from starcat.exchange.export import export_tables, tables_of
-    from starcat.exchange.formats import ONBOARD_FORMATS
+    from starcat.exchange.formats import ONBOARD_FORMATS, SOLVER_FORMATS
     from starcat.exchange.onboard import export_image
+    from starcat.exchange.solvers.write import export_solver
 
     target = None if output is None else Path(output)
     if form in ONBOARD_FORMATS:
         return export_image(Path(database), form, target, **options)
+    if form in SOLVER_FORMATS:
+        return export_solver(Path(database), form, target, **options)
     return export_tables(tables_of(Path(database)), form, target or Path("export"), **options)
 
 

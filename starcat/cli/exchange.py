@@ -11,11 +11,12 @@ import typer
 from starcat.cli.console import print_facts, print_table, print_things, say, show
 from starcat.cli.options import Json, to_either
 from starcat.errors import ConfigError
-from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
+from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
 
 if TYPE_CHECKING:
     from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
+    from starcat.exchange.solvers.write import ExportedSolver
     from starcat.onboard.reading import OnboardImage
 
 app = typer.Typer()
@@ -32,14 +33,16 @@ FormatName = Annotated[
         "--format",
         metavar="FORMAT",
         help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
-        f"{' or '.join(ONBOARD_FORMATS)} for flight software.",
+        f"{' or '.join(ONBOARD_FORMATS)} for flight software; for other solvers "
+        f"{', '.join(SOLVER_FORMATS[:-1])} or {SOLVER_FORMATS[-1]}.",
     ),
 ]
 OutputPath = Annotated[
     Path | None,
     to_either(
         "Where the result goes: the folder of one file a product, default: export; for onboard and "
-        "c the file, default: <name>-<version>.img or .c."
+        "c the file, default: <name>-<version>.img or .c; for other solvers the folder, default: "
+        "<name>-<version>-<format>."
     ),
 ]
 MaxPartitionRows = Annotated[
@@ -71,7 +74,7 @@ def export(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write tables for other tools, one file a product, or an image for flight software.
+    """Write tables for other tools, an image for flight software, or other solvers' databases.
 
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
@@ -86,6 +89,10 @@ def export(
         image = export_image(_named(source), form, output, replace=replace, **given)
         _say_left_out(image)
         show(json, image.as_dict(), print_exported_image, image)
+        return
+    if form in SOLVER_FORMATS:
+        _refuse(form, of_tables | of_hats | of_images)
+        _for_solver(_named(source), form, output, replace, json)
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
     from starcat.exchange.export import MAX_ROWS, export_tables, tables_of
@@ -103,6 +110,15 @@ def export(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _for_solver(
+    database: Path, solver: str, output: Path | None, replace: bool, json: bool
+) -> None:
+    from starcat.exchange.solvers.write import export_solver
+
+    exported = export_solver(database, solver, output, replace=replace)
+    show(json, exported.as_dict(), print_exported_solver, exported)
 
 
 def _refuse(form: str, options: Mapping[str, object]) -> None:
@@ -132,6 +148,19 @@ def print_exported(exported: Exported) -> None:
     print_things(title, exported.files, columns, numbers=(2, 3))
     beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
     print_table("", (f"in {exported.folder}{beside}",), [])
+
+
+def print_exported_solver(exported: ExportedSolver) -> None:
+    """Print what was written for another solver."""
+    stars, faintest_mag = exported.facts["stars"], exported.facts["faintest_mag"]
+    facts = {
+        "epoch": f"J{exported.facts['epoch_jyear']:g}",
+        "stars": f"{stars:,}, the faintest {faintest_mag:.2f} mag",
+        **{name.replace("_", " "): f"{value:,}" for name, value in exported.made.items()},
+        "folder": str(exported.folder),
+        "to load": exported.main,
+    }
+    print_facts(f"{exported.facts['database']} for {exported.solver}", facts)
 
 
 LIBRARY_STARS = 192

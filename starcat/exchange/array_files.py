@@ -245,11 +245,11 @@ def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for column in columns:
             values = _fixed_texts(column) if column.is_text else column.values
-            _add_array(archive, column.name, values)
+            add_array(archive, column.name, values)
             if column.offsets is not None:
-                _add_array(archive, f"{column.name}.offsets", column.offsets)
+                add_array(archive, f"{column.name}.offsets", column.offsets)
             if column.is_null.any():
-                _add_array(archive, f"{column.name}.is_null", column.is_null)
+                add_array(archive, f"{column.name}.is_null", column.is_null)
 
 
 def _to_numpy(values: pa.Array) -> NDArray[Any]:
@@ -275,7 +275,8 @@ def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
     return column.values.astype(np.str_)
 
 
-def _add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+def add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+    """Add an array to an npz file, the same bytes every time."""
     if len(f"{name}.npy".encode()) > _ENTRY_NAME_BYTES:
         raise SchemaError(
             f"column {name[:20]}... has a name of {len(name)} letters, which npz has no room for; "
@@ -290,4 +291,4 @@ def _add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> Non
         )
     # An entry opened by its name is dated 1980, so that the bytes are the same every time.
     with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
-        np.lib.format.write_array(stream, np.ascontiguousarray(values), allow_pickle=False)
+        np.lib.format.write_array(stream, np.asarray(values, order="C"), allow_pickle=False)

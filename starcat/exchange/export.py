@@ -25,7 +25,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.catalog.stars import floats_of
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
 from starcat.exchange.columns import Label, field_facts
-from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS
+from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
 from starcat.exchange.writers import write_batches
 from starcat.storage.atomic import whole_folder
 from starcat.storage.parquet import read_parquet
@@ -165,8 +165,8 @@ def _check_asked(file_format: str, folder: Path) -> None:
     """Refuse what cannot be done before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
-            f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}, or "
-            f"{' or '.join(ONBOARD_FORMATS)}",
+            f"format {file_format!r} is unknown; choose one of "
+            + ", ".join((*EXPORT_FORMATS, *ONBOARD_FORMATS, *SOLVER_FORMATS)),
             key="to",
             value=file_format,
         )

@@ -94,6 +94,7 @@ PAGE_FORMATS: tuple[PageFormat, ...] = get_args(PageFormat)
 TEXT_FORMATS = tuple(name for name in FILE_FORMATS if FORMATS[name].is_text)
 EXPORT_FORMATS = (*FILE_FORMATS, "hats")
 ONBOARD_FORMATS = ("onboard", "c")
+SOLVER_FORMATS = ("tetra3", "cedar-solve", "tetra3rs", "lost", "astrometry-net", "astap")
 
 TAP_FORMATS = tuple(
     FORMATS[name] for name in ("votable", "votable/td", "fits", "csv", "tsv", "json", "parquet")

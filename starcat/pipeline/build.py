@@ -176,6 +176,7 @@ def _make(
         (
             *catalog.notes,
             *motion_notes(spec, products),
+            *join_notes(joined, spec),
             *in_band.notes,
             *spec.exposure_notes,
             str(held or ""),
@@ -233,6 +234,17 @@ def join_all(
     for table in tables:
         stars, joined[table.source] = table.join(stars, spec.selection)
     return stars, joined
+
+
+def join_notes(joined: Mapping[str, int], spec: BuildSpec) -> tuple[str, ...]:
+    """Return a note for each joined source that says nothing of any star."""
+    return tuple(
+        f"{name} says nothing of any star of {spec.catalog.source}: a joined source knows stars by "
+        "their numbers in other catalogs or by place. Join a file that has what these stars have, "
+        "or leave it out"
+        for name, count in joined.items()
+        if not count
+    )
 
 
 def report_build(folder: Path, results: BuildResults) -> CoverageReport:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from starcat.catalog.observed import with_observed
 from starcat.catalog.span import with_span
 from starcat.catalog.stars import floats_of
-from starcat.pipeline.build import Inputs, join_all, read_sources
+from starcat.pipeline.build import Inputs, join_all, join_notes, read_sources
 from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
 from starcat.pipeline.sensor_band import in_band_of
@@ -72,7 +72,7 @@ def read_snapshot(
     """Read the catalogs of a spec, as its build does."""
     catalog, joins = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
-    stars, _ = join_all(joined.catalog.stars, joins, spec)
+    stars, found = join_all(joined.catalog.stars, joins, spec)
     in_band = in_band_of(stars, spec, inputs, workers, progress)
     stars = with_observed(in_band.stars, spec.selection.observed)
     stars = with_span(stars, spec.span_jyear)
@@ -84,7 +84,7 @@ def read_snapshot(
         round(len(catalog.rejected) * _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS))),
         catalog.stars.nbytes + catalog.rejected.nbytes,
         catalog.rows_read,
-        (*catalog.notes, *in_band.notes),
+        (*catalog.notes, *join_notes(found, spec), *in_band.notes),
     )
 
 

@@ -98,7 +98,7 @@ COUNTERPART = 75.0
 DATASET_BYTES = 835.0
 """A dataset of the database, beside its values: its name, place and attributes."""
 
-REPORT_BYTES, REPORT_BYTES_PER_FIELD = 649.5e3, 39.0
+REPORT_BYTES, REPORT_BYTES_PER_FIELD = 1.03e6, 98.0
 """The report with its page and pictures and the manifest, and what each field adds to them."""
 
 PART_ROWS, PARTS = 8192, 3

@@ -32,7 +32,13 @@ from starcat.service.settings import Role, Settings
 VOSI = ("/tap/availability", "/tap/capabilities")
 """What clients look at before they know that a token is needed (VOSI 1.1)."""
 
-OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI)
+NOVA = (
+    *("/api/login", "/api/upload", "/api/url_upload"),
+    *("/api/submissions/", "/api/jobs/", "/wcs_file/"),
+)
+"""Whose clients send no header: a session is in their JSON, a number in their addresses."""
+
+OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
 """What everybody may see, also where a token is needed for all else."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")

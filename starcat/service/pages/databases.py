@@ -34,6 +34,7 @@ from starcat.service.pages.facts import (
     products_of,
     rejections_of,
     report_of,
+    star_columns,
 )
 from starcat.service.pages.notebook import Notebook, database_code, difference_code, query_code
 from starcat.service.pages.rendering import address_of, page_router, render
@@ -124,6 +125,7 @@ def coverage_page(
         report=report_of(database),
         sky_map=sky_map(fields),
         fields=[field_at(fields, number) for number in numbers],
+        star_columns=["designation", "mag", *star_columns(database.manifest)],
         fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
         view=view_of(database, fields=f"/databases/{database.id}/fields.json"),
         order=order,

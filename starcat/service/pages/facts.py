@@ -85,6 +85,19 @@ def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
+def star_columns(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the columns of ``stars`` with errors and blends that the database knows."""
+    spec = manifest["spec"]
+    schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
+    known = ["mag_error", "position_error_end_arcsec"]
+    if not isinstance(spec["epoch_jyear"], int | float):
+        known.append("drift_arcsec")
+    if spec["selection"].get("neighbours"):
+        known += ["centroid_offset_arcsec", "contamination", "blend_mag"]
+    columns = {column.name for column in schema.columns}
+    return [name for name in known if name in columns]
+
+
 def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return why records of the catalogs are no guide stars, the most frequent reason first.
 

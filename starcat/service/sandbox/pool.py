@@ -18,8 +18,9 @@ from starcat.query.session import Limits, Session, open_session
 from starcat.service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat.service.settings import Settings
 
-IDLE = 8
-"""Query sessions that are kept while nobody asks; those used longest ago are closed first."""
+IDLE = 2 * SHORT_PLACES
+"""Query sessions that are kept while nobody asks; those used longest ago are closed first. SQL and
+TAP have different ones of the same database, and each may want all places for a moment."""
 
 SPARE = 2
 """Processes that are started before it is known what they are to open, which takes less time."""
@@ -197,7 +198,8 @@ class QueryPool:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
         self._lanes = Lanes(SHORT_PLACES, settings.queries)
-        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
+        # What was interrupted is lent again: a process that has not heard in time is gone.
+        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError, Overdue))
         self.close = self._open.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

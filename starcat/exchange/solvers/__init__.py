@@ -1,0 +1,1 @@
+"""Databases in the files of other star identifiers and plate solvers."""

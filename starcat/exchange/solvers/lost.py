@@ -1,0 +1,90 @@
+"""The database of LOST: a catalog and the pairs of its stars under a K-vector, double precision.
+
+Parts follow each other, each with a number that says what it is, flags, a length, and its bytes
+from the next multiple of 8; 0 ends the file. Values stand at multiples of their size. LOST takes
+fields as wide as its pairs are far apart, and numbers stars in 16 bits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcat.errors import ConfigError
+from starcat.exchange.solvers.sky import SolverSky
+from starcat.geometry.proximity import pairs_within
+
+MOST_STARS = 32_767
+_CATALOG, _PAIRS = 0xF9A283BC, 0x2536F009
+_HAS_MAGNITUDE, _HAS_NAME = 1, 2
+_BIN_ARCSEC = 5.0
+_LEAST_DEG = 0.5
+"""Pairs that are closer tell little, and centroids of such stars often run into each other."""
+
+_STAR = np.dtype([("direction", "<f8", (3,)), ("mag", "<f4"), ("name", "<i2"), ("", "V2")])
+_INDEX = np.dtype(
+    [("pairs", "<i4"), ("", "V4"), ("least", "<f8"), ("most", "<f8"), ("bins", "<i4")]
+)
+
+
+def write_lost(sky: SolverSky, path: Path) -> dict[str, Any]:
+    """Write the database of LOST; returns its figures."""
+    if len(sky.mag) > MOST_STARS:
+        raise ConfigError(
+            f"{sky.name} has {len(sky.mag):,} stars; LOST numbers {MOST_STARS:,} at most: build it "
+            "again with a brighter selection.faint_limit_mag",
+            key="to",
+        )
+    count, pairs = _pairs(sky)
+    file = bytearray()
+    for number, content in ((_PAIRS, pairs), (_CATALOG, _catalog(sky))):
+        _add_part(file, number, content)
+    _fill(file, 4)
+    path.write_bytes(file + bytes(4))
+    return {"pairs": count}
+
+
+def _catalog(sky: SolverSky) -> bytes:
+    stars = np.zeros(len(sky.mag), dtype=_STAR)
+    stars["direction"] = sky.directions
+    stars["mag"] = np.round(100.0 * sky.mag)
+    stars["name"] = np.arange(1, len(stars) + 1)
+    flags = _HAS_MAGNITUDE | _HAS_NAME
+    head = np.int16(len(stars)).tobytes() + np.int8(flags).tobytes()
+    # The last star ends with its name, without the bytes that bring another to its place.
+    return head.ljust(8, b"\0") + stars.tobytes()[:-2]
+
+
+def _pairs(sky: SolverSky) -> tuple[int, bytes]:
+    least_rad, most_rad = np.radians(_LEAST_DEG), _diagonal_rad(sky)
+    rows, angle = pairs_within(sky.directions, most_rad)
+    rows, angle = rows[angle >= least_rad], angle[angle >= least_rad]
+    order = np.lexsort((rows[:, 1], rows[:, 0], angle))
+    bins = int(np.ceil((most_rad - least_rad) / np.radians(_BIN_ARCSEC / 3600.0)))
+    index = np.zeros((), dtype=_INDEX)
+    index["pairs"], index["bins"] = len(rows), bins
+    index["least"], index["most"] = least_rad, most_rad
+    # A pair in the n-th bin is counted from the n-th bound on.
+    width = (most_rad - least_rad) / bins
+    bin_of = np.minimum(np.ceil((angle[order] - least_rad) / width), bins)
+    counts = np.searchsorted(bin_of, np.arange(bins + 1), side="right")
+    parts = (index, counts.astype("<i4"), rows[order].astype("<i2"))
+    return len(rows), b"".join(part.tobytes() for part in parts)
+
+
+def _diagonal_rad(sky: SolverSky) -> float:
+    half = np.tan(0.5 * np.radians(sky.fov_deg[1])) / sky.camera.width_px
+    return float(2.0 * np.arctan(half * np.hypot(sky.camera.width_px, sky.camera.height_px)))
+
+
+def _add_part(file: bytearray, number: int, content: bytes) -> None:
+    _fill(file, 4)
+    file += np.array([number, 0, len(content)], dtype="<u4").tobytes()
+    _fill(file, 8)
+    file += content
+
+
+def _fill(file: bytearray, size: int) -> None:
+    file += bytes(-len(file) % size)

@@ -1,0 +1,78 @@
+"""What every solver is given: the guide stars, the fields of view, and where they come from."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from starcat.arrays import Array
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.reader import Artifact
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import radec_from_directions
+from starcat.version import __version__
+
+
+@dataclass(frozen=True)
+class SolverSky:
+    """The guide stars of a database, brightest first, at its epoch; rows are stars."""
+
+    name: str  # <name>-<version>
+    source: str
+    epoch_jyear: float
+    star_id: NDArray[np.int64]
+    designation: tuple[str, ...]
+    directions: Array  # ICRS unit vectors, shape (N, 3)
+    ra_deg: Array
+    dec_deg: Array
+    mag: Array
+    camera: Camera
+    fov_deg: tuple[float, float]  # narrowest and widest horizontal field of view
+    manifest_sha256: str
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where a solver's file comes from."""
+        return {
+            "database": self.name,
+            "manifest_sha256": self.manifest_sha256,
+            "starcat": __version__,
+            "source": self.source,
+            "epoch_jyear": self.epoch_jyear,
+            "stars": len(self.mag),
+            "faintest_mag": float(self.mag[-1]),
+            "fov_deg": [round(fov, 9) for fov in self.fov_deg],
+        }
+
+
+def sky_of(artifact: Artifact) -> SolverSky:
+    """Return what a solver's file is made of."""
+    manifest, spec = artifact.manifest, artifact.spec
+    stars = artifact.stars
+    order = np.lexsort((stars["star_id"].to_numpy(), floats_of(stars, "mag")))
+    stars = stars.take(pa.array(order))
+    directions = directions_of(stars)
+    ra_deg, dec_deg = radec_from_directions(directions)
+    camera = spec.camera.camera()
+    levels = spec.products.levels
+    widest_deg = levels.widest_fov_x_deg if levels.enabled else camera.fov_x_deg
+    return SolverSky(
+        name=f"{manifest['name']}-{manifest['version']}",
+        source=spec.catalog.source,
+        epoch_jyear=float(manifest["epoch_jyear"]),
+        star_id=stars["star_id"].to_numpy(),
+        designation=tuple(text or "" for text in stars["designation"].to_pylist()),
+        directions=directions,
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        mag=floats_of(stars, "mag"),
+        camera=camera,
+        fov_deg=(camera.fov_x_deg, widest_deg),
+        manifest_sha256=hashlib.sha256((artifact.folder / MANIFEST_NAME).read_bytes()).hexdigest(),
+    )

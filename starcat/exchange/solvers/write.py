@@ -1,0 +1,91 @@
+"""A database as another solver loads it: its files, the stars, and where they are from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import csv
+
+from starcat.artifact.verify import check_artifact
+from starcat.exchange.formats import SOLVER_FORMATS
+from starcat.exchange.solvers.astap import write_astap
+from starcat.exchange.solvers.lost import write_lost
+from starcat.exchange.solvers.programs import write_astrometry_net, write_tetra3rs
+from starcat.exchange.solvers.sky import SolverSky, sky_of
+from starcat.exchange.solvers.tetra import write_tetra
+from starcat.storage.atomic import move_into_place, whole_folder
+from starcat.storage.digests import file_sha256, json_bytes
+
+PROVENANCE_NAME = "provenance.json"
+STARS_NAME = "stars.csv"
+
+_Write = Callable[[SolverSky, Path], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class ExportedSolver:
+    """The files of a solver as they were written."""
+
+    solver: str
+    folder: Path
+    main: str  # name of the file or folder that the solver loads
+    made: dict[str, Any]  # figures of the solver's own
+    facts: dict[str, Any]  # what provenance.json says
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {"solver": self.solver, "folder": str(self.folder), **self.facts}
+
+
+def export_solver(
+    database: Path, solver: str, output: Path | None = None, *, replace: bool = False
+) -> ExportedSolver:
+    """Write a database for another solver, one of `SOLVER_FORMATS`."""
+    sky = sky_of(check_artifact(database))
+    final = output or Path(f"{sky.name}-{solver}")
+    write, suffix = _WRITERS[solver]
+    with whole_folder(final.absolute()) as unfinished:
+        main = unfinished / f"{sky.name}{suffix}"
+        made = write(sky, main)
+        files = sorted(path for path in unfinished.rglob("*") if path.is_file())
+        digests = {path.relative_to(unfinished).as_posix(): file_sha256(path) for path in files}
+        facts = {"solver": solver, **sky.provenance, **made, "sha256": digests}
+        csv.write_csv(_stars(sky), unfinished / STARS_NAME)
+        (unfinished / PROVENANCE_NAME).write_bytes(json_bytes(facts))
+        move_into_place(unfinished, final.absolute(), replace=replace)
+    return ExportedSolver(solver, final, main.name, made, facts)
+
+
+def _stars(sky: SolverSky) -> pa.Table:
+    """Return the stars in the order of the solver's own, so that its rows have names."""
+    return pa.table(
+        {
+            "row": pa.array(range(1, len(sky.mag) + 1)),
+            "star_id": sky.star_id,
+            "designation": pa.array(sky.designation),
+            "ra_deg": sky.ra_deg,
+            "dec_deg": sky.dec_deg,
+            "mag": sky.mag,
+        }
+    )
+
+
+_WRITERS: dict[str, tuple[_Write, str]] = dict(
+    zip(
+        SOLVER_FORMATS,
+        (
+            (partial(write_tetra, solver="tetra3"), ".npz"),
+            (partial(write_tetra, solver="cedar-solve"), ".npz"),
+            (write_tetra3rs, ".bin"),
+            (write_lost, ".dat"),
+            (write_astrometry_net, ""),
+            (write_astap, ""),
+        ),
+        strict=True,
+    )
+)
