@@ -294,6 +294,9 @@ class TestNames:
         monkeypatch.setenv("STARCAT_SOURCES", str(tmp_path))
         recorded = map_of("mine")
         assert recorded == mapped(recorded).table.recorded()
+        two = mapped({**recorded, "magnitudes": {"V": "v", "B": "v"}, "bands": ["V", "B"]})
+        again = json.loads(json.dumps(two.table.recorded(), sort_keys=True))
+        assert mapped(again).bands == ("V", "B")
         with known_maps([{**recorded, "epoch": 1990.0}]):
             assert data_source("mine").epoch_jyear == 1990.0
         assert data_source("mine").epoch_jyear == 2000.0

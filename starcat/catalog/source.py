@@ -219,7 +219,7 @@ def mapped(content: Mapping[str, Any]) -> DataSource:
         licence=table.licence,
         frame=table.frame,
         epoch_jyear=table.epoch_jyear,
-        bands=tuple(table.magnitudes),
+        bands=table.ordered_bands,
         urls_retrieved="no address",
         files=(RecordFile(name=table.name, file_names=names, layout="table", table=table),),
     )

@@ -151,6 +151,7 @@ class TableMap(_Model):
     magnitudes: dict[str, Given] = Field(
         min_length=1, description="by band, the default first; fluxes become AB magnitudes"
     )
+    bands: tuple[str, ...] = Field((), description="their order; default: that of [magnitudes]")
     magnitude_errors: dict[str, Given] = Field({}, description="standard errors by band")
     colour: str | None = Field(None, description="two of the bands, such as BP-RP")
     flags: Flags = Flags(double=None, variable=None)
@@ -170,7 +171,9 @@ class TableMap(_Model):
         has_ra = self.columns.pm_ra is not None or self.columns.pm_ra_cosdec is not None
         if has_ra != (self.columns.pm_dec is not None):
             raise ValueError("columns: a proper motion has two parts; give both or none")
-        bands = tuple(self.magnitudes)
+        bands = self.ordered_bands
+        if sorted(bands) != sorted(self.magnitudes):
+            raise ValueError(f"bands: names {', '.join(bands)}, not each of [magnitudes] once")
         for band in self.magnitude_errors:
             if band not in bands:
                 raise ValueError(
@@ -194,6 +197,11 @@ class TableMap(_Model):
                 f"epoch: {self.moment!r} is no date; write it like 2016-01-01"
             ) from None
         return self
+
+    @property
+    def ordered_bands(self) -> tuple[str, ...]:
+        """The bands, the default first."""
+        return self.bands or tuple(self.magnitudes)
 
     @property
     def colour_bands(self) -> tuple[str, str] | None:
@@ -235,9 +243,12 @@ class TableMap(_Model):
             found |= {f"{kind}.{band}": value for band, value in getattr(self, kind).items()}
         conditions = {"double": self.flags.double, "variable": self.flags.variable}
         found |= {f"flags.{key}": Value(value=text) for key, text in conditions.items() if text}
-        found |= {f"reject.{key}": Value(value=text) for key, text in self.reject.items()}
+        # In the order of the reasons, since the first that applies is the verdict.
+        for key in (one for one in REJECTS if one in self.reject):
+            found[f"reject.{key}"] = Value(value=self.reject[key])
         return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
 
     def recorded(self) -> dict[str, Any]:
-        """Return the map as a manifest holds it."""
-        return self.model_dump(mode="json", exclude_defaults=True)
+        """Return the map as a manifest holds it; JSON has no order of keys, so the bands have one."""
+        held = self.model_dump(mode="json", exclude_defaults=True)
+        return {**held, "bands": list(self.ordered_bands)}

@@ -340,7 +340,7 @@ class MappedTable:
         return {**columns, **self._light(records, band), **self._remarks(records)}
 
     def _light(self, records: Records, band: str) -> Columns:
-        bands = list(self.table.magnitudes)
+        bands = self.table.ordered_bands
         columns: Columns = {
             "mag": self.magnitudes(records, band),
             "mag_error": known(_number(records, f"magnitude_errors.{band}")),
