@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from starcat.catalog.readers.records import TableColumn
 from starcat.catalog.readers.tables import ANY, SAMPLE_ROWS, open_table
-from starcat.catalog.source import RecordFile
+from starcat.catalog.source import RecordFile, source_names
 from starcat.catalog.source_files import InputFile, table_parts
 from starcat.catalog.table_map import UNITS, unit_of
 from starcat.errors import SourceMissing
@@ -72,11 +72,11 @@ class Draft:
 
     def as_toml(self) -> str:
         """Return the map as TOML."""
-        name = re.sub(r"[^a-z0-9_-]+", "-", self.path.name.lower().split(".")[0]).strip("-")[:32]
+        name = re.sub(r"[^a-z0-9_-]+", "-", self.path.name.lower().split(".")[0]).strip("-")[:29]
         lines = [
             f"# A map proposed for {self.path.name}. Look through it, and check it with",
             f"# starcat sources --check MAP.toml {self.path.name}",
-            f'name = "{name or "mine"}"',
+            f'name = "{"my-" if name in source_names() else ""}{name or "mine"}"',
         ]
         lines += [f"{key} = {value}" for key, value in self.top.items()]
         for section in ("columns", "magnitudes", "magnitude_errors", "flags"):

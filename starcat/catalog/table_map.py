@@ -249,6 +249,6 @@ class TableMap(_Model):
         return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
 
     def recorded(self) -> dict[str, Any]:
-        """Return the map as a manifest holds it; JSON has no order of keys, so the bands have one."""
+        """Return the map as a manifest holds it; JSON has no order of keys, so bands have one."""
         held = self.model_dump(mode="json", exclude_defaults=True)
         return {**held, "bands": list(self.ordered_bands)}
