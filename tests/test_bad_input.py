@@ -216,6 +216,29 @@ def records_of_2mass() -> bytes:
     return b"".join(b"|".join(each) + b"\n" for each in (fields, second))
 
 
+OWN_TABLE = b"id,ra,dec,pm,v\n1,2,3,4,5\n"
+OWN_MAP = """
+name = "mine"
+epoch = 2000.0
+[columns]
+star_id = "id"
+ra = "ra"
+dec = "dec"
+pm_ra = { value = "4", unit = "deg/yr" }
+pm_dec = { value = "pm", unit = "mas/yr" }
+[magnitudes]
+V = "v"
+"""
+
+
+def own_table(old: str, new: str, table: bytes = OWN_TABLE) -> Callable[[Place], Call]:
+    """Ingest a table by a map with something changed."""
+    assert old in OWN_MAP
+    files = {"mine.toml": OWN_MAP.replace(old, new, 1).encode(), "t.csv": table}
+    call = "ingest --source {folder}/mine.toml --input {folder}/t.csv -o {out}/stars.parquet"
+    return run(call, files)
+
+
 def write_zeros(place: Place) -> None:
     os.truncate(place.write("sao.dat", b""), 1 << 26)
 
@@ -294,6 +317,11 @@ CATALOG_FILES: Cases = {
     "no input named and none found": run("ingest sao -o {out}/stars.parquet"),
     "source unknown": run("ingest soa -o {out}/stars.parquet"),
     "source unknown, like no other": run("build --preset sao-12deg --input xyzzy=a.dat -o {out}"),
+    "map with an unknown key": own_table("epoch", "epoc"),
+    "map without a unit that is needed": own_table(', unit = "mas/yr"', ""),
+    "map that names no column of the table": own_table('ra = "ra"', 'ra = "alpha"'),
+    "map with a query for an expression": own_table('V = "v"', 'V = "(SELECT 1)"'),
+    "map of a table that is none": own_table("", "", b"ARROW1"),
     "source is not a star catalog": run(
         "ingest gcvs --input {folder}/gcvs.tsv -o {out}/stars.parquet", {"gcvs.tsv": b"1\n"}
     ),

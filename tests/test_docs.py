@@ -36,6 +36,7 @@ WALKED = [
     "docs/howto-calibrate.md",
     "docs/howto-query.md",
     "docs/howto-release.md",
+    "docs/howto-own-catalog.md",
 ]
 
 

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 
 from starcat.catalog.archives.mapped import identity
-from starcat.catalog.ingest import Ingested
-from starcat.catalog.source import give_map, known_maps, mapped
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.readers import tables
+from starcat.catalog.source import data_source, give_map, known_maps, map_of, mapped, source_names
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import floats_of
+from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
+from starcat.errors import ConfigError, SourceError
 from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.pipeline.build import build
+from starcat.pipeline.rebuild import rebuild
+from starcat.resources import resource_folder
+from starcat.specs.reading import preset
+from starcat.store.ingest import ingest_to_store
 from starcat.store.reading import read_catalog
 
 
@@ -105,3 +117,230 @@ def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
         assert hits >= 0.8 * len(case.meant), case.name
         right, total = right + hits, total + len(case.meant)
     assert right >= 0.95 * total
+
+
+TABLE = "id,ra,dec,pmra,pmdec,v,flag\n" + "".join(
+    f"{n},{n}.5,{n / 4},1.0,2.0,{n / 10 + 3},{'D' if n % 2 else ''}\n" for n in range(1, 31)
+)
+MAP = """name = "mine"
+epoch = 2000.0
+[columns]
+star_id = "id"
+ra = "ra"
+dec = "dec"
+pm_ra_cosdec = { value = "pmra", unit = "mas/yr" }
+pm_dec = { value = "pmdec", unit = "mas/yr" }
+[magnitudes]
+V = "v"
+[flags]
+double = "flag = 'D'"
+"""
+EDITS_OF_MAP = (
+    (
+        'name = "mine"',
+        "name = mine",
+        "mine.toml: not a readable TOML file: Invalid value (at line 1",
+    ),
+    ('name = "mine"\n', "", "mine.toml: name: missing; every map needs it"),
+    ('"mine"', '"sao"', "name: sao is a source of starcat; choose another name"),
+    ("epoch =", "epoc =", "mine.toml: epoc: unknown key; did you mean 'epoch'?"),
+    ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is no date; write it like 2016-01-01"),
+    (
+        "epoch",
+        'frame = "B1950"\nepoch',
+        "frame: found 'B1950'; Input should be 'ICRS', 'FK5', 'FK4'",
+    ),
+    (
+        "epoch",
+        'frame = "FK5"\nequinox = "1975"\nepoch',
+        "equinox: '1975' is not like J2000 or B1950",
+    ),
+    ("epoch", 'colour = "B-V"\nepoch', "colour: 'B-V' is not two of the bands V"),
+    ('ra = "ra"\n', "", "mine.toml: columns.ra: missing; every map needs it"),
+    ('V = "v"\n', "", "mine.toml: magnitudes: "),
+    (
+        'pm_dec = { value = "pmdec", unit = "mas/yr" }\n',
+        "",
+        "a proper motion has two parts; give both",
+    ),
+    (
+        '"pmra", unit = "mas/yr"',
+        '"pmra", unit = "mas per yr"',
+        "'mas per yr' is no unit of astropy",
+    ),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be turned"),
+    ('{ value = "pmra", unit = "mas/yr" }', '"pmra"', "neither t.csv nor the map states a unit"),
+    ('"ra"', '"RAJ2000"', "columns.ra: 'RAJ2000' is no column of t.csv; it has id, ra, dec"),
+    ('"v"', '"(SELECT max(v) FROM t)"', "subquery is not allowed in one"),
+    ('"v"', '"random()"', "there is no function random; did you mean 'round'?"),
+    ('"v"', '"v); DROP TABLE x; SELECT (1"', "no expression: it is more than one"),
+    ('"v"', '"flag + 1"', "magnitudes.V: 'flag + 1' cannot be computed: Binder Error"),
+    ('"v"', '"upper(flag)"', "magnitudes.V: 'upper(flag)' gives string; expected numbers"),
+    (
+        "flag = 'D'",
+        "flag",
+        "flags.double: 'flag' gives texts; write a condition, such as flag = 'D'",
+    ),
+    ("flag = 'D'", 'flag = \\"D\\"', "texts in single ones"),
+    (
+        "[flags]",
+        '[quality]\nbad = "v > 3"\n[flags]',
+        "quality.bad: no such one; choose of saturated",
+    ),
+)
+EDITS_OF_TABLE = (
+    (TABLE, "", "the file is empty; expected a table of stars"),
+    (TABLE, TABLE.splitlines()[0], "the table (text) has no row; expected stars"),
+    (TABLE.splitlines()[0] + "\n", "", "the first line has no names of columns but '1, 1.5"),
+    ("pmra,pmdec", "pmra,pmra", "two columns are called pmra; rename one of each"),
+    (",1.0,2.0,", ",", "row 1, fields: found 5; expected 7"),
+    (".5,", "x,", "row 1, columns.ra: found '1x'; expected a number"),
+    (
+        TABLE,
+        "PAR1" + TABLE,
+        "not a table that can be read (Parquet magic bytes not found in footer",
+    ),
+    (TABLE, "SIMPLE  =   T" + TABLE, "not a table that can be read ("),
+    (TABLE, "<?xml version='1.0'?><html></html>", "does not appear to be a VOTABLE"),
+    (TABLE, "ARROW1\0\0" + TABLE, "not a table that can be read ("),
+    ("D", "\udce9", "is not utf-8; if it is a text, state its 'encoding' in the map"),
+    ("id,", "# %ECSV 1.0\n# ---\n# datatype: [\nid,", "its header in YAML is damaged"),
+)
+
+
+def read_own(folder: Path, table_map: str = MAP, table: str = TABLE) -> Ingested:
+    (folder / "mine.toml").write_text(table_map)
+    (folder / "t.csv").write_bytes(table.encode("utf-8", "surrogateescape"))
+    with known_maps([]):
+        name = give_map(folder / "mine.toml").name
+        return read_catalog(name, [folder / "t.csv"], neighbours=False)
+
+
+@pytest.mark.parametrize(("old", "new", "told"), EDITS_OF_MAP)
+def test_a_wrong_map_is_refused_with_its_key(tmp_path: Path, old: str, new: str, told: str):
+    assert old in MAP
+    with pytest.raises(ConfigError) as caught:
+        read_own(tmp_path, MAP.replace(old, new, 1))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"), EDITS_OF_TABLE, ids=range(1, len(EDITS_OF_TABLE) + 1)
+)
+def test_a_wrong_table_is_refused_with_its_place(tmp_path: Path, old: str, new: str, told: str):
+    assert old in TABLE
+    with pytest.raises(SourceError) as caught:
+        read_own(tmp_path, table=TABLE.replace(old, new))
+    assert told in str(caught.value)
+    assert str(tmp_path / "t.csv") in str(caught.value)
+
+
+def test_a_bad_row_is_rejected_with_its_number_and_reason(tmp_path: Path):
+    lines = TABLE.splitlines()
+    lines[2] += ",one more"
+    lines[3] = lines[3].replace("3.5", "three")
+    lines[4] = lines[4].replace("4,", ",", 1)
+    lines[5] = lines[5].replace("5.5", "")
+    lines[6] = lines[6].replace(",1.5,", ",91.5,")
+    lines[8] = lines[7]
+    read = read_own(tmp_path, table="\n".join(["# a comment", *lines]) + "\n")
+    found = {row["source_line"]: row["reason"] for row in read.rejected.to_pylist()}
+    assert found == {
+        2: "malformed_record", 3: "malformed_record", 4: "no_identity", 5: "no_position",
+        6: "impossible_value", 8: "duplicate_record",
+    }  # fmt: skip
+    assert read.problems == (
+        "t.csv row 2, fields: found 8; expected 7",
+        "t.csv row 3, columns.ra: found 'three'; expected a number",
+    )
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_the_size_of_blocks_leaves_no_trace(
+    case: Case, sky: Sky, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    table, name = case.make(sky, tmp_path), "gaia_dr3_hats"
+    with known_maps([]):
+        if case.toml:
+            (tmp_path / "map.toml").write_text(case.toml)
+            name = give_map(tmp_path / "map.toml").name
+        whole = read_catalog(name, [table], neighbours=False)
+        monkeypatch.setattr(tables, "BLOCK_ROWS", 7)
+        monkeypatch.setattr(tables, "BLOCK_BYTES", 2000)
+        parts = read_catalog(name, [table], neighbours=False)
+    assert parts.stars.equals(whole.stars)
+    assert parts.rejected.equals(whole.rejected)
+
+
+class TestNames:
+    """One function finds a source by its name, wherever its map is."""
+
+    def test_maps_in_a_folder_are_known_by_the_names_of_their_files(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        assert "mine" not in source_names()
+        (tmp_path / "mine.toml").write_text(MAP)
+        monkeypatch.setenv("STARCAT_SOURCES", str(tmp_path))
+        assert "mine" in source_names()
+        assert data_source("mine").bands == ("V",)
+        (tmp_path / "other.toml").write_text(MAP)
+        with pytest.raises(ConfigError, match=r"rename it to mine\.toml"):
+            data_source("other")
+
+    def test_a_map_of_a_manifest_comes_before_those_of_the_folder(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ):
+        (tmp_path / "mine.toml").write_text(MAP)
+        monkeypatch.setenv("STARCAT_SOURCES", str(tmp_path))
+        recorded = map_of("mine")
+        assert recorded == mapped(recorded).table.recorded()
+        with known_maps([{**recorded, "epoch": 1990.0}]):
+            assert data_source("mine").epoch_jyear == 1990.0
+        assert data_source("mine").epoch_jyear == 2000.0
+
+    def test_an_unknown_name_says_how_a_table_becomes_a_source(self):
+        with pytest.raises(ConfigError, match=r"--source MAP\.toml"):
+            data_source("mine")
+
+
+def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
+    (tmp_path / "mine.toml").write_text(MAP)
+    (tmp_path / "t.csv").write_text(TABLE.replace("30,30.5,", "30,,"))
+    with known_maps([]):
+        found = check_map(give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
+    values = {one["key"]: one for one in found["values"]}
+    assert (values["columns.ra"]["least"], values["columns.ra"]["missing"]) == (1.5, 1)
+    assert values["columns.pm_dec"]["unit"] == "mas/yr"
+    assert values["flags.double"]["true"] == 15
+    assert [row["row"] for row in found["first_rows"]] == [1, 2, 3, 4, 5]
+    assert found["rejected"] == {"no_position": 1}
+    assert found["unused_columns"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_database_of_an_own_table_is_built_again_from_its_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """From a file and from a store made of it: the same database, and again from the manifest."""
+    monkeypatch.chdir(tmp_path)
+    stars = ingest("gaia", locate("gaia", {}), read_limit_mag=6.2, neighbours=False).stars
+    table = stars.select(["star_id", "designation", "ra_deg", "dec_deg", "mag"])
+    pq.write_table(table.rename_columns(["no", "who", "alpha", "delta", "g"]), "bright.parquet")
+    Path("bright.toml").write_text(
+        'name = "bright"\nepoch = 2016.0\n[columns]\nstar_id = "no"\ndesignation = "who"\n'
+        'ra = "alpha"\ndec = "delta"\n[magnitudes]\nG = "g"\n'
+    )
+    changes = {"selection.faint_limit_mag": "5.5", "catalog.source": "bright", "name": "own"}
+    spec = preset("gaia-12deg", changes)
+    with known_maps([]):
+        give_map(Path("bright.toml"))
+        built = build(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
+        ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
+        again = build(spec, {"bright": [Path("store")]}, Path("again"))
+    assert built.manifest["manifest_version"] == "1.5.0"
+    schema = json.loads((resource_folder("schemas") / "manifest-1.5.0.json").read_text())
+    jsonschema.validate(built.manifest, schema)
+    assert again.manifest["products"] == built.manifest["products"]
+    rebuilt = rebuild(built.folder, {"bright": [Path("bright.parquet")]})
+    assert rebuilt.is_identical

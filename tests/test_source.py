@@ -143,7 +143,7 @@ def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, me
 
 
 def test_a_file_that_is_not_toml(tmp_path):
-    with pytest.raises(ConfigError, match=r"tiny\.toml is not a TOML file"):
+    with pytest.raises(ConfigError, match=r"tiny\.toml: not a readable TOML file"):
         tiny(tmp_path, 'title = "Tiny"', "title =")
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -22,9 +21,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starcat.catalog.table_map import TableMap
-from starcat.errors import ConfigError, FileMissing, reason, suggest
+from starcat.errors import ConfigError, suggest
 from starcat.failures import validation_message
 from starcat.resources import resource_folder
+from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
 
 UNITS = frozenset((
     "deg", "rad", "h", "min", "s", "arcmin", "arcsec", "mas", "cas", "darcsec", "mag", "mmag",
@@ -195,19 +195,13 @@ class DataSource(_Model):
 
 def read_source(path: Path) -> DataSource:
     """Read one data-source file, or the map of a table."""
+    advice = "no such map; 'starcat sources --draft FILE' proposes one for a table"
+    content = content_of_toml(text_of_toml(path, advice), path.name)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
         return DataSource.model_validate(content) if "files" in content else mapped(content)
-    except FileNotFoundError:
-        raise FileMissing(
-            f"{path}: no such map; 'starcat sources --draft FILE' proposes one for a table"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        why = reason(error) if isinstance(error, OSError) else error
-        raise ConfigError(f"{path.name}: not a readable TOML file: {why}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path.name} is not a TOML file: {error}") from error
     except ValidationError as error:
+        if "files" not in content:
+            raise what_is_wrong(error, path.name, TableMap, "map") from error
         key, found = validation_message(error)
         raise ConfigError(f"{path.name}: {key}: {found}", key=key) from error
 

@@ -79,7 +79,7 @@ def unit_of(text: str) -> Any:
     """Return the unit of astropy that a text means; `ValueError` where it means none."""
     from astropy import units
 
-    for form in (None, "cds", "vounit", "fits"):
+    for form in (None, "cds"):
         try:
             return units.Unit(text, format=form)
         except (ValueError, TypeError):
@@ -116,8 +116,12 @@ class StarColumns(_Model):
 class Flags(_Model):
     """Conditions, such as ``flag = 'D'``."""
 
-    double: str = Field("", description="where it holds, the star is flagged double")
-    variable: str = Field("", description="where it holds, the star is flagged variable")
+    double: str | None = Field(
+        None, min_length=1, description="where it holds, the star is flagged double"
+    )
+    variable: str | None = Field(
+        None, min_length=1, description="where it holds, the star is flagged variable"
+    )
 
 
 class TableMap(_Model):
@@ -149,10 +153,10 @@ class TableMap(_Model):
     )
     magnitude_errors: dict[str, Given] = Field({}, description="standard errors by band")
     colour: str | None = Field(None, description="two of the bands, such as BP-RP")
-    flags: Flags = Flags(double="", variable="")
-    reject: dict[
-        Literal["deleted", "duplicate_record", "minor_planet", "extended", "artifact"], str
-    ] = Field({}, description="conditions on which a row is rejected, by reason")
+    flags: Flags = Flags(double=None, variable=None)
+    reject: dict[str, str] = Field(
+        {}, description=f"conditions on which a row is rejected: {', '.join(REJECTS)}"
+    )
     quality: dict[str, str] = Field({}, description=f"conditions by bit: {', '.join(QUALITIES)}")
 
     @model_validator(mode="after")
@@ -174,12 +178,21 @@ class TableMap(_Model):
                 )
         if self.colour is not None and self.colour_bands is None:
             raise ValueError(f"colour: {self.colour!r} is not two of the bands {', '.join(bands)}")
-        for bit in self.quality:
-            if bit not in QUALITIES:
-                raise ValueError(f"quality.{bit}: no such bit; choose of {', '.join(QUALITIES)}")
-        for text in (*self.quality.values(), *self.reject.values()):
-            if not text.strip():
-                raise ValueError("quality, reject: a condition is empty; write it, or leave it out")
+        for kind, given, known in (
+            ("quality", self.quality, QUALITIES),
+            ("reject", self.reject, REJECTS),
+        ):
+            for name, text in given.items():
+                if name not in known:
+                    raise ValueError(f"{kind}.{name}: no such one; choose of {', '.join(known)}")
+                if not text.strip():
+                    raise ValueError(f"{kind}.{name}: is empty; write a condition, or leave it out")
+        try:
+            _ = self.epoch_jyear
+        except ValueError:
+            raise ValueError(
+                f"epoch: {self.moment!r} is no date; write it like 2016-01-01"
+            ) from None
         return self
 
     @property

@@ -75,7 +75,8 @@ def build(
     from starcat.pipeline.build import Built
     from starcat.pipeline.build import build as run_build
 
-    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
+    given = inputs_by_source(inputs, maps=sources)
+    chosen = chosen_spec(spec, preset, changes)
     most = None if max_memory is None else int(max_memory * 2**30)
     try:
         with progress_bars() as progress:

@@ -181,12 +181,13 @@ def ingest(
 
 def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
     """Return the source that a command is about: the named one, or that of the first map."""
-    from starcat.catalog.source import data_source
+    from starcat.catalog.source import data_source, give_map
     from starcat.errors import ConfigError
 
-    if name is None and not maps:
+    own = [give_map(path).name for path in maps or ()]
+    if name is None and not own:
         raise ConfigError("name a source, such as sao, or a map with --source", key="source")
-    return data_source(name or str((maps or [])[0])).name
+    return own[0] if name is None else data_source(name).name
 
 
 @app.command()

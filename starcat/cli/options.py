@@ -49,20 +49,10 @@ Input = Annotated[
     list[str] | None,
     typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
 ]
-
-
-def _know(maps: list[Path] | None) -> list[Path] | None:
-    from starcat.catalog.source import give_map
-
-    for path in maps or []:
-        give_map(path)
-    return maps
-
-
 OwnSources = Annotated[
     list[Path] | None,
     typer.Option(
-        "--source", metavar="MAP.toml", callback=_know, is_eager=True,
+        "--source", metavar="MAP.toml",
         help="Map of a table of your own, which is a source from then on. Repeatable.",
     ),
 ]  # fmt: skip
@@ -228,10 +218,14 @@ def field_range(text: str | None) -> tuple[float, float] | None:
     )
 
 
-def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
-    """Return the paths of ``SOURCE=PATH`` texts by source."""
-    from starcat.catalog.source import data_source
+def inputs_by_source(
+    given: list[str] | None, only: str | None = None, maps: list[Path] | None = None
+) -> Mapping[str, list[Path]]:
+    """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
+    from starcat.catalog.source import data_source, give_map
 
+    for own in maps or []:
+        give_map(own)
     inputs: dict[str, list[Path]] = {}
     for text in given or []:
         name, separator, path = text.partition("=")

@@ -89,7 +89,8 @@ def estimate(
     """
     from starcat.pipeline.estimate import estimate_spec
 
-    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
+    given = inputs_by_source(inputs, maps=sources)
+    chosen = chosen_spec(spec, preset, changes)
     with progress_bars() as progress:
         found = estimate_spec(chosen, given, progress=progress)
     print_estimate(found, as_json=json)

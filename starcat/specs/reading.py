@@ -6,7 +6,7 @@ import reprlib
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -180,8 +180,11 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
 
 def _known_keys(location: tuple[Any, ...], model: Any) -> list[str]:
     for part in location:
-        model = model.model_fields[part].annotation
-    return sorted(model.model_fields)
+        fields = getattr(model, "model_fields", {})
+        kind = fields[part].annotation if part in fields else model
+        inner = (one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields"))
+        model = next(inner, kind)
+    return sorted(getattr(model, "model_fields", ()))
 
 
 def preset_names() -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from every_command import every_command
 from typer.testing import CliRunner
 
 from starcat.catalog.source import data_source, source_names
+from starcat.catalog.table_map import UNITS, Flags, StarColumns, TableMap
 from starcat.catalog.verdict import Reason
 from starcat.cli.main import app
 from starcat.evaluation.report.files import reproduction_page
@@ -104,7 +105,26 @@ def sources_page() -> str:
             names = ", ".join(f"`{pattern}`" for pattern in file.file_names)
             parts = f" ({len(file.parts)} parts)" if file.parts else ""
             page.append(f"{names}{parts}: {rows}{size}, {file.layout.replace('_', ' ')}.\n")
-    return "\n".join(page)
+    return "\n".join([*page, *map_keys()])
+
+
+def map_keys() -> list[str]:
+    """Return the reference of the keys of a map."""
+    page = [
+        "## Maps of tables\n",
+        "How to write one: [howto-own-catalog.md](howto-own-catalog.md).\n",
+    ]
+    for title, model in (("", TableMap), ("columns", StarColumns), ("flags", Flags)):
+        page.append(f"### {f'[{title}]' if title else 'At the top, and sections'}\n")
+        page.append("| key | needed | becomes | meaning |\n|---|---|---|---|")
+        for name, field in model.model_fields.items():
+            if field.description:
+                needed = "yes" if field.is_required() else ""
+                page.append(
+                    f"| `{name}` | {needed} | {UNITS.get(name, '')} | {field.description} |"
+                )
+        page.append("")
+    return page
 
 
 def spec_page() -> str:

@@ -322,7 +322,7 @@ variable = "var"
 """, {
         "nr": "star_id", "alpha1950": "ra", "delta1950": "dec", "mu_a_cosd": "pm_ra_cosdec",
         "mu_d": "pm_dec", "mpg": "magnitudes.pg", "m_vis": "magnitudes.V", "var": "flags.variable",
-    }, arcsec=0.02, mas_yr=0.5),
+    }, arcsec=0.003, mas_yr=0.2),
     Case("fits", galactic, 1991.25, """
 name = "galaxy"
 frame = "galactic"

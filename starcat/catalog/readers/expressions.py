@@ -59,7 +59,9 @@ def columns_in(
     [(found,)] = cursor.execute("SELECT json_serialize_sql(?)", [_query(text)]).fetchall()
     tree = json.loads(found)
     if tree.get("error"):
-        raise _refused(key, text, tree["error_message"].splitlines()[0], where)
+        told = str(tree["error_message"]).splitlines()[0]
+        several = "Only SELECT" in told
+        raise _refused(key, text, "it is more than one" if several else told, where)
     statements = tree["statements"]
     listed = statements[0]["node"].get("select_list", ())
     if len(statements) != 1 or len(listed) != 1:
@@ -70,8 +72,8 @@ def columns_in(
             raise _refused(key, text, f"{part['class'].lower()} is not allowed in one", where)
         function = part.get("function_name")
         if function is not None and function not in FUNCTIONS:
-            hint = suggest(function, FUNCTIONS) or f"there are {', '.join(FUNCTIONS[13:])}"
-            raise _refused(key, text, f"it has no function {function}; {hint}", where)
+            hint = suggest(function, FUNCTIONS).strip() or f"there are {', '.join(FUNCTIONS[13:])}"
+            raise _refused(key, text, f"there is no function {function}; {hint}", where)
         if part["class"] == "COLUMN_REF":
             named[_column(".".join(part["column_names"]), known, key, text, where)] = None
     return tuple(named), listed[0]["class"] == "COLUMN_REF"

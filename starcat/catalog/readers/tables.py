@@ -100,6 +100,11 @@ def read_tables(
 
 def damaged(file: InputFile, error: Exception) -> StarcatError:
     """Return what to say of a table that a library cannot read."""
+    if isinstance(error, UnicodeDecodeError):
+        return file.error(
+            f"byte {error.start + 1} is not {error.encoding}; if it is a text, state its "
+            f"'encoding' in the map, such as latin-1, else expected {FORMATS}"
+        )
     why = " ".join(str(error).split())[:200] or type(error).__name__
     return file.error(f"not a table that can be read ({why}); expected {FORMATS}. Get it again")
 
@@ -141,9 +146,12 @@ def _no_columns(file: InputFile, table: int | str | None, known: Sequence[str]) 
 
 def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str, Any]]:
     """Return the columns that a header in YAML tells, as astropy writes it, and the header."""
-    from astropy.table.meta import get_header_from_yaml
+    from astropy.table.meta import YamlParseError, get_header_from_yaml
 
-    header = get_header_from_yaml(lines)
+    try:
+        header = get_header_from_yaml(lines)
+    except YamlParseError as error:
+        raise ValueError("its header in YAML is damaged") from error
     return {
         one["name"]: TableColumn(
             one["name"],
@@ -186,7 +194,10 @@ def _open_text(file: InputFile, how: TableMap, head: bytes) -> OpenTable:
         is_text = not all(_is_number(value) for value in values if value not in BLANKS)
         plain = TableColumn(name, is_text, units[place].strip() if units else "")
         columns[name] = told.get(name, plain)
-    return OpenTable("ECSV" if told else "text", columns, lambda wanted: options.read(file, wanted))
+    form = "ECSV" if told else "text"
+    if not sample:
+        return OpenTable(form, columns, lambda _: iter(()))
+    return OpenTable(form, columns, lambda wanted: options.read(file, wanted))
 
 
 def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list[str], int]:
@@ -201,7 +212,7 @@ def _check_names(file: InputFile, names: Sequence[str], *, has_header: bool) -> 
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise file.error(f"two columns are called {', '.join(twice)}; rename one of each")
-    if has_header and all(_is_number(name) for name in names):
+    if has_header and 2 * sum(_is_number(name) for name in names) >= len(names):
         raise file.error(
             f"the first line has no names of columns but {quoted(', '.join(names))}; give them "
             "with 'names' in the map"
@@ -231,10 +242,12 @@ class _TextOptions:
         bad: list[Problem] = []
 
         def note(row: pacsv.InvalidRow) -> str:
-            found = f"{row.actual_columns} fields"
-            bad.append(Problem(row.number or 0, "row", None, found, f"{row.expected_columns}"))
+            number = (row.number or 0) - before
+            found, expected = f"{row.actual_columns}", f"{row.expected_columns}"
+            bad.append(Problem(number, "fields", None, found, expected, what="row"))
             return "skip"
 
+        before = self.skipped + self.after + (0 if self.how.names else 1)
         raw, stream = open_input(file.path)
         with raw, stream:
             reading = self._begin(stream, wanted, note)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.source import data_source
+from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import SourceMissing, reason
 from starcat.service.jobs.job import Kind
@@ -48,13 +48,15 @@ def source_digests(records: Records, name: str) -> list[str]:
     """Return what tells the files of a source from others."""
     paths = locate(name, {})
     try:
-        return file_digests(records, source_files(name, paths))
+        digests = file_digests(records, source_files(name, paths))
     except OSError as error:
         raise SourceMissing(
             f"{name}: a file cannot be read ({reason(error)}); the operator has to look at "
             f"{', '.join(map(str, paths))}",
             source=name,
         ) from error
+    table_map = map_of(name)
+    return [*digests, hashlib.sha256(json_bytes(table_map)).hexdigest()] if table_map else digests
 
 
 def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
