@@ -83,9 +83,10 @@ def outsiders(names: set[str]) -> set[str]:
     return tops - set(sys.stdlib_module_names) - {"starcat"}
 
 
-def loaded_by(code: str) -> set[str]:
-    """Return the top-level modules that a fresh interpreter has loaded after some code."""
-    program = f"{code}\nimport sys\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+def loaded_by(code: str, depth: int = 1) -> set[str]:
+    """Return the modules down to some depth that a fresh interpreter has loaded after some code."""
+    names = f"{{'.'.join(name.split('.')[:{depth}]) for name in sys.modules}}"
+    program = f"{code}\nimport sys\nprint(*{names})"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
     )
@@ -232,6 +233,15 @@ def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():
     loaded = loaded_by("import starcat.cli.main")
     assert "typer" in loaded
     assert not loaded & (HEAVY | {"numpy", "h5py", "requests", "pooch"})
+
+
+@pytest.mark.slow
+def test_a_server_starts_without_what_only_some_requests_need():
+    """``import scipy`` loads a part when it is first used; ``from scipy.x import`` at once."""
+    found = loaded_by("import starcat.service.server", depth=2)
+    assert "fastapi" in {name.partition(".")[0] for name in found}
+    parts = {f"scipy.{part}" for part in ("ndimage", "optimize", "sparse", "spatial", "special")}
+    assert not found & parts
 
 
 MAX_MODULE_LINES, MAX_FUNCTION_LINES, MAX_DOCSTRING_SHARE = 500, 60, 0.22

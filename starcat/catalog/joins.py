@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions
 from starcat.catalog.parts import FileReading, read_files
@@ -66,7 +66,7 @@ def _same_place(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
     if not len(stars) or not len(known):
         return known[:0], known[:0]
     within = float(chord_from_separation(np.radians(MATCH_ARCSEC / 3600.0)))
-    chord, star = cKDTree(then).query(places[known], distance_upper_bound=within)
+    chord, star = scipy.spatial.cKDTree(then).query(places[known], distance_upper_bound=within)
     is_found = np.isfinite(chord)
     return np.asarray(star, dtype=np.int64)[is_found], known[is_found]
 
