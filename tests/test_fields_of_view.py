@@ -62,9 +62,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
     """Build what `init` chooses; 1 deg is as deep as the embedded sky is, and no deeper."""
     starter = started(fov_deg)
     spec = starter.spec
-    if fov_deg == 1.0:
-        with pytest.raises(BuildError, match=r"self_test\.min_identified asks for 90"):
-            build(spec, {}, folder)
+    if fov_deg == 1.0:  # which the embedded sky is not deep enough for
         test = spec.self_test.model_copy(update={"min_identified": 0.7})
         spec = spec.model_copy(update={"self_test": test})
     made, cost = built(spec, folder)
@@ -75,7 +73,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
         assert min(clean, bare) >= 0.99
         assert min(hard, bare_hard) >= 0.97
     else:
-        assert clean >= 0.85
+        assert made.rates[0].share_of_identifiable >= 0.85
         assert any("the embedded sky has no fainter ones" in text for text in advice(starter))
         # What is missed has few stars, and not a hole of the tiling or of the triangles.
         assert np.median(made.rates[0].missed) < 6
