@@ -17,6 +17,7 @@ from astropy.wcs import WCS
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
 
 from artifact_copies import copied
+from rendered import picture_of
 from served import serve
 from services import add_database, client_of, token_of
 
@@ -30,18 +31,6 @@ from starcat.specs.build_spec import CameraSpec
 
 BESIDE = Path(__file__).resolve().parents[2] / "shared" / "nights"
 NIGHTS = Path(os.environ.get("STARCAT_NIGHTS") or BESIDE)
-
-
-def picture_of(frame, camera) -> bytes:
-    """Return a FITS picture of a frame, rows from the bottom."""
-    image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
-    y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
-    for (cx, cy), mag in zip(frame.centroids_px, frame.mag, strict=True):
-        spot = np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 1.2**2))
-        image += 2e4 * 10.0 ** (-0.4 * (mag - 3.0)) * spot
-    buffer = io.BytesIO()
-    fits.PrimaryHDU(np.clip(image, 0, 60000).astype(np.uint16)[::-1]).writeto(buffer)
-    return buffer.getvalue()
 
 
 def sent(client, address, given, **files):

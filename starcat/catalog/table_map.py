@@ -220,13 +220,13 @@ class TableMap(_Model):
     @property
     def epoch_jyear(self) -> float | None:
         """The same as a Julian year."""
-        from astropy.time import Time
-
         moment = self.moment
         if not isinstance(moment, str):
             return moment
         if moment.replace(".", "", 1).isdigit():
             return float(moment)
+        from astropy.time import Time
+
         return float(Time(moment, scale="tt").jyear)
 
     @property

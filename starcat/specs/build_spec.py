@@ -432,6 +432,12 @@ class BuildSpec(Section):
         return *self.selection.variables.join, *self.selection.doubles.join
 
     @property
+    def fields_deg(self) -> tuple[float, float]:
+        """Narrowest and widest horizontal field of view that the database is for."""
+        own_deg, levels = self.camera.camera().fov_x_deg, self.products.levels
+        return own_deg, levels.widest_fov_x_deg if levels.enabled else own_deg
+
+    @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch

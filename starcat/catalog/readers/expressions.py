@@ -9,12 +9,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import duckdb
 import pyarrow as pa
 
 from starcat.errors import ConfigError, suggest
+
+if TYPE_CHECKING:
+    import duckdb
 
 FUNCTIONS = (
     *("+", "-", "*", "/", "//", "%", "**", "^", "||", "~~", "!~~", "~~*", "!~~*"),
@@ -44,6 +46,8 @@ _SETTINGS = {
 
 @cache
 def _database() -> duckdb.DuckDBPyConnection:
+    import duckdb
+
     connection = duckdb.connect(":memory:", config=dict(_SETTINGS))
     connection.execute(_MACROS)
     return connection
@@ -123,6 +127,8 @@ def _refused(key: str, text: str, why: str, where: str) -> ConfigError:
 
 def evaluate(text: str, columns: Mapping[str, pa.Array], count: int, key: str) -> pa.Array:
     """Return the value of an expression, which was checked, for every row."""
+    import duckdb
+
     cursor = _database().cursor()
     table = pa.table({**columns, "every row": pa.nulls(count)})
     try:

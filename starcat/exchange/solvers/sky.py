@@ -59,9 +59,6 @@ def sky_of(artifact: Artifact) -> SolverSky:
     stars = stars.take(pa.array(order))
     directions = directions_of(stars)
     ra_deg, dec_deg = radec_from_directions(directions)
-    camera = spec.camera.camera()
-    levels = spec.products.levels
-    widest_deg = levels.widest_fov_x_deg if levels.enabled else camera.fov_x_deg
     return SolverSky(
         name=f"{manifest['name']}-{manifest['version']}",
         source=spec.catalog.source,
@@ -72,7 +69,7 @@ def sky_of(artifact: Artifact) -> SolverSky:
         ra_deg=ra_deg,
         dec_deg=dec_deg,
         mag=floats_of(stars, "mag"),
-        camera=camera,
-        fov_deg=(camera.fov_x_deg, widest_deg),
+        camera=spec.camera.camera(),
+        fov_deg=spec.fields_deg,
         manifest_sha256=hashlib.sha256((artifact.folder / MANIFEST_NAME).read_bytes()).hexdigest(),
     )

@@ -28,7 +28,8 @@ from starcat.service.problems import Problem, problem_of
 from starcat.service.security.request_limits import address_of
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
-from starcat.specs.product_sections import Levels, Products
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
 
 router = APIRouter(include_in_schema=False)
 
@@ -272,19 +273,22 @@ def _database(service: Service) -> Database:
     every = service.library.databases()
     if not every:
         raise TargetMissing("this service has no database to solve pictures with yet")
-    return max(every, key=lambda one: (_levels(one).enabled, one.folder.stat().st_mtime_ns, one.id))
+    return max(
+        every,
+        key=lambda one: (_spec(one).products.levels.enabled, one.folder.stat().st_mtime_ns, one.id),
+    )
 
 
-def _levels(database: Database) -> Levels:
-    return Products.model_validate(database.spec["products"]).levels
+def _spec(database: Database) -> BuildSpec:
+    return spec_from_dict(database.spec, database.title)
 
 
 def _fields_of(database: Database, given: dict[str, Any]) -> tuple[float, float] | None:
     """Return the fields to try: those that were given, as far as the database has them."""
-    levels = _levels(database)
-    if not levels.enabled:
+    spec = _spec(database)
+    if not spec.products.levels.enabled:
         return None
-    narrow, wide = database.camera.fov_x_deg, float(levels.widest_fov_x_deg)
+    narrow, wide = known = spec.fields_deg
     unit = _DEG.get(str(given.get("scale_units") or "degwidth"))
     if unit is not None:
         low, high = _scale(given)
@@ -293,7 +297,7 @@ def _fields_of(database: Database, given: dict[str, Any]) -> tuple[float, float]
         raise Problem(
             422,
             f"no field of {database.title} is within the scale that was given; it has those from "
-            f"{database.camera.fov_x_deg:.4g} to {levels.widest_fov_x_deg:g} deg",
+            f"{known[0]:.4g} to {known[1]:.4g} deg",
         )
     return narrow, wide
 

@@ -1,0 +1,152 @@
+"""The command ``starcat-astap``: called as ASTAP is by N.I.N.A., Ekos, SharpCap and others.
+
+It solves one picture and writes what those programs read: ``<base>.ini``, and where it is solved
+``<base>.wcs``, a FITS header. Options that do not matter here are taken and left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcat.cli.console import say
+from starcat.errors import ProductError, StarcatError
+from starcat.storage.atomic import write_file
+
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.build_spec import BuildSpec
+
+SOLVED, NOT_SOLVED, TOO_FEW_STARS, NO_PICTURE, NO_DATABASE, BAD_DATABASE = 0, 1, 2, 16, 32, 33
+"""Exit codes, as ASTAP has them."""
+
+_SCALE_ERROR = 0.1
+"""How far the field that a program states may be off."""
+_TAKEN = (*("-r", "-ra", "-spd", "-z", "-s", "-t", "-m", "-check", "-speed", "-D"),)
+_KEYS = (
+    *("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2", "CDELT1", "CDELT2"),
+    *("CROTA1", "CROTA2", "CD1_1", "CD1_2", "CD2_1", "CD2_2"),
+)
+
+
+def main() -> None:
+    """Run the command."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Solve a picture as ASTAP's options say; returns ASTAP's exit code."""
+    given, _ = _parser().parse_known_args(arguments)
+    picture = Path(given.f)
+    base = Path(given.o) if given.o else picture.with_suffix("")
+    command = " ".join(["starcat-astap", *arguments])
+    code, facts, header = _solved(picture, given)
+    if header is not None:
+        text = header.tostring(sep="" if given.wcs else "\r\n", padding=given.wcs)
+        write_file(base.with_suffix(".wcs"), text.encode("ascii"))
+    told = {"PLTSOLVD": "F" if header is None else "T", **facts, "CMDLINE": command}
+    text = "".join(f"{key}={value}\r\n" for key, value in told.items())
+    write_file(base.with_suffix(".ini"), text.encode())
+    say(facts.get("ERROR") or f"solved: {base.with_suffix('.ini')}")
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("starcat-astap", description=__doc__, allow_abbrev=False)
+    parser.add_argument("-f", required=True, metavar="FILE", help="the picture")
+    parser.add_argument(
+        "-fov", type=float, default=0.0, metavar="DEG", help="height of the field; 0: not known"
+    )
+    parser.add_argument("-o", metavar="BASE", help="path of the results without a suffix")
+    parser.add_argument(
+        "-d",
+        default=os.environ.get("STARCAT_DATABASE", ""),
+        metavar="FOLDER",
+        help="a database; by default $STARCAT_DATABASE",
+    )
+    parser.add_argument("-wcs", action="store_true", help="write the .wcs as FITS, not in lines")
+    for flag in ("-update", "-log", "-progress", "-annotate"):
+        parser.add_argument(flag, action="store_true", help=argparse.SUPPRESS)
+    for option in _TAKEN:
+        parser.add_argument(option, help=argparse.SUPPRESS)
+    return parser
+
+
+def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, str], Header | None]:
+    from starcat.artifact.reader import open_artifact
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.image_file import read_image
+    from starcat.images.solve_files import open_matcher
+
+    if not given.d:
+        told = "no database: give its folder with -d, or in $STARCAT_DATABASE"
+        return NO_DATABASE, {"ERROR": told}, None
+    try:
+        matcher = open_matcher(Path(given.d), IdentifyOptions())
+        spec = open_artifact(Path(given.d)).spec
+    except StarcatError as error:
+        missing = isinstance(error, ProductError) and not Path(given.d).is_dir()
+        return NO_DATABASE if missing else BAD_DATABASE, {"ERROR": str(error)}, None
+    try:
+        height_px, width_px = read_image(picture).shape
+        options = _scale(spec, given.fov * width_px / height_px)
+        return _identified(picture, matcher, options)
+    except StarcatError as error:
+        return NO_PICTURE, {"ERROR": str(error)}, None
+
+
+def _identified(
+    picture: Path, matcher: Matcher, options: dict[str, Any]
+) -> tuple[int, dict[str, str], Header | None]:
+    """Identify a picture with its rows either way: programs send both."""
+    from astropy.io import fits
+
+    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.image_file import wcs_header
+    from starcat.images.solve_files import identify_file
+
+    for flip in (None, True, False):
+        answers = identify_file(picture, matcher, IdentifyOptions(flip=flip, **options))
+        result = next(iter(answers)).result
+        if result.ok:
+            header = fits.Header.fromstring(wcs_header(result, picture, flip=flip).decode())
+            return SOLVED, _facts(header), header
+        why = result.refusal
+        if why is None or why.reason != "mirrored":
+            break
+    code = TOO_FEW_STARS if result.status == "too_few_stars" else NOT_SOLVED
+    return code, {"ERROR": result.status if why is None else f"{why.message}; {why.hint}"}, None
+
+
+def _scale(spec: BuildSpec, fov_deg: float) -> dict[str, Any]:
+    """Return the options of the scale, for a width that is stated or not (0)."""
+    if not spec.products.levels.enabled:
+        return {"fov_error": _SCALE_ERROR} if fov_deg else {}
+    narrow, wide = spec.fields_deg
+    if fov_deg:
+        narrow = min(max(narrow, fov_deg * (1.0 - _SCALE_ERROR)), wide)
+        wide = max(min(wide, fov_deg * (1.0 + _SCALE_ERROR)), narrow)
+    return {"fov_deg": (narrow, wide)}
+
+
+def _facts(header: Header) -> dict[str, str]:
+    """Return the keys of a solution with what ASTAP adds: scales and turns of the axes."""
+    from astropy.wcs import WCS
+
+    (a, b), (c, d) = WCS(header, naxis=2).pixel_scale_matrix
+    sign = 1.0 if a * d - b * c >= 0.0 else -1.0
+    made = {
+        "CD1_1": a, "CD1_2": b, "CD2_1": c, "CD2_2": d,
+        "CDELT1": sign * math.hypot(a, c), "CDELT2": math.hypot(b, d),
+        "CROTA1": math.degrees(math.atan2(sign * c, sign * a)),
+        "CROTA2": math.degrees(math.atan2(-b, d)),
+    }  # fmt: skip
+    header.update(made)
+    return {key: f"{float(header[key]): .16E}" for key in _KEYS}
