@@ -103,7 +103,7 @@ def ingest(
     Parameters
     ----------
     source : str
-        Such as ``sao``; ``starcat sources`` lists them.
+        Such as ``sao``; ``starcat sources`` lists them. The path of a map stands for its source.
     inputs : path or sequence of paths, optional
         Its files or folder; looked for by default, as the command line does.
     band : str, optional

@@ -192,7 +192,7 @@ def ingest_options(
             key="source",
             value=source_name,
         )
-    return IngestOptions(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
+    return IngestOptions(source.name, check_band(source, band), epoch_jyear, read_limit_mag)
 
 
 def check_band(source: DataSource, band: str | None) -> str:

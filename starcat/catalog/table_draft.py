@@ -54,7 +54,9 @@ _BANDS = (
     r"(psf)?_?flux_?(?P<band>[a-z]{1,2})(_.*)?",
     r"(?P<band>[jhk])_m",
 )
-_ERROR = re.compile(r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom)$")
+_ERROR = re.compile(
+    r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom)$", re.IGNORECASE
+)
 _USUAL = {"radial_velocity": "km/s", "pm_ra": "mas/yr", "parallax_error": "mas"}
 
 
@@ -141,47 +143,36 @@ def _guesses(made: Draft) -> Iterator[tuple[str, str]]:
     for by_ucd in (True, False):
         for key, ucd, pattern in _RULES:
             for name, column in made.columns.items():
-                told = column.ucd.lower()
-                base = _ERROR.sub("", name.lower())
-                is_error = base != name.lower() or told.startswith("stat.error")
-                fits = (
-                    re.match(ucd, told.removeprefix("stat.error;"))
-                    if by_ucd and ucd and told
-                    else None
-                )
-                if fits is None and not by_ucd:
-                    fits = re.fullmatch(pattern, _plain(base))
-                if fits and (not is_error or f"{key}_error" in UNITS or key == "pm_ra_cosdec"):
-                    error = key.replace("_cosdec", "") + "_error" if is_error else key
-                    yield error, name
+                base, is_error = _base(name, column)
+                told = column.ucd.lower().removeprefix("stat.error;")
+                fits = ucd and told and re.match(ucd, told)
+                if fits if by_ucd else re.fullmatch(pattern, _plain(base)):
+                    error = f"{key.removesuffix('_cosdec')}_error"
+                    if not is_error or error in UNITS:
+                        yield error if is_error else key, name
         yield from _magnitudes(made, by_ucd=by_ucd)
-    if "columns.star_id" not in made.found:
-        for key in ("columns.hip_number", "columns.hd_number"):
-            if key in made.found:
-                made.found["columns.star_id"] = made.found[key]
-                name = next(one for one, short in made.used.items() if f"columns.{short}" == key)
-                made.used[name] = "star_id"
-                return
+    for short in ("hip_number", "hd_number"):
+        if "columns.star_id" not in made.found and f"columns.{short}" in made.found:
+            made.found["columns.star_id"] = made.found[f"columns.{short}"]
+            made.used |= {name: "star_id" for name, key in made.used.items() if key == short}
+
+
+def _base(name: str, column: TableColumn) -> tuple[str, bool]:
+    """Return the name of what a column is or is the error of, and whether it is the error."""
+    base = _ERROR.sub("", name)
+    return base, base != name or column.ucd.lower().startswith("stat.error")
 
 
 def _magnitudes(made: Draft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
     for name, column in made.columns.items():
-        lower = re.sub(r"\s*[\[(].*?[\])]", "", name.lower())
-        base = _ERROR.sub("", lower)
-        is_error = base != lower or column.ucd.startswith("stat.error")
-        told = re.search(r"phot\.(mag|flux).*em\.[a-z]+\.([A-Za-z]+)$", column.ucd)
-        if by_ucd:
-            band = told[2] if told else ""
-        else:
-            fits = (re.fullmatch(pattern, base) for pattern in _BANDS)
-            match = next(filter(None, fits), None)
-            band = (
-                name[base.index(match["band"]) :][: len(match["band"])]
-                if match and not is_error
-                else (match["band"] if match else "")
-            )
-        if band:
-            yield f"{'magnitude_errors' if is_error else 'magnitudes'}.{_band(band)}", name
+        base, is_error = _base(re.sub(r"\s*[\[(].*?[\])]", "", name), column)
+        told = re.search(r"phot\.(?:mag|flux).*em\.[a-z]+\.(?P<band>[A-Za-z]+)$", column.ucd)
+        if not by_ucd:
+            matches = (re.fullmatch(pattern, base, re.IGNORECASE) for pattern in _BANDS)
+            told = next(filter(None, matches), None)
+        if told:
+            kind = "magnitude_errors" if is_error else "magnitudes"
+            yield f"{kind}.{_band(told['band'])}", name
 
 
 def _band(text: str) -> str:
