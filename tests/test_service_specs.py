@@ -94,6 +94,16 @@ def test_a_spec_is_checked_as_toml_as_json_and_as_a_changed_preset(client, small
     assert spec_from_dict(answer.json()["spec"], "answer") == preset("gaia-12deg", changes)
 
 
+def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkeypatch):
+    (tmp_path / "secret.toml").write_text('password = "hunter2"')
+    monkeypatch.chdir(tmp_path)
+    spec = small_spec.replace('"sao"', '"secret.toml"')
+    for path in ("validate", "estimate", "coverage"):
+        answer = client.post(f"{API}/specs/{path}", content=spec, headers=TOML)
+        told = refused(answer, 422)
+        assert (told["key"], "hunter2" in answer.text) == ("catalog.source", False)
+
+
 @pytest.mark.parametrize(
     ("text", "key", "words"),
     [

@@ -44,6 +44,8 @@ LATER_KEYS = (
 spec without them makes the bytes that it always made."""
 
 
+SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
+"""Never a path: a spec may come from anybody, and a path of a map would be read."""
 SHA256_PATTERN = r"^[0-9a-f]{64}$"
 Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
@@ -52,7 +54,7 @@ class Catalog(Section):
     """Where the stars come from."""
 
     source: str = Field(
-        pattern=r"^[0-9A-Za-z._-]{1,64}$",
+        pattern=SOURCE_NAME,
         description="name of a star catalog, as 'starcat sources' lists them",
         examples=["gaia"],
     )

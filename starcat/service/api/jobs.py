@@ -28,7 +28,7 @@ from starcat.service.jobs.submission import (
     submit_ingest,
 )
 from starcat.service.service import Service, TheService
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import SOURCE_NAME, BuildSpec
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -75,7 +75,9 @@ class IngestWish(Wish):
     """A catalog to be read."""
 
     kind: Literal["ingest"]
-    source: str = Field(max_length=100, description="A star catalog, as 'starcat sources' lists.")
+    source: str = Field(
+        pattern=SOURCE_NAME, description="A star catalog, as 'starcat sources' lists."
+    )
     band: str | None = Field(None, max_length=20, description="Band of the magnitudes.")
     epoch_jyear: float | None = Field(
         None, ge=1800, le=2200, description="Julian year to move positions to; else its own."
