@@ -447,7 +447,8 @@ REFUSED = {
     "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
     "changes of a spec": ({"kind": "build", "spec": {}, "changes": {"a": "1"}}, "changes"),
     "a foreign key": ({"kind": "build", "preset": "gaia-12deg", "output": "/etc"}, "output"),
-    "an unknown catalog": ({"kind": "ingest", "source": "../sao"}, "sao"),
+    "an unknown catalog": ({"kind": "ingest", "source": "soa"}, "did you mean 'sao'"),
+    "a path of a catalog": ({"kind": "ingest", "source": "../sao"}, "source: String should match"),
     "too many frames": ({"kind": "evaluate", "database": "0" * 16, "frames": 10**9}, "less than"),
 }
 """What specs are refused for is tested with them; here that a job says it."""
