@@ -16,7 +16,15 @@ from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 from starcat.catalog.archives.mapped import identity
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.readers import tables
-from starcat.catalog.source import data_source, give_map, known_maps, map_of, mapped, source_names
+from starcat.catalog.source import (
+    data_source,
+    give_map,
+    known_maps,
+    map_of,
+    mapped,
+    source_names,
+    star_sources,
+)
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import floats_of
 from starcat.catalog.table_check import check_map
@@ -256,6 +264,7 @@ def test_a_bad_row_is_rejected_with_its_number_and_reason(tmp_path: Path):
 
 
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+@pytest.mark.slow
 def test_the_size_of_blocks_leaves_no_trace(
     case: Case, sky: Sky, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -286,6 +295,8 @@ class TestNames:
         (tmp_path / "other.toml").write_text(MAP)
         with pytest.raises(ConfigError, match=r"rename it to mine\.toml"):
             data_source("other")
+        assert {"mine", "sao"} <= set(star_sources())
+        assert "other" not in star_sources()
 
     def test_a_map_of_a_manifest_comes_before_those_of_the_folder(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

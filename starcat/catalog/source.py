@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -255,8 +255,13 @@ def source_names() -> tuple[str, ...]:
 
 
 def star_sources() -> tuple[str, ...]:
-    """Return the names of those that are star catalogs."""
-    return tuple(name for name in source_names() if data_source(name).kind == "stars")
+    """Return the names of those that are star catalogs; a broken map is told when it is used."""
+    found = []
+    for name in source_names():
+        with suppress(ConfigError):
+            if data_source(name).kind == "stars":
+                found.append(name)
+    return tuple(found)
 
 
 def data_source(name: str) -> DataSource:
