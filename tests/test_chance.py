@@ -458,6 +458,7 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
     assert by_both >= 14
 
 
+@pytest.mark.slow
 def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     # Of six true spots with 1 px of noise one is farther than 3 px from its star.
     frames = withheld(narrow_sky, 6, 1.0, 0.0, 1e-6)

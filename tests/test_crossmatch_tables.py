@@ -201,6 +201,7 @@ def test_an_empty_product_has_no_problems(artifact):
     assert len(matched_stars(none)) == 0
 
 
+@pytest.mark.slow
 def test_the_radius_of_the_spec_is_kept(files, small_spec):
     spec = spec_of(
         small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"'),

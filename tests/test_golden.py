@@ -32,7 +32,7 @@ COUNTS = {
     [
         pytest.param("gaia-12deg", "tmp_path", marks=pytest.mark.slow),
         ("sao-12deg", "excerpts"),
-        (MADE, "made_catalogs"),
+        pytest.param(MADE, "made_catalogs", marks=pytest.mark.slow),
     ],
 )
 def test_a_preset_still_makes_the_same_products(name, folder, request, tmp_path_factory):

@@ -165,6 +165,7 @@ def test_no_flipped_bit_goes_unseen(folder, made):
     assert ran.stdout == "10000 flips, 0 missed\n", ran.stderr
 
 
+@pytest.mark.slow
 def test_an_image_of_the_other_byte_order_is_refused(folder, made):
     program = build(folder, "replay", "replay.c")
     ran = subprocess.run([program, made["big"], made["frames"]], capture_output=True, text=True)

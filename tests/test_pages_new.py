@@ -273,6 +273,7 @@ def test_a_second_database_of_one_name_and_version_is_refused(client):
 # What it would give
 
 
+@pytest.mark.slow
 def test_limits_are_suggested_for_the_camera(client):
     state = _sent(client, "/new/preview", SPEC.replace("4.5", "3"), do="suggest").json()
     draft = draft_of_text(state["toml"])

@@ -188,6 +188,7 @@ def test_the_second_build_changes_nothing(dist: Path, build_small: Callable[...,
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
+@pytest.mark.slow
 def test_another_artifact_is_kept_unless_told(dist, build_small):
     folder = dist / "small-1.0.0"
     before = content(folder)

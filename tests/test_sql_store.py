@@ -172,6 +172,7 @@ def test_a_box_of_a_store_is_what_brute_force_finds(session, sky, sides):
     assert ids(session, f"FROM box({west}, {east}, {south}, {north})") == expected.tolist()
 
 
+@pytest.mark.slow
 def test_a_field_of_a_store_is_that_of_one_table(session, sky, tmp_path):
     pq.write_table(sky.table, tmp_path / "stars.parquet")
     with open_session([str(tmp_path / "stars.parquet")]) as plain:

@@ -87,6 +87,7 @@ def test_a_file_that_was_mended_is_read_again(parts, whole, tmp_path):
     assert bytes_of(store) == whole
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again_and_what_was_changed_is(
     damaged, whole, tmp_path, monkeypatch
 ):
