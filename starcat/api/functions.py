@@ -125,13 +125,15 @@ def ingest(
     ConfigError, SourceError
         If the source is unknown, or its files are missing or damaged.
     """
+    from starcat.catalog.source import source_given
     from starcat.catalog.source_files import locate
     from starcat.progress import no_progress
     from starcat.store.reading import read_catalog as read
 
+    name = source_given(source).name
     return read(
-        source,
-        locate(source, {source: _paths(inputs)} if inputs is not None else {}),
+        name,
+        locate(name, {name: _paths(inputs)} if inputs is not None else {}),
         band=band,
         epoch_jyear=epoch_jyear,
         read_limit_mag=read_limit_mag,

@@ -1,7 +1,8 @@
 """What an archive is: the TOML files in ``data_sources``, read and checked.
 
 `data_source` finds a source by its name, and is the only function that does: those that ship with
-starcat, then tables of one's own whose map was given or is in ``$STARCAT_SOURCES``.
+starcat, then tables of one's own whose map was given or is in ``$STARCAT_SOURCES``. Where the user
+of this machine speaks, `source_given` also takes the path of a map.
 
 A source has one or more files, each with a record layout: the columns byte by byte (fixed
 width), in order (delimited) or as a packed structure (binary). The readers run on these
@@ -265,7 +266,7 @@ def star_sources() -> tuple[str, ...]:
 
 
 def data_source(name: str) -> DataSource:
-    """Return the data source of a name, or of the map at a path, which is known from then on."""
+    """Return the data source of a name; never reads a path, as names may come from anybody."""
     if name in _shipped_names():
         return _shipped(name)
     if name in _given:
@@ -280,8 +281,6 @@ def data_source(name: str) -> DataSource:
                 value=source.name,
             )
         return source
-    if name.endswith(".toml"):
-        return give_map(Path(name))
     hint = suggest(name, source_names())
     raise ConfigError(
         f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}. A table of "
@@ -289,6 +288,13 @@ def data_source(name: str) -> DataSource:
         key="source",
         value=name,
     )
+
+
+def source_given(text: str) -> DataSource:
+    """Return the source that the user of this machine names, or whose map is at a path."""
+    if text.endswith(".toml") and text not in source_names():
+        return give_map(Path(text))
+    return data_source(text)
 
 
 def give_map(path: Path) -> DataSource:

@@ -110,17 +110,15 @@ def _identified(
 
     from starcat.images.identify_options import IdentifyOptions
     from starcat.images.image_file import wcs_header
-    from starcat.images.solve_files import identify_file
+    from starcat.images.solve_files import identify_either_way
 
-    for flip in (None, True, False):
-        answers = identify_file(picture, matcher, IdentifyOptions(flip=flip, **options))
-        result = next(iter(answers)).result
-        if result.ok:
-            header = fits.Header.fromstring(wcs_header(result, picture, flip=flip).decode())
-            return SOLVED, _facts(header), header
-        why = result.refusal
-        if why is None or why.reason != "mirrored":
-            break
+    answers, found = identify_either_way(picture, matcher, IdentifyOptions(**options))
+    result = found[0].result
+    if result.ok:
+        text = wcs_header(result, picture, flip=answers.options.flip)
+        header = fits.Header.fromstring(text.decode())
+        return SOLVED, _facts(header), header
+    why = result.refusal
     code = TOO_FEW_STARS if result.status == "too_few_stars" else NOT_SOLVED
     return code, {"ERROR": result.status if why is None else f"{why.message}; {why.hint}"}, None
 

@@ -74,12 +74,12 @@ def fetch(
     Example: starcat fetch tycho2
     """
     from starcat.catalog.fetch import fetch_source
-    from starcat.catalog.source import data_source
+    from starcat.catalog.source import source_given
     from starcat.catalog.source_files import cache_folder
 
     with progress_bars() as progress:
         report = fetch_source(
-            data_source(source),
+            source_given(source),
             output or cache_folder(),
             parts=tuple(part or ()),
             retries=retries,
@@ -181,13 +181,13 @@ def ingest(
 
 def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
     """Return the source that a command is about: the named one, or that of the first map."""
-    from starcat.catalog.source import data_source, give_map
+    from starcat.catalog.source import give_map, source_given
     from starcat.errors import ConfigError
 
     own = [give_map(path).name for path in maps or ()]
     if name is None and not own:
         raise ConfigError("name a source, such as sao, or a map with --source", key="source")
-    return own[0] if name is None else data_source(name).name
+    return own[0] if name is None else source_given(name).name
 
 
 @app.command()

@@ -222,7 +222,7 @@ def inputs_by_source(
     given: list[str] | None, only: str | None = None, maps: list[Path] | None = None
 ) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
-    from starcat.catalog.source import data_source, give_map
+    from starcat.catalog.source import give_map, source_given
 
     for own in maps or []:
         give_map(own)
@@ -233,7 +233,7 @@ def inputs_by_source(
             name, separator, path = only, "=", text
         if not separator or not path:
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
-        inputs.setdefault(data_source(name).name, []).append(Path(path))
+        inputs.setdefault(source_given(name).name, []).append(Path(path))
     return inputs
 
 

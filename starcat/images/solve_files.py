@@ -356,6 +356,19 @@ def identify_file(
     return answers_of(path, measure(path, chosen, own), matcher, chosen, own)
 
 
+def identify_either_way(
+    path: Path, matcher: Matcher, options: IdentifyOptions
+) -> tuple[FileAnswers, list[FrameAnswer]]:
+    """Identify a file; where its first frame only matches mirrored, with its rows the other way."""
+    for flip in (options.flip, True, False):
+        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}))
+        found = list(answers)
+        refusal = found[0].result.refusal if found else None
+        if refusal is None or refusal.reason != "mirrored":
+            break
+    return answers, found
+
+
 def answers_of(
     path: Path,
     measured: MeasuredFile,

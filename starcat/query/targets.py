@@ -216,12 +216,12 @@ def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
 
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
-    from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source import source_given, source_names
     from starcat.catalog.source_files import source_of_file
 
     name, separator, given = text.partition("=")
     if separator and not path.exists():
-        return data_source(name).name, [Path(given)]
+        return source_given(name).name, [Path(given)]
     if path.is_file():
         return source_of_file(path), [path]
     return (text, []) if text in source_names() else (None, [])

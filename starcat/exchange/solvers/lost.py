@@ -58,7 +58,9 @@ def _catalog(sky: SolverSky) -> bytes:
 
 
 def _pairs(sky: SolverSky) -> tuple[int, bytes]:
-    least_rad, most_rad = np.radians(_LEAST_DEG), _diagonal_rad(sky)
+    focal_px = 0.5 * sky.camera.width_px / np.tan(0.5 * np.radians(sky.fov_deg[1]))
+    least_rad = np.radians(_LEAST_DEG)
+    most_rad = sky.camera.with_focal_length(float(focal_px)).diagonal_rad
     rows, angle = pairs_within(sky.directions, most_rad)
     rows, angle = rows[angle >= least_rad], angle[angle >= least_rad]
     order = np.lexsort((rows[:, 1], rows[:, 0], angle))
@@ -72,11 +74,6 @@ def _pairs(sky: SolverSky) -> tuple[int, bytes]:
     counts = np.searchsorted(bin_of, np.arange(bins + 1), side="right")
     parts = (index, counts.astype("<i4"), rows[order].astype("<i2"))
     return len(rows), b"".join(part.tobytes() for part in parts)
-
-
-def _diagonal_rad(sky: SolverSky) -> float:
-    half = np.tan(0.5 * np.radians(sky.fov_deg[1])) / sky.camera.width_px
-    return float(2.0 * np.arctan(half * np.hypot(sky.camera.width_px, sky.camera.height_px)))
 
 
 def _add_part(file: bytearray, number: int, content: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
+from starcat.storage.digests import file_sha256
 from starcat.version import __version__
 
 
@@ -71,5 +71,5 @@ def sky_of(artifact: Artifact) -> SolverSky:
         mag=floats_of(stars, "mag"),
         camera=spec.camera.camera(),
         fov_deg=spec.fields_deg,
-        manifest_sha256=hashlib.sha256((artifact.folder / MANIFEST_NAME).read_bytes()).hexdigest(),
+        manifest_sha256=file_sha256(artifact.folder / MANIFEST_NAME),
     )

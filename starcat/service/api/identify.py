@@ -221,6 +221,7 @@ def identify_upload(
     kind: Kind | None,
     *,
     for_page: bool = False,
+    either_way: bool = False,
 ) -> tuple[dict[str, Any], bytes]:
     """Identify frames in the sandbox; return the answers and the picture of the first."""
     artifact = service.library.find(database).folder
@@ -234,6 +235,7 @@ def identify_upload(
             "options": options.model_dump(),
             "picture": kind,
             "for_page": for_page,
+            "either_way": either_way,
         }
         found = service.sandbox.call("identify", arguments)
         drawn = folder / f"picture.{kind}"

@@ -228,18 +228,13 @@ def calibration_of(wcs: str) -> dict[str, float]:
 
 
 def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
-    """Solve a picture; where it only matches mirrored, its rows are taken the other way."""
     database = _database(service)
     fov_deg = _fields_of(database, given)
-    size_px = None if fov_deg is None else _size_of(given)
-    for flip in (None, True, False):
-        frames.content.seek(0)
-        options = IdentifyOptions(fov_deg=fov_deg, size_px=size_px, flip=flip)
-        found, _ = identify_upload(service, database.id, frames, options, None, for_page=True)
-        [frame], [more] = found["frames"], found["more"]
-        if (frame.get("refusal") or {}).get("reason") != "mirrored":
-            break
-    return Solution(frames.name, more["wcs"] or "", frame)
+    options = IdentifyOptions(fov_deg=fov_deg, size_px=None if fov_deg is None else _size_of(given))
+    found, _ = identify_upload(
+        service, database.id, frames, options, None, for_page=True, either_way=True
+    )
+    return Solution(frames.name, found["more"][0]["wcs"] or "", found["frames"][0])
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:

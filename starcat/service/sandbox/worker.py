@@ -37,20 +37,26 @@ def identify(
     picture: str | None = None,
     *,
     for_page: bool = False,
+    either_way: bool = False,
 ) -> dict[str, Any]:
     """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG.
 
-    A page is told more of each frame: the brightness of its centroids, and its WCS.
+    A page is told more of each frame: the brightness of its centroids, and its WCS. Either way, the
+    rows of a picture that matches mirrored are turned over.
     """
     from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
-    from starcat.images.solve_files import identify_file
+    from starcat.images.solve_files import identify_either_way, identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
     # What is not about the matcher does not open another.
     own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
-    answers = identify_file(Path(file), _matcher(artifact, own), chosen)
-    found = list(answers)
+    matcher = _matcher(artifact, own)
+    if either_way:
+        answers, found = identify_either_way(Path(file), matcher, chosen)
+    else:
+        answers = identify_file(Path(file), matcher, chosen)
+        found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
     is_any = any(answer.result.ok for answer in found)
