@@ -43,6 +43,15 @@ def excerpts_folder() -> Path:
     return Path(os.environ.get("STARCAT_CATALOGS") or beside)
 
 
+@pytest.fixture(autouse=True)
+def no_given_maps() -> Iterator[None]:
+    """Forget the maps of tables that a test gives, as a process does when its command ends."""
+    from starcat.catalog.source import known_maps
+
+    with known_maps([]):
+        yield
+
+
 @pytest.fixture(scope="session")
 def has_excerpts() -> bool:
     """Whether `catalogs` are the genuine excerpts, whose figures are known."""
