@@ -80,7 +80,7 @@ static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) 
   return 0;
 }
 
-int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]) {
+int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]) {
   const starcat_camera *c = &camera->given;
   const real x = (x_px - c->x0_px) / c->focal_length_px;
   const real y = (y_px - c->y0_px) / c->focal_length_px;
@@ -95,7 +95,7 @@ int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]) {
   return 1;
 }
 
-int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px) {
+int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px) {
   const starcat_camera *c = &camera->given;
   if (!(body[2] > R(0.0))) {
     return 0;
@@ -111,7 +111,7 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
 }
 
 /* How a direction turns with its pixel's x and y: the turn, radians, for one pixel of each. */
-void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]) {
+void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], real turn[2][3]) {
   const real u = body[0] / body[2], v = body[1] / body[2];
   real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
   if (camera->distorted != 0) {
@@ -128,18 +128,18 @@ void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2]
 }
 
 static int is_possible(const starcat_camera *c) {
-  return sc_is_between(c->width_px, R(1.0), LARGEST_PX) &&
-         sc_is_between(c->height_px, R(1.0), LARGEST_PX) &&
-         sc_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
-         sc_is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
-         sc_is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) &&
-         sc_is_between(c->k1, R(-1e9), R(1e9)) && sc_is_between(c->k2, R(-1e9), R(1e9)) &&
-         sc_is_between(c->k3, R(-1e9), R(1e9)) &&
-         sc_is_between(c->p1, R(-1e9), R(1e9)) &&
-         sc_is_between(c->p2, R(-1e9), R(1e9)) && sc_is_between(c->fold_radius, R(0.0), R(1e9));
+  return starcat_is_between(c->width_px, R(1.0), LARGEST_PX) &&
+         starcat_is_between(c->height_px, R(1.0), LARGEST_PX) &&
+         starcat_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
+         starcat_is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
+         starcat_is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) &&
+         starcat_is_between(c->k1, R(-1e9), R(1e9)) && starcat_is_between(c->k2, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->k3, R(-1e9), R(1e9)) && starcat_is_between(c->p1, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->p2, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->fold_radius, R(0.0), R(1e9));
 }
 
-starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera) {
+starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera) {
   real widest = R(1.0);
   if (!is_possible(given)) {
     return STARCAT_E_CAMERA;
@@ -152,7 +152,7 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);
-    if (!sc_direction(camera, x, y, camera->corner[n])) {
+    if (!starcat_direction(camera, x, y, camera->corner[n])) {
       return STARCAT_E_CAMERA;
     }
     if (camera->corner[n][2] < widest) {
@@ -168,13 +168,13 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
 
 /* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
  * Returns 0 where the lens would then form no image of a centroid. */
-static int scale_camera(sc_call *call, real focal) {
+static int scale_camera(starcat_call *call, real focal) {
   starcat_workspace *w = call->work;
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
-  int good = sc_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
+  int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
   for (uint32_t i = 0; good && (i < w->count); i++) {
-    good = sc_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
+    good = starcat_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
@@ -183,22 +183,22 @@ static int scale_camera(sc_call *call, real focal) {
 
 /* Use another focal length from now on, a multiple of the given one; the given one itself where the
  * lens forms no image with the other. */
-void sc_set_focal(sc_call *call, real focal) {
+void starcat_set_focal(starcat_call *call, real focal) {
   if ((focal != call->focal) && !scale_camera(call, focal)) {
     (void)scale_camera(call, R(1.0));
   }
 }
 
 /* Fit the focal length too from now on, where its error may be above 0. */
-void sc_allow_scales(sc_call *call, real fov_error) {
-  const sc_camera *camera = &call->camera;
+void starcat_allow_scales(starcat_call *call, real fov_error) {
+  const starcat_optics *camera = &call->camera;
   call->fov_error = fov_error;
   call->log_scales = R(0.0);
   call->bend = R(0.0);
   if (fov_error > R(0.0)) {
     const real radius_rad = STARCAT_ATAN2(camera->sin_radius, camera->cos_radius);
     call->log_scales = R(-2.0) * STARCAT_LOG(R(1.0) - fov_error);
-    call->bend = SC_CURVATURE * fov_error * radius_rad * radius_rad;
+    call->bend = STARCAT_CURVATURE * fov_error * radius_rad * radius_rad;
   }
 }
 

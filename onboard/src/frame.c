@@ -46,7 +46,7 @@ static int comes_before(const starcat_workspace *w, real brightness, real square
 }
 
 /* Put a centroid where it belongs among those that are in order. */
-static void insert(const sc_call *call, uint32_t row, real magnitude, real x, real y) {
+static void insert(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
   const real brightness = is_finite(magnitude) ? magnitude : R(1e30), square = dx * dx + dy * dy;
@@ -70,7 +70,8 @@ static void insert(const sc_call *call, uint32_t row, real magnitude, real x, re
 }
 
 /* Which centroids can be used; the others get their reason as their result. */
-static void take_usable(const sc_call *call, const starcat_frame *frame, starcat_result *result) {
+static void take_usable(const starcat_call *call, const starcat_frame *frame,
+                        starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
   starcat_workspace *w = call->work;
   w->has_magnitudes = 0;
@@ -109,17 +110,17 @@ static void drop_repeats(starcat_workspace *w, starcat_result *result) {
   w->count = kept;
 }
 
-static void set_limits(sc_call *call, const starcat_options *options) {
+static void set_limits(starcat_call *call, const starcat_options *options) {
   const starcat_workspace *w = call->work;
-  call->tolerance_px = options->noise_px > R(0.0) ? SC_SIGMAS_OF_TOLERANCE * options->noise_px
+  call->tolerance_px = options->noise_px > R(0.0) ? STARCAT_SIGMAS_OF_TOLERANCE * options->noise_px
                                                   : options->tolerance_px;
   call->noise_px = options->noise_px;
   call->focal = R(1.0);
   call->focal_px = call->camera.given.focal_length_px;
-  sc_allow_scales(call, options->fov_error);
+  starcat_allow_scales(call, options->fov_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
-  call->reach_px = SC_REACH * call->tolerance_px;
-  call->mag_reach = w->has_magnitudes != 0u ? SC_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->reach_px = STARCAT_REACH * call->tolerance_px;
+  call->mag_reach = w->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
   call->log_certain = options->log_chance;
@@ -131,9 +132,10 @@ static void set_limits(sc_call *call, const starcat_options *options) {
   }
 }
 
-starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
-                        const starcat_options *options, const starcat_frame *frame,
-                        starcat_workspace *work, starcat_result *result) {
+starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+                             const starcat_camera *camera, const starcat_options *options,
+                             const starcat_frame *frame, starcat_workspace *work,
+                             starcat_result *result) {
   if ((image == NULL) || (camera == NULL) || (options == NULL) || (frame == NULL) ||
       (work == NULL) || (result == NULL)) {
     return STARCAT_E_NULL;
@@ -159,7 +161,7 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   }
   starcat_status status = check_options(options);
   if (status == STARCAT_IDENTIFIED) {
-    status = sc_prepare_camera(camera, &call->camera);
+    status = starcat_prepare_camera(camera, &call->camera);
   }
   if (status != STARCAT_IDENTIFIED) {
     return status;
@@ -187,15 +189,15 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
     }
   }
   drop_repeats(work, result);
-  sc_list_columns(call);
+  starcat_list_columns(call);
   for (uint32_t i = 0; i < work->count; i++) {
-    if (!sc_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
+    if (!starcat_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
     }
   }
   set_limits(call, options);
   result->n_usable = work->count;
-  if (work->count < SC_MIN_STARS) {
+  if (work->count < STARCAT_MIN_STARS) {
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
   }

@@ -8,7 +8,7 @@
 /^edge:/ {
   match($0, /sourcename: "[^"]*"/); from = substr($0, RSTART + 13, RLENGTH - 14)
   match($0, /targetname: "[^"]*"/); to = substr($0, RSTART + 13, RLENGTH - 14)
-  if (to == "__indirect_call") { calls[from] = calls[from] " sc_triangle sc_pyramid" }
+  if (to == "__indirect_call") { calls[from] = calls[from] " starcat_triangle starcat_pyramid" }
   else { calls[from] = calls[from] " " to }
 }
 function deepest(name,    n, i, list, most, below) {

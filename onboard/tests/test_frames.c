@@ -150,7 +150,8 @@ void test_dropped(void) {
   starcat_real x[STARCAT_MAX_CENTROIDS], y[STARCAT_MAX_CENTROIDS];
   starcat_real magnitudes[STARCAT_MAX_CENTROIDS];
   sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
-  const starcat_frame clean = unit_frame_of(&truth), dirty = {truth.count + 6u, x, y, magnitudes, NULL};
+  const starcat_frame clean = unit_frame_of(&truth),
+                      dirty = {truth.count + 6u, x, y, magnitudes, NULL};
   const uint32_t n = truth.count;
   memcpy(x, truth.x, sizeof truth.x);
   memcpy(y, truth.y, sizeof truth.y);

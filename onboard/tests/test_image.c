@@ -202,7 +202,8 @@ static void use_scratch(void) {
   sky_frame truth;
   for (uint32_t n = 0; n < 3u; n++) {
     sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 2, &truth);
-    const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes, NULL};
+    const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes,
+                                 NULL};
     unit_scratch.options.max_steps = 20000;
     (void)starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                            &unit_work, &unit_result);
