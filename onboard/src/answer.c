@@ -24,7 +24,7 @@ static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
   if (sigma_px == NULL) {
     return noise_px;
   }
-  return sigma_px[row] - sigma_px[row] == R(0.0) ? sigma_px[row] : R(0.0);
+  return starcat_are_finite(sigma_px + row, 1) ? sigma_px[row] : R(0.0);
 }
 
 /* List the centroids of the best agreement that are stars, with directions of the image or others,

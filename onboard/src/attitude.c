@@ -33,7 +33,7 @@ int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]) 
   const real xy = m[2] * m[4] - m[1] * m[5];
   const real xz = m[1] * m[4] - m[2] * m[3];
   const real determinant = m[0] * xx + m[1] * xy + m[2] * xz;
-  if (!(determinant > R(0.0))) {
+  if (!(determinant > STARCAT_LEAST_DETERMINANT)) {
     return 0;
   }
   const real scale = R(1.0) / determinant;
@@ -57,7 +57,7 @@ int starcat_invert(const starcat_information *m, starcat_information *inverse) {
     return 0;
   }
   const real left = m->scale - starcat_dot(c, along);
-  if (!(left > R(0.0))) {
+  if (!(left > STARCAT_LEAST_DETERMINANT)) {
     return 0;
   }
   const real scale = R(1.0) / left;
@@ -175,6 +175,11 @@ void starcat_matrix(const real q[4], real m[9]) {
   m[8] = R(1.0) - R(2.0) * (x * x + y * y);
 }
 
+static int is_direction(const real v[3]) {
+  return starcat_are_finite(v, 3) && (starcat_absolute(v[0]) <= R(2.0)) &&
+         (starcat_absolute(v[1]) <= R(2.0)) && (starcat_absolute(v[2]) <= R(2.0));
+}
+
 /* How well two pairs determine an attitude: the sine of the angle between their directions. */
 static real spread(const real (*v)[3], uint32_t i, uint32_t j) {
   real normal[3];
@@ -190,8 +195,7 @@ starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_rea
     return STARCAT_E_NULL;
   }
   for (uint32_t i = 0; i < count; i++) {
-    const real sum = body[i][0] + body[i][1] + body[i][2] + icrs[i][0] + icrs[i][1] + icrs[i][2];
-    if (!(sum - sum == R(0.0))) {
+    if (!is_direction(body[i]) || !is_direction(icrs[i])) {
       return STARCAT_E_NOT_FINITE;
     }
     const real apart = spread(body, 0, i);

@@ -14,10 +14,10 @@
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
+#define LEAST_EXTENT R(1e-6) /* of stars on the detector, square pixels */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
-static real larger(real a, real b) { return a > b ? a : b; }
 
 /* How places move as the camera turns, summed over the matched centroids: the determinant, and
  * that with the focal length as a fourth unknown over the one without. */
@@ -62,7 +62,7 @@ static real log_expected(const starcat_call *call, uint32_t n, real square_px, r
                          uint32_t unknowns) {
   return starcat_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
          R(0.5) * log_information + log_unit_ball(n, unknowns) +
-         R(0.5) * (real)(2u * n - unknowns) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
+         R(0.5) * (real)(2u * n - unknowns) * STARCAT_LOG(starcat_larger(square_px, LEAST_SQUARE)) -
          (real)n * call->camera.log_area;
 }
 
@@ -91,7 +91,7 @@ static real log_share(const starcat_call *call, uint32_t n, uint32_t most) {
 
 /* Logarithm of the sum of two numbers whose logarithms are given. */
 static real log_of_sum(real a, real b) {
-  const real most = larger(a, b), apart = most - (a < b ? a : b);
+  const real most = starcat_larger(a, b), apart = most - starcat_smaller(a, b);
   return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / starcat_exponential(apart)) : most;
 }
 
@@ -108,9 +108,12 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
   starcat_count_ways(call, is_stated ? fewer : n_matched);
   real expected = log_expected(call, n_matched, square_px, STARCAT_LOG(information), 3);
   if ((call->log_scales > R(0.0)) && (of_scale > R(0.0))) {
-    expected = log_of_sum(expected, STARCAT_LOG(call->log_scales) +
-                                        log_expected(call, n_matched, square_px,
-                                                     STARCAT_LOG(information * of_scale), 4));
+    expected = log_of_sum(
+        expected,
+        STARCAT_LOG(call->log_scales) +
+            log_expected(call, n_matched, square_px,
+                         STARCAT_LOG(starcat_larger(information * of_scale, STARCAT_LEAST_NUMBER)),
+                         4));
   }
   expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(w->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
@@ -146,7 +149,7 @@ static real corner_deviation(const starcat_information *covariance, const starca
   for (uint32_t n = 0; n < 4u; n++) {
     starcat_information h = {{0}, {0}, R(0.0)};
     starcat_inform(&h, camera->corner[n]);
-    worst = larger(worst, trace(covariance, &h));
+    worst = starcat_larger(worst, trace(covariance, &h));
   }
   return STARCAT_SQRT(worst);
 }
@@ -232,7 +235,7 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
       product += x * (w->x[i] - w->x_of[j]) + y * (w->y[i] - w->y_of[j]);
     }
   }
-  const real excess = product / extent;
+  const real excess = product / starcat_larger(extent, LEAST_EXTENT);
   const real corner_px =
       STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                    call->camera.half_height * call->camera.half_height);
@@ -248,6 +251,6 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
       left += x * x + y * y;
     }
   }
-  const real variance = left / (R(2.0) * n - R(4.0)) / extent;
+  const real variance = left / (R(2.0) * n - R(4.0)) / starcat_larger(extent, LEAST_EXTENT);
   return excess * excess > STARCAT_SCALE_DEVIATIONS * STARCAT_SCALE_DEVIATIONS * variance;
 }

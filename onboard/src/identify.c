@@ -5,6 +5,8 @@
 #include "internal.h"
 
 #define WIDEST_PRIOR_RAD R(0.35)
+#define LARGEST_QUATERNION R(1e6)
+#define LEAST_SQUARE R(1e-12)
 #define MOST_ANCHORS 8u
 
 starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
@@ -32,12 +34,18 @@ typedef struct {
 static starcat_status set_prior(const starcat_call *call, const real q[4], real uncertainty_rad,
                                 prior *p) {
   const starcat_optics *camera = &call->camera;
-  const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-  real unit[4];
-  if (!(square - square == R(0.0)) || !(uncertainty_rad - uncertainty_rad == R(0.0))) {
+  real unit[4], square = R(0.0);
+  if (!starcat_are_finite(q, 4) || !starcat_are_finite(&uncertainty_rad, 1)) {
     return STARCAT_E_NOT_FINITE;
   }
-  if (!(square > R(0.0)) || !(uncertainty_rad > R(0.0)) || (uncertainty_rad > WIDEST_PRIOR_RAD)) {
+  for (uint32_t n = 0; n < 4u; n++) {
+    if (starcat_absolute(q[n]) > LARGEST_QUATERNION) {
+      return STARCAT_E_OPTIONS;
+    }
+    square += q[n] * q[n];
+  }
+  if (!(square > LEAST_SQUARE) || !(uncertainty_rad > R(0.0)) ||
+      (uncertainty_rad > WIDEST_PRIOR_RAD)) {
     return STARCAT_E_OPTIONS;
   }
   for (uint32_t n = 0; n < 4u; n++) {
@@ -47,7 +55,7 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   const real c = STARCAT_COS(uncertainty_rad), s = STARCAT_SIN(uncertainty_rad);
   p->cos_radius = camera->cos_radius * c - camera->sin_radius * s;
   p->sin_radius = camera->sin_radius * c + camera->cos_radius * s;
-  if (!(p->cos_radius > R(0.0))) {
+  if (!(p->cos_radius > STARCAT_LEAST_COSINE)) {
     return STARCAT_E_OPTIONS;
   }
   const real stretch = R(1.0) / (p->cos_radius * p->cos_radius);

@@ -12,10 +12,13 @@
 #define MANIFEST_AT 128u
 #define NAME_AT 160u
 #define OWN_AT 4092u
+#define MOST_EXPONENT (1023u + 40u)
+#define OUT_OF_RANGE R(1e13)
 
 enum { DIRECTIONS = 1, MAGNITUDES, STAR_IDS, GRID, KVECTOR, TRIANGLES, RADII, PAIRS };
 
 const char *starcat_version(void) { return STARCAT_VERSION; }
+uint32_t starcat_version_number(void) { return STARCAT_VERSION_NUMBER; }
 
 static uint16_t u16_at(const uint8_t *bytes, size_t offset) {
   return *(const uint16_t *)(const void *)(bytes + offset);
@@ -25,7 +28,12 @@ static uint32_t u32_at(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
+/* A number; a large one where its exponent is none that an image can have, which may not fit. */
 static real f64_at(const uint8_t *bytes, size_t offset) {
+  const uint64_t bits = *(const uint64_t *)(const void *)(bytes + offset);
+  if ((bits >> 52 & 0x7ffu) > MOST_EXPONENT) {
+    return OUT_OF_RANGE;
+  }
   return (real) * (const double *)(const void *)(bytes + offset);
 }
 
@@ -168,7 +176,8 @@ static int is_complete(const starcat_image *image, const sections *found) {
                      has(found, KVECTOR, image->n_kvector, 4);
   if (image->method == STARCAT_TRIANGLE) {
     return common && has(found, TRIANGLES, image->n_features, 3u * index) &&
-           has(found, RADII, image->n_features, 2) && (image->radius_quantum_rad > R(0.0));
+           has(found, RADII, image->n_features, 2) &&
+           starcat_is_between(image->radius_quantum_rad, R(1e-15), R(1e6));
   }
   return common && (image->method == STARCAT_PYRAMID) &&
          has(found, PAIRS, image->n_features, 2u * index);
@@ -203,8 +212,8 @@ static starcat_status check_numbers(const starcat_image *image) {
   }
   if ((image->grid_bands == 0u) || (image->grid_sectors == 0u) || (image->n_kvector < 2u) ||
       (image->grid_bands > 65535u) || (image->grid_sectors > 65535u) ||
-      !(image->kvector_slope > R(0.0)) || !(image->kvector_slope < R(1e6)) ||
-      !(image->kvector_intercept > R(-1e6)) || !(image->kvector_intercept < R(1e6))) {
+      !starcat_is_between(image->kvector_slope, R(1e-25), R(1e6)) ||
+      !starcat_is_between(image->kvector_intercept, R(-1e6), R(1e6))) {
     return STARCAT_E_LAYOUT;
   }
   return u32_at(image->bytes, 56) > STARCAT_MAX_STARS ? STARCAT_E_CAPACITY : STARCAT_IDENTIFIED;

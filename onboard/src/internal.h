@@ -7,6 +7,10 @@
 
 #include "vectors.h"
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0))
+#error "compile starcat without -ffast-math: centroids that are not numbers would not be found"
+#endif
+
 /* Image format, docs/onboard-format.md. */
 #define STARCAT_MAGIC "STARCAT"
 #define STARCAT_FORMAT_MAJOR 1u
@@ -44,11 +48,23 @@
 #define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
 #define STARCAT_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define STARCAT_FEW_CENTROIDS 12u
-/* Least weight of a centroid over the largest, which rounding still leaves room for. */
+#define STARCAT_LEAST_COSINE R(0.01)  /* of the angle from the axis to what a camera sees */
+#define STARCAT_LEAST_PX R(1e-6)      /* of a tolerance or a noise */
+#define STARCAT_LARGEST_PX R(1e6)
+#define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
+/* Least weight of a centroid over the largest, which rounding still leaves room for; least side of a
+ * triangle whose corners rounding still tells apart; and numbers below which a determinant is due to
+ * rounding, and whose inverses can still be squared. */
 #ifdef STARCAT_SINGLE
 #define STARCAT_LEAST_WEIGHT R(1e-4)
+#define STARCAT_LEAST_SIDE R(1e-6)
+#define STARCAT_LEAST_DETERMINANT R(1e-12)
+#define STARCAT_LEAST_NUMBER R(1e-37)
 #else
 #define STARCAT_LEAST_WEIGHT R(1e-8)
+#define STARCAT_LEAST_SIDE R(1e-15)
+#define STARCAT_LEAST_DETERMINANT R(1e-60)
+#define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
 #define STARCAT_SPREAD_CENTROIDS \
   400u /* that make triangles with their neighbours, the first ones */
@@ -115,6 +131,9 @@ static inline void starcat_rows_of(const starcat_image *image, uint32_t feature,
     }
   }
 }
+
+/* frame.c */
+int starcat_are_finite(const void *numbers, uint32_t count);
 
 /* attitude.c */
 int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],

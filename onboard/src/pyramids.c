@@ -146,7 +146,7 @@ static int complete(starcat_call *call, const base *o, const real first[3], cons
       body[n][k] = w->body[o->corner[n]][k];
     }
   }
-  const real scale = R(1.0) / STARCAT_SQRT(starcat_dot(third, third));
+  const real scale = R(1.0) / STARCAT_SQRT(starcat_larger(starcat_dot(third, third), R(1e-6)));
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] *= scale;
   }

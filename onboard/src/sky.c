@@ -13,7 +13,7 @@
 #endif
 
 /* A number of 0 to 4 that grows with right ascension, without an angle. At x = 0 both formulas give
- * the same; at a pole it is not a number, which cell() puts into the first cell. */
+ * the same; no cap that holds a pole comes here. */
 static real longitude(real x, real y) {
   const real ax = x < R(0.0) ? -x : x, ay = y < R(0.0) ? -y : y;
   const real t = y / (ax + ay);

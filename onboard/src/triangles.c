@@ -12,9 +12,11 @@
 
 /* Factors of a bound that rounding shall not make narrower. */
 #ifdef STARCAT_SINGLE
+#define LEAST_CHORD R(1e-12) /* square of the longest of a triangle of stars */
 #define BELOW R(0.99999)
 #define ABOVE R(1.00001)
 #else
+#define LEAST_CHORD R(1e-28)
 #define BELOW R(0.999999999)
 #define ABOVE R(1.000000001)
 #endif
@@ -252,8 +254,9 @@ static int by_neighbours(starcat_call *call, search *s) {
 
 void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
   starcat_workspace *w = call->work;
-  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0, STARCAT_MOST_TRIANGLES};
-  s.least_side_rad = STARCAT_MIN_SIDE_PX / call->focal_px;
+  search s = {look_up, w->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
+  s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
+  s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   w->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (w->has_magnitudes == 0u);
   if (w->is_crowded != 0u) {
     s.count = s.count < STARCAT_SPREAD_CENTROIDS ? s.count : STARCAT_SPREAD_CENTROIDS;
@@ -300,15 +303,13 @@ typedef struct {
   int is_right_handed;
 } observed;
 
-static real shorter(real a, real b) { return a < b ? a : b; }
-static real longer(real a, real b) { return a > b ? a : b; }
 
 /* Put three numbers in order. */
 static void sort(real v[3]) {
-  const real less = shorter(v[0], v[1]), more = longer(v[0], v[1]), other = v[2];
-  v[0] = shorter(less, other);
-  v[1] = longer(less, shorter(more, other));
-  v[2] = longer(more, other);
+  const real less = starcat_smaller(v[0], v[1]), more = starcat_larger(v[0], v[1]), other = v[2];
+  v[0] = starcat_smaller(less, other);
+  v[1] = starcat_larger(less, starcat_smaller(more, other));
+  v[2] = starcat_larger(more, other);
 }
 
 /* What the chords may be where the scale is not known: the square of the longest, and those of the
@@ -329,7 +330,7 @@ static void bound_shape(const starcat_call *call, observed *o) {
     o->least[n] = BELOW * low * low;
     o->most[n] = ABOVE * high * high;
   }
-  o->least[2] = BELOW * least * least;
+  o->least[2] = starcat_larger(BELOW * least * least, LEAST_CHORD);
   o->most[2] = ABOVE * most * most;
 }
 
@@ -349,7 +350,7 @@ static void observe(const starcat_call *call, const uint32_t triple[3], const re
     o->sides[n] = sides[n];
   }
   o->error = error;
-  o->slack = error / shorter(shorter(sides[0], sides[1]), sides[2]);
+  o->slack = error / starcat_smaller(starcat_smaller(sides[0], sides[1]), sides[2]);
   sort(o->least);
   sort(o->most);
   if (call->fov_error > R(0.0)) {
@@ -499,11 +500,12 @@ static void features_of(const real sides[3], real error, real *area, real *area_
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
   const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
-  const real square = a2 * u + b2 * v + c2 * t;
-  *area = R(0.25) * STARCAT_SQRT(square > R(1e-30) ? square : R(1e-30));
+  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
+  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
+  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
   const real scale = R(0.125) / *area;
   const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
-  *radius = R(0.25) * a * b * c / *area;
+  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
   *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
   const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
   *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);

@@ -12,10 +12,14 @@ typedef starcat_real real;
 
 #define R(number) ((real)(number))
 
-/* Whether a number is in a closed range; not so where one of the three is not a number. */
+/* Whether a number is in a closed range. */
 static inline int starcat_is_between(real x, real low, real high) {
   return (x >= low) && (x <= high);
 }
+
+static inline real starcat_larger(real a, real b) { return a > b ? a : b; }
+static inline real starcat_smaller(real a, real b) { return a < b ? a : b; }
+static inline real starcat_absolute(real x) { return x < R(0.0) ? -x : x; }
 
 static inline real starcat_dot(const real a[3], const real b[3]) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

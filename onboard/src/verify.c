@@ -22,12 +22,12 @@ int starcat_spend(starcat_workspace *work, uint32_t steps) {
 int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
   const int16_t stored = call->image->magnitudes[row];
-  if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN)) {
+  if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN) ||
+      !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
     return 1;
   }
   const real apart = observed - R(0.001) * (real)stored;
-  /* Also true where the centroid's magnitude is not a number. */
-  return !((apart > call->mag_reach) || (-apart > call->mag_reach));
+  return (apart <= call->mag_reach) && (-apart <= call->mag_reach);
 }
 
 /* Put the stars around the field on the detector; keep those within a margin of it. */
@@ -159,11 +159,13 @@ static void refine(starcat_call *call, real m[9], const uint16_t *of, const real
     }
     if (starcat_solve(h.angles, h.with_scale, along, unused) != 0) {
       const real of_scale = h.scale - starcat_dot(h.with_scale, along);
-      if (of_scale > R(0.0)) {
-        step = (shrink - starcat_dot(along, turn)) / of_scale;
+      const real excess = shrink - starcat_dot(along, turn);
+      if (starcat_absolute(excess) < of_scale) {
+        step = excess / of_scale;
+      } else if (of_scale > R(0.0)) { /* farther than a step may go */
+        step = excess > R(0.0) ? R(1.0) : R(-1.0);
       }
     }
-    step = step > R(1.0) ? R(1.0) : (step < R(-1.0) ? R(-1.0) : step);
     real focal = call->focal * starcat_exponential(step);
     const real shortest = R(1.0) - call->fov_error;
     focal = focal < shortest ? shortest : focal;

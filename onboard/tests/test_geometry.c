@@ -74,6 +74,15 @@ void test_attitude(void) {
       CHECK(off < (n % 2u == 0u ? 100.0 * tight : 0.03));
     }
   }
+  for (uint32_t k = 0; k < 3u; k++) { /* numbers that no direction has */
+    const starcat_real sound[2] = {body[1][k], icrs[2][k]};
+    body[1][k] = (starcat_real)-2.1;
+    CHECK_IS(solve(body, icrs, 4, q), STARCAT_E_NOT_FINITE);
+    body[1][k] = sound[0];
+    icrs[2][k] = (starcat_real)INFINITY;
+    CHECK_IS(solve(body, icrs, 4, q), STARCAT_E_NOT_FINITE);
+    icrs[2][k] = sound[1];
+  }
   body[1][1] = (starcat_real)NAN;
   CHECK_IS(solve(body, icrs, 4, q), STARCAT_E_NOT_FINITE);
   CHECK_IS(solve(body, icrs, 1, q), STARCAT_TOO_FEW_STARS);
@@ -137,6 +146,11 @@ void test_camera(void) {
   body[0] = (starcat_real)0.8;
   body[2] = (starcat_real)0.6;
   CHECK(!starcat_pixel(&camera, body, &x, &y));
+  /* Without a fold single precision ends at an angle of 87 degrees from the axis. */
+  given.fold_radius = (starcat_real)0.0;
+  CHECK_IS(starcat_prepare_camera(&given, &camera), STARCAT_IDENTIFIED);
+  body[2] = (starcat_real)0.02;
+  CHECK_IS(starcat_pixel(&camera, body, &x, &y), IF_SINGLE(0, 1));
 }
 
 /* Chords and angles against libm, where the series ends and beyond. */

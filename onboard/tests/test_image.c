@@ -87,6 +87,8 @@ static void check_numbers(void) {
   CHECK_IS(with_u32(56, STARCAT_MAX_STARS), STARCAT_IDENTIFIED);
   CHECK_IS(with_f64(96, 0.0), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, nan), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(96, 1e-300), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(96, 1e300), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, 1e7), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(88, -1e7), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(88, 1e7), STARCAT_E_LAYOUT);
@@ -131,11 +133,17 @@ void test_open(void) {
   CHECK_IS(with_u32(28, 2), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(104, 0.0), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(104, (double)NAN), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(104, 1e-300), STARCAT_E_LAYOUT);
   check_sections(7);
   CHECK_IS(unit_triangle.image.n_stars, SKY_STARS);
   CHECK(strcmp(unit_triangle.image.name, "sky-1.0.0") == 0);
   CHECK_IS(unit_triangle.image.manifest_sha256[31], 0xa5);
+  char version[32];
+  (void)sprintf(version, "%d.%d.%d", STARCAT_VERSION_MAJOR, STARCAT_VERSION_MINOR,
+                STARCAT_VERSION_PATCH);
+  CHECK(strcmp(version, STARCAT_VERSION) == 0);
   CHECK(strcmp(starcat_version(), STARCAT_VERSION) == 0);
+  CHECK_IS(starcat_version_number(), STARCAT_VERSION_NUMBER);
 }
 
 /* Flip a bit; scrub has to find it, open has to refuse the image, and the block has to be named. */

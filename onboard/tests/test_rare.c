@@ -110,7 +110,8 @@ static void check_too_near(void) {
 }
 #endif
 
-/* A camera of 180 degrees but for a millionth of an arcsecond: opposite corners are opposite. */
+/* A camera of 180 degrees but for a millionth of an arcsecond, too wide for a plane to show; and one
+ * whose stars, in opposite corners, are 178 degrees apart. */
 static void check_half_sky(void) {
   unit_copy(&unit_pyramid);
   unit_scratch.camera.width_px = (starcat_real)1e6;
@@ -125,6 +126,9 @@ static void check_half_sky(void) {
     truth.magnitudes[n] = (starcat_real)n;
   }
   unit_scratch.options.max_steps = 100000;
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_CAMERA);
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_CAMERA);
+  unit_scratch.camera.focal_length_px = (starcat_real)10000.0;
   CHECK(unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED);
   CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_OPTIONS);
 }
@@ -369,6 +373,16 @@ static void check_ways(void) {
   starcat_count_ways(&call, 5);
   const double all = (double)unit_work.log_ways[5];
   CHECK_NEAR((double)starcat_log_ways(&call, 5), all, 1e-4);
+  /* Of more stars than single precision adds up in units of the largest number. */
+  const uint32_t stars = unit_work.n_within;
+  for (uint32_t j = stars; j < 180u; j++) {
+    unit_work.within[j] = unit_work.within[j - stars];
+  }
+  unit_work.n_within = 180;
+  starcat_count_ways(&call, SKY_SPOTS);
+  CHECK_NEAR((double)starcat_log_ways(&call, SKY_SPOTS), (double)unit_work.log_ways[SKY_SPOTS],
+             1e-3);
+  unit_work.n_within = stars;
   for (uint32_t i = 0; i < unit_work.count; i++) {
     unit_work.magnitude[i] = (starcat_real)1000.0;
   }
