@@ -127,7 +127,9 @@ def ingest(
     inputs: Annotated[
         list[str] | None,
         typer.Option(
-            "--input", metavar="[SOURCE=]PATH", help="File or folder of the catalog. Repeatable."
+            "--input",
+            metavar="[SOURCE=]PATH",
+            help="File, folder or address (HATS) of the catalog. Repeatable.",
         ),
     ] = None,
     to: ToFormat = "parquet",
@@ -165,6 +167,7 @@ def ingest(
         print_ingested(read, output, as_json=json)
         return
     from starcat.store.ingest import ingest_to_store
+    from starcat.store.reading import brought
 
     options = StoreOptions(
         max_partition_rows=max_partition_rows,
@@ -175,6 +178,7 @@ def ingest(
         replace=replace,
     )
     with progress_bars() as progress:
+        paths = brought(source, paths, **how, progress=progress)
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
     print_stored(stored, as_json=json)
 
