@@ -144,7 +144,17 @@ def persistent(url: str, once: Callable[[], _Result], options: DownloadOptions) 
         except _WORTH_A_RETRY as error:
             _logger.info("%s, attempt %d: %s", url, attempt + 1, error)
             cause = error
-    raise DownloadError(f"{_short(str(cause))} (attempts: {attempts})") from cause
+    raise DownloadError(f"{_short(_why(cause))} (attempts: {attempts})") from cause
+
+
+def _why(error: Exception | None) -> str:
+    """Return why there was no answer, without the objects that the libraries name."""
+    refused = re.search(r"\[Errno -?\d+\] ([^\"')]+)", str(error))
+    if isinstance(error, requests.ConnectionError) and refused:
+        return f"the server cannot be reached: {refused[1]}"
+    if isinstance(error, requests.Timeout) or "timed out" in str(error):
+        return "the server does not answer in time"
+    return str(error)
 
 
 def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:

@@ -70,6 +70,7 @@ GAP_BYTES = 1 << 18
 """Bytes between two parts that are read with them: fewer take less time than another request."""
 
 CONNECTIONS = 4
+HOW = DownloadOptions()
 _MAGIC = b"PAR1"
 
 Ranges = list[tuple[int, int]]
@@ -107,14 +108,12 @@ def address_of(path: Path) -> str | None:
     return str(json.loads((path / NOTE_NAME).read_bytes())["address"])
 
 
-def bring(
-    note: Path, options: IngestOptions, progress: Progress, how: DownloadOptions | None = None
-) -> Path:
+def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
     """Return the copy for the note of an address, in which is what the options let be used."""
     table = data_source(options.source_name).table
     chosen = [options.source_name, table and table.recorded(), options.band, options.read_limit_mag]
     name = hashlib.sha256(json_bytes(chosen)).hexdigest()[:16]
-    copy = _Copy(address_of(note) or "", note / name, how or DownloadOptions())
+    copy = _Copy(address_of(note) or "", note / name, HOW)
     with writing(note, "set STARCAT_CACHE to a folder with room; what has come is kept"):
         copy.folder.mkdir(exist_ok=True)
         with locked(copy.folder):
