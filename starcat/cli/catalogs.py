@@ -160,6 +160,7 @@ def ingest(
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         from starcat.catalog.ingest import write_star_tables
+
         with progress_bars() as progress:
             read = read_catalog(source, paths, **how, workers=workers, progress=progress)
             write_star_tables(read, output)
