@@ -133,6 +133,12 @@ def ingest(
         ),
     ] = None,
     to: ToFormat = "parquet",
+    merge: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A catalog that adds the stars which those before lack (parquet). Repeatable."
+        ),
+    ] = None,
     epoch_jyear: EpochJyear = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
     read_limit_mag: ReadLimitMag = None,
@@ -150,19 +156,30 @@ def ingest(
     """
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
+    from starcat.pipeline.merged import read_merged
+    from starcat.specs.product_sections import Crossmatch
     from starcat.store.plan import StoreOptions
-    from starcat.store.reading import brought, read_catalog
+    from starcat.store.reading import brought
 
+    if merge and to != "parquet":
+        raise ConfigError(
+            "--merge: several catalogs are merged into one Parquet file; leave out --to hats",
+            key="merge",
+        )
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
     source = _one_source(source, sources)
-    paths = locate(source, inputs_by_source(inputs, source))
+    names = [source, *(merge or [])]
+    given = inputs_by_source(inputs, None if merge else source)
+    paths = locate(source, given)
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         from starcat.catalog.ingest import write_star_tables
 
         with progress_bars() as progress:
-            read = read_catalog(source, paths, **how, workers=workers, progress=progress)
+            located = {name: locate(name, given) for name in names}
+            how |= {"workers": workers, "progress": progress}
+            read = read_merged(names, located, Crossmatch(), **how)
             write_star_tables(read, output)
         print_ingested(read, output, as_json=json)
         return
