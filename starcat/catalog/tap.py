@@ -63,7 +63,7 @@ class Asked:
     """What a TAP service is asked for."""
 
     service: str  # address
-    table: str  # as it stands behind FROM
+    table: str = ""  # as it stands behind FROM
     query: str = ""  # a whole query in place of a table
     map: TableMap | None = None  # whose columns are asked for; None for all
     limit_mag: float | None = None  # of the first band of the map
@@ -285,7 +285,12 @@ class _Fetch:
     def _ask(self, query: str, maxrec: int | None = None) -> OpenTable:
         """Run a query as a job, and read the VOTable that it gives."""
         path = self.work / "answer.vot"
-        forget_part(path)
+        try:
+            return self._answer(query, path, maxrec)
+        finally:
+            forget_part(path)
+
+    def _answer(self, query: str, path: Path, maxrec: int | None) -> OpenTable:
         with _told(self.asked.service, query):
             with self.service.submit_job(query, maxrec=maxrec) as job:
                 job.run()
@@ -301,7 +306,6 @@ class _Fetch:
             opened = open_table(InputFile(part, layout, "tap"))
             if opened.form != "VOTable":
                 raise DownloadError(f"the answer is {opened.form}, not a VOTable")
-        forget_part(path)
         return opened
 
 
@@ -425,10 +429,11 @@ def _told(service: str, query: str) -> Iterator[None]:
     except DownloadError as error:
         raise DownloadError(f"{service}: {error} (asked for {query!r})") from error
     except (*_NO_TAP, DALAccessError) as error:
-        text = " ".join(str(error).split())[:300] or type(error).__name__
+        text = " ".join(str(error).partition("This could mean")[0].split())[:300]
+        text = text or type(error).__name__
         raise DownloadError(
-            f"{service}: does not answer as a TAP service does when asked for {query!r} ({text}); "
-            "give the address of the service, without /sync or /async, or try again later"
+            f"{service}: does not answer as a TAP service does when asked for {query!r} "
+            f"({text}); give the address of the service, without /sync, or try again later"
         ) from error
 
 
