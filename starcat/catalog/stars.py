@@ -7,6 +7,7 @@ positions to the epoch of the build and parts the rejected records from the star
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -77,9 +78,15 @@ def table_from_columns(product: str, columns: Mapping[str, Values], count: int) 
         value = columns.get(field.name)
         if value is None:
             is_flag = field.type == pa.bool_() and not field.nullable
-            value = False if is_flag else pa.nulls(count, field.type)
+            value = False if is_flag else nulls(count, field.type)
         arrays.append(_as_array(value, field.type, count))
     return pa.Table.from_arrays(arrays, schema=schema)
+
+
+@lru_cache(maxsize=8)
+def nulls(count: int, kind: pa.DataType) -> pa.Array:
+    """Return a column without values; most archives lack many columns of the same type."""
+    return pa.nulls(count, kind)
 
 
 def with_columns(stars: pa.Table, columns: Mapping[str, Values]) -> pa.Table:
