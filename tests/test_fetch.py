@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
 import json
 import os
-import re
 import socket
 import socketserver
 import subprocess
@@ -15,13 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
+from archive_server import Archive, sha256
 from served import in_background
 
 import starcat
@@ -52,119 +49,6 @@ BODY = records(ROWS)
 OTHER = records(ROWS, factor=7907)
 PACKED = gzip.compress(BODY, mtime=0)
 HALF = len(BODY) // 2 + 7
-
-
-def sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
-@dataclass
-class Remote:
-    """A file on the server; the lists are used up, one item for each request."""
-
-    body: bytes
-    ranges: bool = True
-    heeds_if_range: bool = True
-    validators: tuple[str, ...] = ("ETag",)
-    validates_206: bool = True
-    shift_206: int = 0
-    says_length: bool = True
-    encoding: str | None = None
-    statuses: list[int] = field(default_factory=list)
-    cut_after: list[int] = field(default_factory=list)
-    stall: threading.Event | None = None
-
-    @property
-    def version(self) -> dict[str, str]:
-        """The headers that name this version of the file."""
-        digest = sha256(self.body)[:16]
-        known = {
-            "ETag": f'"{digest}"',
-            "weak ETag": f'W/"{digest}"',
-            "Last-Modified": f"Thu, 01 Jan 2026 00:00:{int(digest[:2], 16) % 60:02d} GMT",
-        }
-        return {key.removeprefix("weak "): known[key] for key in self.validators}
-
-
-@dataclass
-class Request:
-    path: str
-    range: str | None
-    if_range: str | None
-    encodings: str | None
-    status: int = 0
-    sent: int = 0
-
-
-class Handler(BaseHTTPRequestHandler):
-    server: Archive
-
-    def do_GET(self) -> None:
-        keys = ("Range", "If-Range", "Accept-Encoding")
-        request = Request(self.path, *(self.headers[key] for key in keys))
-        self.server.requests.append(request)
-        remote = self.server.remotes.get(self.path.partition("?")[0])
-        if remote is None or remote.statuses:
-            request.status = remote.statuses.pop(0) if remote else 404
-            self.send_error(request.status)
-            return
-        start = self._start(remote, request)
-        if start >= len(remote.body) > 0:
-            request.status = 416
-            self.send_response(416)
-            self.send_header("Content-Range", f"bytes */{len(remote.body)}")
-            self.end_headers()
-            return
-        self._answer(remote, request, start)
-
-    def _start(self, remote: Remote, request: Request) -> int:
-        asked = re.fullmatch(r"bytes=(\d+)-", request.range or "")
-        strong = [value for value in remote.version.values() if not value.startswith("W/")]
-        fits = request.if_range in (None, *strong) or not remote.heeds_if_range
-        return int(asked[1]) - remote.shift_206 if asked and fits and remote.ranges else 0
-
-    def _answer(self, remote: Remote, request: Request, start: int) -> None:
-        rest = remote.body[start:]
-        request.status = 206 if start else 200
-        self.send_response(request.status)
-        for key, value in remote.version.items():
-            if remote.validates_206 or not start:
-                self.send_header(key, value)
-        if remote.encoding:
-            self.send_header("Content-Encoding", remote.encoding)
-        if remote.says_length:
-            self.send_header("Content-Length", str(len(rest)))
-        if start:
-            total = len(remote.body)
-            self.send_header("Content-Range", f"bytes {start}-{total - 1}/{total}")
-        self.end_headers()
-        if remote.cut_after:
-            rest = rest[: remote.cut_after.pop(0)]
-        self.wfile.write(rest)
-        request.sent = len(rest)
-        if remote.stall:
-            self.wfile.flush()
-            remote.stall.wait(20)
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-class Archive(ThreadingHTTPServer):
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.remotes: dict[str, Remote] = {}
-        self.requests: list[Request] = []
-
-    def url(self, path: str) -> str:
-        return f"http://127.0.0.1:{self.server_port}{path}"
-
-    def serve(self, path: str, body: bytes, **keys: Any) -> str:
-        self.remotes[path] = Remote(body, **keys)
-        return self.url(path)
-
-    def handle_error(self, *_: object) -> None:
-        """Say nothing: a client that was killed is part of the tests."""
 
 
 @pytest.fixture

@@ -214,7 +214,9 @@ def test_every_deviation_from_misra_is_explained():
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("target", ["sanitize", "valgrind", "coverage", "cppcheck", "size"])
+@pytest.mark.parametrize(
+    "target", ["hostile", "misuse", "sanitize", "valgrind", "coverage", "cppcheck", "size"]
+)
 def test_tools_find_nothing(folder, target):
     said = make(folder, target, f"BUILD=build-{target}")
     if target == "coverage":

@@ -78,7 +78,7 @@ def build(
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
-    given = {source: _paths(files) for source, files in (inputs or {}).items()}
+    given = {source: _inputs(files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
         given,
@@ -133,7 +133,7 @@ def ingest(
     name = source_given(source).name
     return read(
         name,
-        locate(name, {name: _paths(inputs)} if inputs is not None else {}),
+        locate(name, {name: _inputs(inputs)} if inputs is not None else {}),
         band=band,
         epoch_jyear=epoch_jyear,
         read_limit_mag=read_limit_mag,
@@ -454,6 +454,14 @@ def pull(wanted: str, registry: PathLike, output: PathLike = "dist") -> Pulled:
 
     place = Path(output)
     return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock")
+
+
+def _inputs(given: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Return what a catalog is read from; a text may be the address of a HATS catalog."""
+    from starcat.store.wire import input_path
+
+    one = isinstance(given, str | os.PathLike)
+    return [input_path(str(path)) for path in ([given] if one else given)]  # type: ignore[union-attr]
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -127,7 +127,9 @@ def ingest(
     inputs: Annotated[
         list[str] | None,
         typer.Option(
-            "--input", metavar="[SOURCE=]PATH", help="File or folder of the catalog. Repeatable."
+            "--input",
+            metavar="[SOURCE=]PATH",
+            help="File, folder or address (HATS) of the catalog. Repeatable.",
         ),
     ] = None,
     to: ToFormat = "parquet",
@@ -149,6 +151,7 @@ def ingest(
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
     from starcat.store.plan import StoreOptions
+    from starcat.store.reading import brought, read_catalog
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
@@ -157,7 +160,6 @@ def ingest(
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         from starcat.catalog.ingest import write_star_tables
-        from starcat.store.reading import read_catalog
 
         with progress_bars() as progress:
             read = read_catalog(source, paths, **how, workers=workers, progress=progress)
@@ -167,14 +169,11 @@ def ingest(
     from starcat.store.ingest import ingest_to_store
 
     options = StoreOptions(
-        max_partition_rows=max_partition_rows,
-        memory_bytes=int(memory_gib * 2**30),
-        workers=workers,
-        scheduler=scheduler,
-        resume=resume,
-        replace=replace,
-    )
+        max_partition_rows=max_partition_rows, memory_bytes=int(memory_gib * 2**30),
+        workers=workers, scheduler=scheduler, resume=resume, replace=replace,
+    )  # fmt: skip
     with progress_bars() as progress:
+        paths = brought(source, paths, **how, progress=progress)
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
     print_stored(stored, as_json=json)
 

@@ -47,7 +47,11 @@ def to_either(what: str) -> Any:
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
     list[str] | None,
-    typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
+    typer.Option(
+        "--input",
+        metavar="SOURCE=PATH",
+        help="File, folder or address (HATS) of a source. Repeatable.",
+    ),
 ]
 OwnSources = Annotated[
     list[Path] | None,
@@ -223,6 +227,7 @@ def inputs_by_source(
 ) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
     from starcat.catalog.source import give_map, source_given
+    from starcat.store.wire import input_path
 
     for own in maps or []:
         give_map(own)
@@ -233,7 +238,7 @@ def inputs_by_source(
             name, separator, path = only, "=", text
         if not separator or not path:
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
-        inputs.setdefault(source_given(name).name, []).append(Path(path))
+        inputs.setdefault(source_given(name).name, []).append(input_path(path))
     return inputs
 
 

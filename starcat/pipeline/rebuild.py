@@ -16,6 +16,7 @@ from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
+from starcat.store.wire import address_of
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,10 @@ def rebuild(
     # A table of one's own is read as its map was when the database was built.
     with known_maps(maps_in(old.manifest)):
         found = _same_inputs(old, inputs, progress)
-        if output is not None:
-            return _compare(old, build(spec, found, output, progress=progress).folder)
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-            return _compare(old, build(spec, found, Path(folder), progress=progress).folder)
+            built = build(spec, found, output or Path(folder), progress=progress)
+            _check_remote(old, built.manifest, found)
+            return _compare(old, built.folder)
 
 
 def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
@@ -67,12 +68,17 @@ def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
-    """Return the inputs of a build, found to be the files that the manifest lists."""
+    """Return the inputs of a build, found to be the files that the manifest lists.
+
+    What is at an address is known when the build has read what it uses of it.
+    """
     found = {}
     progress("check inputs", 0, None)
     for facts in old.manifest["sources"]:
         name = facts["source"]
         found[name] = locate(name, given)
+        if any(map(address_of, found[name])):
+            continue
         paths = [file.path for file in SourceFiles.find(data_source(name), found[name]).files]
         expected = [(file["name"], file["sha256"]) for file in facts["files"]]
         if len(paths) != len(expected):
@@ -91,6 +97,22 @@ def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
                     path=path,
                 )
     return found
+
+
+def _check_remote(old: Artifact, manifest: dict[str, Any], inputs: Inputs) -> None:
+    """Check that what was read at addresses is what the database was made from."""
+    read = {facts["source"]: facts["files"] for facts in manifest["sources"]}
+    for facts in old.manifest["sources"]:
+        name = facts["source"]
+        before = {file["sha256"] for file in facts["files"]}
+        for file in read[name] if any(map(address_of, inputs[name])) else ():
+            if file["sha256"] not in before:
+                raise ChecksumMismatch(
+                    f"{name}: {file['name']} has changed: what was read of it has sha256 "
+                    f"{file['sha256']}, which {old.folder.name} was not made from. Name what it "
+                    f"was made from with --input {name}=ADDRESS",
+                    source=name,
+                )
 
 
 def _compare(old: Artifact, folder: Path) -> Rebuilt:

@@ -16,11 +16,11 @@ from pydantic import BaseModel, ConfigDict
 from starcat.errors import ConfigError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.pulling import Pulled, pull_release
-from starcat.releases.registry import is_address, open_registry
+from starcat.releases.registry import open_registry
 from starcat.releases.tree import Release, check_version, choose, parse, parse_wanted
 from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
-from starcat.storage.download import DownloadOptions
+from starcat.storage.download import DownloadOptions, is_address
 from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat.lock"
@@ -73,7 +73,7 @@ def _writing(path: Path) -> AbstractContextManager[None]:
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
     """Pin a release, in place of another version of the same database."""
-    given = registry if is_address(registry) else _seen_from(path.parent, registry)
+    given = registry if is_address(registry, "registry") else _seen_from(path.parent, registry)
     pin = Pin(name=release.name, version=release.version, manifest=release.manifest, registry=given)
     prepare(path)
     with _writing(path), locked(path.parent):
@@ -101,7 +101,7 @@ def _seen_from(folder: Path, registry: str) -> str:
 
 def pinned_registry(path: Path, pin: Pin) -> str:
     """Return the registry of a pin as seen from here."""
-    return pin.registry if is_address(pin.registry) else str(path.parent / pin.registry)
+    return pin.registry if is_address(pin.registry, "registry") else str(path.parent / pin.registry)
 
 
 def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) -> Pin:

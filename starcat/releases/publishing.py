@@ -19,10 +19,10 @@ from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.files import copy_to_part, damaged
-from starcat.releases.registry import is_address
 from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
 from starcat.storage.atomic import make_folder, replace_file, sync, unique, writing
 from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.download import is_address
 from starcat.storage.locks import locked
 
 INCOMING = ".incoming"
@@ -57,7 +57,7 @@ class Published:
 
 def publish_artifact(artifact: Path, registry: str, progress: Progress = no_progress) -> Published:
     """Put a database into a registry."""
-    if is_address(registry):
+    if is_address(registry, "registry"):
         raise ConfigError(
             f"{registry}: a registry behind an address can only be read; publish into a folder, "
             "and upload that folder to where the address leads",

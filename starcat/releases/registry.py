@@ -5,14 +5,20 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import urlsplit
 
-from starcat.errors import ConfigError, DownloadError, ProductError, SourceMissing, reason
+from starcat.errors import DownloadError, ProductError, SourceMissing, reason
 from starcat.progress import Progress
 from starcat.releases.files import copy_to_part
 from starcat.releases.tree import INDEX_NAME, MAX_INDEX_BYTES, Blob, Listed, read_index
 from starcat.storage.digests import file_sha256
-from starcat.storage.download import DownloadOptions, NotFound, download, forget_part, part_of
+from starcat.storage.download import (
+    DownloadOptions,
+    NotFound,
+    download,
+    forget_part,
+    is_address,
+    part_of,
+)
 
 
 @dataclass(frozen=True)
@@ -105,26 +111,6 @@ Registry = FolderRegistry | HttpRegistry
 
 def open_registry(text: str, options: DownloadOptions | None = None) -> Registry:
     """Return the registry at a folder or an address; nothing is read yet."""
-    if is_address(text):
+    if is_address(text, "registry"):
         return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
     return FolderRegistry(str(Path(text)))
-
-
-def is_address(text: str) -> bool:
-    """Return whether a registry is reached over HTTP."""
-    if "://" not in text:
-        return False
-    try:
-        address = urlsplit(text)
-        is_usable = address.scheme in ("http", "https") and bool(address.hostname)
-        is_usable &= not (address.query or address.fragment) and address.port != 0
-    except ValueError:  # brackets without a pair, or a port that is no number
-        is_usable = False
-    if not is_usable:
-        raise ConfigError(
-            f"registry {text!r}: expected a folder, or an address that begins with http:// or "
-            "https:// and has no ? or #",
-            key="registry",
-            value=text,
-        )
-    return True

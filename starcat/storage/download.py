@@ -14,12 +14,12 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Literal, TypeVar
 from urllib.parse import urlsplit
 
 import pooch
@@ -27,7 +27,7 @@ import requests
 from pydantic import BaseModel, ConfigDict
 from urllib3.exceptions import HTTPError
 
-from starcat.errors import DownloadError, OutputError
+from starcat.errors import ConfigError, DownloadError, OutputError
 from starcat.progress import Progress, no_progress
 from starcat.version import __version__
 
@@ -37,7 +37,9 @@ Arrival = Literal["downloaded", "resumed"]
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 18
 _LONGEST_WAIT_S = 60.0
-_SIZE = "[0-9]{1,18}"
+_Result = TypeVar("_Result")
+SIZE = "[0-9]{1,18}"
+"""A number of bytes as headers have it."""
 
 
 class NotFound(DownloadError):  # noqa: N818 - the name reads as the fact
@@ -74,7 +76,7 @@ class _PartState(BaseModel):
         return not self.validator
 
 
-class _Refused(Exception):  # noqa: N818 - not an error of its own: it ends the attempts
+class Refused(Exception):  # noqa: N818 - not an error of its own: it ends the attempts
     """The server's answer will be the same next time."""
 
     def __init__(self, message: str, status: int | None = None) -> None:
@@ -82,36 +84,77 @@ class _Refused(Exception):  # noqa: N818 - not an error of its own: it ends the 
         self.status = status
 
 
-class _Broken(Exception):  # noqa: N818
+class Broken(Exception):  # noqa: N818
     """The answer may be better next time."""
 
 
 # The errors of requests are OSErrors.
-_WORTH_A_RETRY = (_Broken, OSError, HTTPError, EOFError, ftplib.Error)
+_WORTH_A_RETRY = (Broken, OSError, HTTPError, EOFError, ftplib.Error)
+
+
+def is_address(text: str, what: str) -> bool:
+    """Return whether a text is an address of HTTP; else it is a path, if it can be one.
+
+    Only for what the user of this machine says: a service opens no address that it is told.
+    """
+    if "://" not in text:
+        return False
+    try:
+        address = urlsplit(text)
+        is_usable = address.scheme in ("http", "https") and bool(address.hostname)
+        is_usable &= not (address.query or address.fragment) and address.port != 0
+    except ValueError:  # brackets without a pair, or a port that is no number
+        is_usable = False
+    if not is_usable:
+        raise ConfigError(
+            f"{what} {text!r}: expected a folder, or an address that begins with http:// or "
+            "https:// and has no ? or #",
+            key=what,
+            value=text,
+        )
+    return True
 
 
 def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
     """Bring one address to ``<name>.part``, trying again after a short wait."""
-    reason: Exception | None = None
+
+    def once() -> Arrival:
+        if url.lower().startswith("ftp:"):
+            _transfer_ftp(url, path, options)
+            return "downloaded"
+        return "resumed" if _transfer_http(url, path, options) else "downloaded"
+
+    return persistent(url, once, options)
+
+
+def persistent(url: str, once: Callable[[], _Result], options: DownloadOptions) -> _Result:
+    """Do what may be broken off or refused for a while, trying again after a short wait."""
+    cause: Exception | None = None
     attempts = 1 + max(0, options.retries)
-    is_ftp = url.lower().startswith("ftp:")
     for attempt in range(attempts):
         if attempt:
             time.sleep(min(options.backoff_s * 2.0 ** (attempt - 1), _LONGEST_WAIT_S))
         try:
-            if is_ftp:
-                _transfer_ftp(url, path, options)
-                return "downloaded"
-            return "resumed" if _transfer_http(url, path, options) else "downloaded"
-        except _Refused as error:
+            return once()
+        except Refused as error:
             kind = NotFound if error.status in (404, 410) else DownloadError
             raise kind(_short(str(error))) from error
         except ftplib.error_perm as error:
             raise DownloadError(_short(str(error))) from error
         except _WORTH_A_RETRY as error:
             _logger.info("%s, attempt %d: %s", url, attempt + 1, error)
-            reason = error
-    raise DownloadError(f"{_short(str(reason))} (attempts: {attempts})") from reason
+            cause = error
+    raise DownloadError(f"{_short(_why(cause))} (attempts: {attempts})") from cause
+
+
+def _why(error: Exception | None) -> str:
+    """Return why there was no answer, without the objects that the libraries name."""
+    refused = re.search(r"\[Errno -?\d+\] ([^\"')]+)", str(error))
+    if isinstance(error, requests.ConnectionError) and refused:
+        return f"the server cannot be reached: {refused[1]}"
+    if isinstance(error, requests.Timeout) or "timed out" in str(error):
+        return "the server does not answer in time"
+    return str(error)
 
 
 def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
@@ -120,13 +163,10 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
     there = part_of(path).stat().st_size if state else 0
     if state and there == state.total:
         return True
-    headers = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
-    if state:
-        headers |= {"Range": f"bytes={there}-"}
-        headers |= {} if state.is_fixed else {"If-Range": state.validator}
-    with _understood():
-        answer = requests.get(url, headers=headers, stream=True, timeout=options.timeout_s)
-    with answer as response:
+    headers = {"Range": f"bytes={there}-"} if state else {}
+    if state and not state.is_fixed:
+        headers |= {"If-Range": state.validator}
+    with answer_of(url, headers, options) as response:
         if not state or response.status_code not in (206, 416):
             _receive_whole(response, url, path, options)
             return False
@@ -138,11 +178,17 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
     return _transfer_http(url, path, options)
 
 
+def answer_of(url: str, headers: Mapping[str, str], options: DownloadOptions) -> requests.Response:
+    """Ask for a file, not packed on the way."""
+    own = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
+    with understood():
+        return requests.get(url, headers={**own, **headers}, stream=True, timeout=options.timeout_s)
+
+
 def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
     """Tell whether a partial answer begins where the part ends, in the same version."""
     found = re.fullmatch(
-        rf"bytes ({_SIZE})-({_SIZE})/({_SIZE}|\*)",
-        response.headers.get("Content-Range", "").strip(),
+        rf"bytes ({SIZE})-({SIZE})/({SIZE}|\*)", response.headers.get("Content-Range", "").strip()
     )
     if response.status_code != 206 or found is None or int(found[1]) != there:
         return False
@@ -157,25 +203,30 @@ def _receive_whole(
     response: requests.Response, url: str, path: Path, options: DownloadOptions
 ) -> None:
     """Take an answer that begins at the first byte, noting what a later part must match."""
-    answer = f"the server answered {response.status_code} {_short(response.reason or '')}"
-    if response.status_code >= 500 or response.status_code in (408, 429):
-        raise _Broken(answer)
-    if response.status_code != 200:
-        raise _Refused(answer, response.status_code)
+    check_status(response, 200)
     packed = response.headers.get("Content-Encoding", "identity") != "identity"
     if packed and not path.name.endswith(".gz"):
-        raise _Refused("the server packs the body although it was asked not to")
+        raise Refused("the server packs the body although it was asked not to")
     length = response.headers.get("Content-Length")
-    if length is not None and not re.fullmatch(_SIZE, length):
-        raise _Refused(f"the server says that the file has {_short(length)!r} bytes")
+    if length is not None and not re.fullmatch(SIZE, length):
+        raise Refused(f"the server says that the file has {_short(length)!r} bytes")
     total = options.fixed_bytes if length is None else int(length)
     if options.fixed_bytes not in (None, total):
-        raise _Refused(f"the server has {total} bytes; expected {options.fixed_bytes}")
+        raise Refused(f"the server has {total} bytes; expected {options.fixed_bytes}")
     forget_part(path)
     validator = _validator(response)
     if validator and options.fixed_bytes is None:
         _write_state(path, _PartState(url=url, validator=validator, total=total))
     _receive(response, path, 0, total, options)
+
+
+def check_status(response: requests.Response, expected: int) -> None:
+    """Check that a server answers as expected; where it is busy, it may do so later."""
+    answer = f"the server answered {response.status_code} {_short(response.reason or '')}"
+    if response.status_code >= 500 or response.status_code in (408, 429):
+        raise Broken(answer)
+    if response.status_code != expected:
+        raise Refused(answer, response.status_code)
 
 
 def _validator(response: requests.Response) -> str | None:
@@ -195,25 +246,26 @@ def _receive(
     with _appending(part_of(path), path.name, there, total, options.progress) as write:
         try:
             # As sent: a .gz is not unpacked, whatever its headers say.
-            while block := _next_block(response):
+            while block := next_block(response):
                 if limits and done + len(block) > min(limits):
-                    raise _Refused(f"the body is longer than {min(limits)} bytes")
+                    raise Refused(f"the body is longer than {min(limits)} bytes")
                 done = write(block)
         except (HTTPError, OSError) as error:
             reason = f"received {done} of {total or 'unknown'} bytes ({type(error).__name__})"
-            raise _Broken(reason) from error
+            raise Broken(reason) from error
     if total is not None and done != total:
-        raise _Broken(f"received {done} of {total} bytes")
+        raise Broken(f"received {done} of {total} bytes")
 
 
-def _next_block(response: requests.Response) -> bytes:
-    with _understood():
+def next_block(response: requests.Response) -> bytes:
+    """Return the next bytes of a body, as sent; none at its end."""
+    with understood():
         block: bytes = response.raw.read1(_BLOCK_BYTES, decode_content=False)
     return block
 
 
 @contextmanager
-def _understood() -> Iterator[None]:
+def understood() -> Iterator[None]:
     """Turn what the libraries of HTTP raise about a malformed answer into a refusal.
 
     A broken connection is worth another attempt and passes. Anything else, such as what a
@@ -225,7 +277,7 @@ def _understood() -> Iterator[None]:
         raise
     except Exception as error:
         what = f"{type(error).__name__}: {_short(str(error))}"
-        raise _Refused(f"the server's answer makes no sense ({what})") from error
+        raise Refused(f"the server's answer makes no sense ({what})") from error
 
 
 def _short(text: str) -> str:

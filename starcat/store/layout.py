@@ -29,6 +29,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcat.errors import ProductError, SchemaError, SourceError, TargetMissing, reason
+from starcat.storage.schema import product_schema
 from starcat.store.pixels import Pixel
 
 COLLECTION_NAME = "collection.properties"
@@ -93,19 +94,23 @@ def open_store(folder: Path) -> Store:
         raise TargetMissing(f"{folder}: does not exist; give the folder of a HATS catalog")
     if not (folder / COLLECTION_NAME).is_file():
         return Store(folder, _read_catalog(folder), None)
-    collection = read_properties(folder / COLLECTION_NAME)
-    primary = collection.get("hats_primary_table_url")
+    inner = primary_of(folder)
+    margin = read_properties(folder / COLLECTION_NAME).get("default_margin")
+    return Store(
+        folder, _read_catalog(inner), _read_catalog(_within(folder, margin)) if margin else None
+    )
+
+
+def primary_of(folder: Path) -> Path:
+    """Return the folder of the stars of a collection."""
+    primary = read_properties(folder / COLLECTION_NAME).get("hats_primary_table_url")
     if not primary:
         raise ProductError(
             f"{folder / COLLECTION_NAME}: has no hats_primary_table_url; expected the name of the "
             "catalog's folder. Get the collection again",
             path=folder,
         )
-    margin = collection.get("default_margin")
-    inner = _within(folder, primary)
-    return Store(
-        folder, _read_catalog(inner), _read_catalog(_within(folder, margin)) if margin else None
-    )
+    return _within(folder, primary)
 
 
 @contextmanager
@@ -120,6 +125,28 @@ def parquet_file(
         why = reason(error) if isinstance(error, OSError) else str(error)
         message = f"{path}: cannot be read as Parquet ({why}); {advice}"
         raise refusal(message, path=path) from error
+
+
+def groups_within(footer: pq.FileMetaData, column: str, limit: float | None) -> list[int]:
+    """Return the row groups that may have stars with a magnitude within a limit."""
+    leaves = [footer.schema.column(k).path for k in range(footer.num_columns)]
+    place = leaves.index(column)
+    groups = []
+    for k in range(footer.num_row_groups):
+        group = footer.row_group(k)
+        known = group.column(place).statistics
+        is_known = limit is not None and known is not None
+        is_blank = is_known and known.has_null_count and known.null_count == group.num_rows
+        is_faint = is_known and known.has_min_max and known.min > limit
+        if not (is_blank or is_faint):
+            groups.append(k)
+    return groups
+
+
+def star_columns(found: Sequence[str]) -> list[str]:
+    """Return the columns of a table of stars that are read: nearest neighbours are found anew."""
+    names = product_schema("stars").arrow_schema.names
+    return [name for name in names if name in found and not name.startswith("nearest_")]
 
 
 def check_has_columns(
@@ -158,13 +185,13 @@ def _read_catalog(folder: Path) -> HatsFolder:
         )
     properties = read_properties(path)
     suffix = properties.get("hats_npix_suffix", ".parquet")
-    partitions = [_partition(folder, pixel, suffix) for pixel in _pixels(folder)]
+    partitions = [_partition(folder, pixel, suffix) for pixel in pixels_of(folder)]
     return HatsFolder(
         folder, properties, tuple(sorted(partitions, key=lambda found: found.pixel.first))
     )
 
 
-def _pixels(folder: Path) -> list[Pixel]:
+def pixels_of(folder: Path) -> list[Pixel]:
     """Return the pixels that the catalog says it has; those of its files where it says nothing."""
     path = folder / PARTITIONS_NAME
     if not path.is_file():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import pyarrow.parquet as pq
 from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
 from starcat.catalog.source import data_source, map_of
-from starcat.catalog.source_files import FileFacts
+from starcat.catalog.source_files import FileFacts, table_parts
 from starcat.catalog.stars import Columns, floats_of, move_to_epoch, table_from_columns
 from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
@@ -35,11 +36,14 @@ from starcat.store.layout import (
     REPEATED,
     Store,
     check_has_columns,
+    groups_within,
     is_store,
     open_store,
     parquet_file,
+    star_columns,
 )
 from starcat.store.metadata import MANIFEST_VERSION
+from starcat.store.wire import address_of, bring
 from starcat.threads import map_in_order
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
@@ -54,10 +58,36 @@ _PLACE = (
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
     """Read a star catalog from a store or from archive files; what is chosen is as for `ingest`."""
-    stores = [path for path in paths if path.is_dir() and is_store(path)]
+    here = brought(source_name, paths, **chosen)
+    is_ours = [open_store(path).is_ours for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None
-    if not stores or (is_mapped and not any(open_store(path).is_ours for path in stores)):
-        return ingest(source_name, paths, **chosen)
+    if not is_ours or (is_mapped and not any(is_ours)):
+        read = ingest(source_name, here, **chosen)
+    else:
+        _check_alone(source_name, paths)
+        read = _read_store(source_name, open_store(here[0]), **chosen)
+    address = address_of(paths[0]) if paths else None
+    return read if address is None else _named_by_address(read, here[0], address)
+
+
+def brought(
+    source_name: str,
+    paths: Sequence[Path],
+    *,
+    band: str | None = None,
+    read_limit_mag: float | None = None,
+    progress: Progress = no_progress,
+    **_: Any,
+) -> list[Path]:
+    """Return paths, with a copy for an address: in it is what can be used of what is there."""
+    if not any(map(address_of, paths)):
+        return list(paths)
+    _check_alone(source_name, paths)
+    options = ingest_options(source_name, band, None, read_limit_mag)
+    return [bring(paths[0], options, progress)]
+
+
+def _check_alone(source_name: str, paths: Sequence[Path]) -> None:
     if len(paths) > 1:
         raise ConfigError(
             f"{source_name}: {len(paths)} inputs are given, and one of them is a store; a store is "
@@ -65,7 +95,20 @@ def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Inge
             key="input",
             value=[str(path) for path in paths],
         )
-    return _read_store(source_name, open_store(paths[0]), **chosen)
+
+
+def _named_by_address(read: Ingested, copy: Path, address: str) -> Ingested:
+    """Return a catalog whose own files are named by where they are."""
+    store = open_store(copy)
+    if store.is_ours:
+        return read
+    is_mapped = data_source(read.source).table is not None
+    own = [store.catalog.folder / file.name for file in read.files]
+    names = [
+        path.relative_to(copy).as_posix() for path in (table_parts(copy) if is_mapped else own)
+    ]
+    files = zip(read.files, names, strict=True)
+    return replace(read, files=tuple(replace(f, name=f"{address}/{name}") for f, name in files))
 
 
 def _read_store(
@@ -166,32 +209,15 @@ def _bright_rows(
 ) -> tuple[pa.Table, int]:
     """Return a file's stars within the limit, and how many are beyond it."""
     number, path = numbered
-    names = product_schema("stars").arrow_schema.names
     with parquet_file(path, ProductError, "get the catalog again") as file:
         has = file.schema_arrow.names
         check_has_columns(path, has, NEEDED, _HINT)
-        columns = [name for name in names if name in has and not name.startswith("nearest_")]
-        groups = _groups_within(file, options.read_limit_mag)
-        table = file.read_row_groups(groups, columns, use_threads=False)
+        groups = groups_within(file.metadata, "mag", options.read_limit_mag)
+        table = file.read_row_groups(groups, star_columns(has), use_threads=False)
         total = file.metadata.num_rows
     if options.read_limit_mag is not None:
         table = table.filter(pc.less_equal(table["mag"], options.read_limit_mag))
     return _as_stars(table, number, options, manifest), total - len(table)
-
-
-def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
-    """Return the row groups that may have stars within a limit."""
-    place = file.schema_arrow.names.index("mag")
-    groups = []
-    for k in range(file.metadata.num_row_groups):
-        group = file.metadata.row_group(k)
-        known = group.column(place).statistics
-        is_known = limit is not None and known is not None
-        is_blank = is_known and known.has_null_count and known.null_count == group.num_rows
-        is_faint = is_known and known.has_min_max and known.min > limit
-        if not (is_blank or is_faint):
-            groups.append(k)
-    return groups
 
 
 def _as_stars(

@@ -1,0 +1,321 @@
+"""HATS catalogs at an address: what can be used of one is brought into a copy, which is then read.
+
+A file of the copy is as long as the remote one and has what was read at the same places; the rest
+is a hole, of zeros. Its digest is thus that of what was read: it is the same for the same remote
+file, source, band and limit. A copy whose making was ended goes on with what it has; every answer
+is compared with the version of the file that the copy began with.
+
+Only the command line and Python make an address an input (`input_path`); a service has no way to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote, urlsplit
+
+import pyarrow.parquet as pq
+from pydantic import BaseModel, ConfigDict
+
+from starcat.catalog.archives.mapped import names_wanted
+from starcat.catalog.parts import IngestOptions
+from starcat.catalog.readers.tables import open_table
+from starcat.catalog.source import data_source
+from starcat.catalog.source_files import InputFile, cache_folder
+from starcat.catalog.verdict import Reason
+from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError
+from starcat.progress import Progress
+from starcat.storage.atomic import placed, writing
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.download import (
+    DownloadOptions,
+    NotFound,
+    download,
+    forget_part,
+    is_address,
+    part_of,
+    rename,
+)
+from starcat.storage.locks import locked
+from starcat.storage.ranges import RemoteVersion, fetch_range
+from starcat.store.layout import (
+    COLLECTION_NAME,
+    DATASET,
+    MANIFEST_NAME,
+    PARTITIONS_NAME,
+    PROPERTIES_NAMES,
+    REJECTED,
+    REPEATED,
+    groups_within,
+    pixels_of,
+    primary_of,
+    read_properties,
+    star_columns,
+)
+from starcat.store.pixels import Pixel
+from starcat.store.split import split_name
+from starcat.threads import map_in_order
+
+NOTE_NAME = "address.json"
+FOOTER_BYTES = 1 << 16
+"""What is asked for first of a Parquet file: most footers are shorter."""
+
+GAP_BYTES = 1 << 18
+"""Bytes between two parts that are read with them: fewer take less time than another request."""
+
+CONNECTIONS = 4
+HOW = DownloadOptions()
+_MAGIC = b"PAR1"
+
+Ranges = list[tuple[int, int]]
+Choose = Callable[[Path, pq.FileMetaData], tuple[Sequence[int], Sequence[str]]]
+"""Given a file whose footer is there: the row groups and columns that are read."""
+
+
+def input_path(text: str) -> Path:
+    """Return the path of an input, or the note of an address, which stands for what is there."""
+    if not is_address(text, "input"):
+        return Path(text)
+    if "@" in urlsplit(text).netloc:
+        raise ConfigError(
+            "input: an address with a name or password in it, which manifests would show; put "
+            "them into ~/.netrc, and leave them out of the address",
+            key="input",
+        )
+    url = text.rstrip("/")
+    note = _notes() / hashlib.sha256(url.encode()).hexdigest()[:16]
+    with writing(note, "set STARCAT_CACHE to a folder with room"):
+        note.mkdir(parents=True, exist_ok=True)
+        with placed(note / NOTE_NAME) as partial_note:
+            partial_note.write_bytes(json_bytes({"address": url}))
+    return note
+
+
+def _notes() -> Path:
+    return cache_folder() / "wire"
+
+
+def address_of(path: Path) -> str | None:
+    """Return the address that a path is the note of; only the download cache has notes."""
+    if path.parent != _notes() or not (path / NOTE_NAME).is_file():
+        return None
+    return str(json.loads((path / NOTE_NAME).read_bytes())["address"])
+
+
+def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
+    """Return the copy for the note of an address, in which is what the options let be used."""
+    table = data_source(options.source_name).table
+    chosen = [options.source_name, table and table.recorded(), options.band, options.read_limit_mag]
+    name = hashlib.sha256(json_bytes(chosen)).hexdigest()[:16]
+    copy = _Copy(address_of(note) or "", note / name, HOW)
+    with writing(note, "set STARCAT_CACHE to a folder with room; what has come is kept"):
+        copy.folder.mkdir(exist_ok=True)
+        with locked(copy.folder):
+            inner, pixels = _bring_listing(copy)
+            is_ours = copy.whole(MANIFEST_NAME)
+            if is_ours:
+                _bring_beside(copy)
+            choose = _choose_stars if is_ours or table is None else _choose_mapped
+            names = [f"{inner}{DATASET}/{pixel.path.as_posix()}" for pixel in pixels]
+            bring_one = partial(copy.part, choose=partial(choose, options))
+            for done, _ in enumerate(map_in_order(bring_one, iter(names), CONNECTIONS), 1):
+                progress(f"partitions {options.source_name}", done, len(names))
+    return copy.folder
+
+
+def _bring_listing(copy: _Copy) -> tuple[str, list[Pixel]]:
+    """Bring what says which partitions there are; return where they are within the catalog."""
+    inner = ""
+    if copy.whole(COLLECTION_NAME, _without_margins):
+        inner = f"{primary_of(copy.folder).relative_to(copy.folder).as_posix()}/"
+    if not any(copy.whole(inner + name) for name in PROPERTIES_NAMES):
+        raise ProductError(
+            f"{copy.url}/{inner}: no {' or '.join(PROPERTIES_NAMES)} there; expected the address "
+            "of a HATS catalog or collection. Other files are read from a path: download them"
+        )
+    if not copy.whole(inner + PARTITIONS_NAME):
+        raise ProductError(
+            f"{copy.url}/{inner}: no {PARTITIONS_NAME} there, and an address lists no files; "
+            "download the catalog, and give its folder"
+        )
+    folder = copy.folder / inner
+    facts = next(read_properties(folder / n) for n in PROPERTIES_NAMES if (folder / n).is_file())
+    if facts.get("hats_npix_suffix", ".parquet") != ".parquet":
+        raise ProductError(
+            f"{copy.url}/{inner}: its partitions are folders of files, and an address lists no "
+            "files; download the catalog, and give its folder"
+        )
+    return inner, pixels_of(folder)
+
+
+def _without_margins(text: bytes) -> bytes:
+    """Return a collection's properties without its margins, which a copy has not."""
+    return b"".join(line for line in text.splitlines(keepends=True) if b"margin" not in line)
+
+
+def _bring_beside(copy: _Copy) -> None:
+    """Bring the rejected and repeated records of a store that starcat made."""
+    manifest = json.loads((copy.folder / MANIFEST_NAME).read_bytes())
+    for facts in manifest["partitions"]:
+        name = f"{REPEATED}/{facts['order']}-{facts['pixel']}.parquet"
+        if facts["repeated"] and not copy.whole(name):
+            raise ProductError(f"{copy.url}/{name}: is missing; the store is not whole")
+    counts = dict(manifest["rejected"])
+    for reason in (Reason.beyond_read_limit, Reason.duplicate_record):
+        counts.pop(reason.name, None)
+    names = [f"{REJECTED}/{split_name(n)}.parquet" for n in range(len(manifest["files"]))]
+    there = [copy.folder / name for name in (names if counts else ()) if copy.whole(name)]
+    rows = sum(pq.read_metadata(path).num_rows for path in there)
+    if rows != sum(counts.values()):
+        raise ProductError(
+            f"{copy.url}/{REJECTED}: {rows} rejected records are there; the store has "
+            f"{sum(counts.values())}. It is not whole"
+        )
+
+
+def _choose_stars(
+    options: IngestOptions, path: Path, footer: pq.FileMetaData
+) -> tuple[Sequence[int], Sequence[str]]:
+    """Choose what a build reads of a partition with the columns of stars."""
+    has = footer.schema.to_arrow_schema().names
+    groups = groups_within(footer, "mag", options.read_limit_mag) if "mag" in has else []
+    return groups, star_columns(has)
+
+
+def _choose_mapped(
+    options: IngestOptions, path: Path, footer: pq.FileMetaData
+) -> tuple[Sequence[int], Sequence[str]]:
+    """Choose what a build reads of a partition whose columns a map tells."""
+    source = data_source(options.source_name)
+    opened = open_table(InputFile(path, source.files[0], source.name))
+    names = names_wanted(source.table, opened, where=path.name) if source.table else []
+    return range(footer.num_row_groups), names
+
+
+class _State(BaseModel):
+    """Which version of a remote file a copy is of, and what it has."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: RemoteVersion
+    there: list[tuple[int, int]] = []
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """A copy of what is used of a catalog."""
+
+    url: str
+    folder: Path
+    how: DownloadOptions
+
+    def whole(self, name: str, edit: Callable[[bytes], bytes] | None = None) -> bool:
+        """Bring a file as it is; tell whether there is one."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        forget_part(path)
+        try:
+            download(self._url(name), path, self.how)
+        except NotFound:
+            return False
+        except DownloadError as error:
+            error.args = (f"{self.url}/{name}: {error}",)
+            raise
+        part = part_of(path)
+        if edit is not None:
+            part.write_bytes(edit(part.read_bytes()))
+        if path.exists() and file_sha256(path) != file_sha256(part):
+            forget_part(path)
+            raise ChecksumMismatch(f"{self.url}/{name}: has changed; {self._advice}", path=path)
+        rename(part, path)
+        forget_part(path)
+        return True
+
+    def part(self, name: str, choose: Choose) -> None:
+        """Bring the footer of a Parquet file, and the columns of row groups that are chosen."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        try:
+            with path.open("r+b") as file:
+                _Part(self._url(name), path, file, self.how).fill(choose)
+        except ChecksumMismatch as error:
+            error.args = (f"{error}; {self._advice}",)
+            error.path = path
+            raise
+
+    def _url(self, name: str) -> str:
+        return f"{self.url}/{quote(name, safe='/=')}"
+
+    @property
+    def _advice(self) -> str:
+        return f"what was read before is in {self.folder}: remove that to read it as it is now"
+
+
+class _Part:
+    """A Parquet file of the copy while it is filled."""
+
+    def __init__(self, url: str, path: Path, file: BinaryIO, how: DownloadOptions) -> None:
+        self.url, self.path, self.file, self.how = url, path, file, how
+        self.note = path.with_name(f".{path.name}.json")
+        self.state: _State | None = None
+        if self.note.exists():
+            state = _State.model_validate_json(self.note.read_bytes())
+            self.state = state if path.stat().st_size == state.version.size else None
+
+    def fill(self, choose: Choose) -> None:
+        """Bring what is chosen and not there."""
+        # The end is asked for each time: the answer tells whether the file is the same.
+        size = self._get(-FOOTER_BYTES, 0).version.size
+        self.file.seek(max(0, size - 8))
+        length = int.from_bytes(self.file.read(4), "little") + 8
+        if self.file.read(4) != _MAGIC or length > size:
+            raise ProductError(f"{self.url}: is no Parquet file; expected a partition of a catalog")
+        self._need([(0, min(size, 4)), (size - length, size - FOOTER_BYTES)])
+        footer = pq.read_metadata(self.path)
+        groups, names = choose(self.path, footer)
+        self._need(chunks_of(footer, groups, names))
+
+    def _need(self, ranges: Ranges) -> None:
+        for first, end in ranges:
+            if first < end and self.state and (first, end) not in self.state.there:
+                state = self._get(first, end)
+                state.there.append((first, end))
+                self.note.write_text(state.model_dump_json() + "\n", encoding="utf-8")
+
+    def _get(self, first: int, end: int) -> _State:
+        def write(place: int, block: bytes) -> None:
+            self.file.seek(place)
+            self.file.write(block)
+
+        known = self.state.version if self.state else None
+        version = fetch_range(self.url, first, end, write, self.how, known)
+        self.file.truncate(version.size)
+        self.file.flush()
+        os.fsync(self.file.fileno())
+        self.state = self.state or _State(version=version)
+        return self.state
+
+
+def chunks_of(footer: pq.FileMetaData, groups: Sequence[int], names: Sequence[str]) -> Ranges:
+    """Return where the columns of row groups are in a file; near ones are one range."""
+    found: Ranges = []
+    for group in map(footer.row_group, groups):
+        for column in map(group.column, range(group.num_columns)):
+            if column.path_in_schema.partition(".")[0] in names:
+                starts = (column.data_page_offset, column.dictionary_page_offset)
+                first = min(start for start in starts if start)
+                found.append((first, first + column.total_compressed_size))
+    joined: Ranges = []
+    for first, end in sorted(found):
+        if joined and first - joined[-1][1] <= GAP_BYTES:
+            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
+        else:
+            joined.append((first, end))
+    return joined
