@@ -125,8 +125,18 @@ def split_by_verdict(stars: pa.Table, verdicts: Verdicts) -> tuple[pa.Table, pa.
     is_kept = verdicts.is_kept
     if is_kept.all():
         return stars, product_schema("rejected").arrow_schema.empty_table()
-    rejected = reject_rows(stars.filter(pa.array(~is_kept)), verdicts.reasons)
-    return stars.filter(pa.array(is_kept)), rejected
+    rejected = reject_rows(_where(stars, ~is_kept), verdicts.reasons)
+    return _where(stars, is_kept), rejected
+
+
+def _where(stars: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
+    """Return some rows; nothing is looked for in the columns that the archive does not have."""
+    mask, count = pa.array(chosen), int(np.count_nonzero(chosen))
+    columns = [
+        nulls(count, column.type) if column.null_count == len(stars) else column.filter(mask)
+        for column in stars.columns
+    ]
+    return pa.Table.from_arrays(columns, schema=stars.schema)
 
 
 def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
