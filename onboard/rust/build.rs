@@ -95,7 +95,10 @@ fn main() {
     println!("cargo:rerun-if-changed=src/ffi.rs");
     fs::write(
         out.join("ffi.rs"),
-        template.replace("@SUFFIX@", &suffix).replace("1000001", &centroids).replace("1000002", &stars),
+        template
+            .replace("@SUFFIX@", &suffix)
+            .replace("1000001", &centroids)
+            .replace("1000002", &stars),
     )
     .unwrap();
 
