@@ -20,7 +20,6 @@
 #define LARGEST_STEP R(1e12)
 #endif
 
-
 /* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
 static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;

@@ -9,13 +9,12 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-/* A number as its bits, and those of the exponent: all are set where it is infinite or not one. */
+/* The exponent's part of a number's second byte, after the seven bits of its first. All are set
+ * where the number is infinite or not one. */
 #ifdef STARCAT_SINGLE
-typedef uint32_t word;
-#define EXPONENT 0x7f800000u
+#define EXPONENT 0x80u
 #else
-typedef uint64_t word;
-#define EXPONENT 0x7ff0000000000000u
+#define EXPONENT 0xf0u
 #endif
 
 void starcat_default_options(starcat_options *options) {
@@ -30,16 +29,14 @@ void starcat_default_options(starcat_options *options) {
 /* Whether so many numbers in a row are finite, by their exponents: where what is not a number is
  * compared or subtracted, a processor may trap. */
 int starcat_are_finite(const void *numbers, uint32_t count) {
-  const uint8_t *from = numbers;
+  const uint16_t one = 1;
+  const size_t is_little = *(const uint8_t *)(const void *)&one;
+  const size_t first = is_little * (sizeof(real) - 1u);
+  const size_t second = 1u + is_little * (sizeof(real) - 3u);
   int finite = 1;
   for (uint32_t n = 0; n < count; n++) {
-    word bits;
-    uint8_t *to = (uint8_t *)(void *)&bits;
-    for (uint32_t k = 0; k < sizeof bits; k++) {
-      to[k] = *from;
-      from++;
-    }
-    finite &= (bits & EXPONENT) != EXPONENT;
+    const uint8_t *bytes = (const uint8_t *)numbers + n * sizeof(real);
+    finite &= ((bytes[first] & 0x7fu) != 0x7fu) | ((bytes[second] & EXPONENT) != EXPONENT);
   }
   return finite;
 }

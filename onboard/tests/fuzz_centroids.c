@@ -44,9 +44,9 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
 
 /* A number as it was, a little off, a plain one, one of the odd ones, or any bits at all. */
 static starcat_real changed(fuzz_bytes *bytes, starcat_real value) {
-  static const starcat_real odd[12] = {
-      0,        -(starcat_real)0.0, 1,       -1,          INFINITY,    -INFINITY,
-      LEAST,    LARGE,              1e9F,    FLT_EPSILON, LEAST / 4,   512};
+  static const starcat_real odd[12] = {0,        -(starcat_real)0.0, 1,         -1,
+                                       INFINITY, -INFINITY,          LEAST,     LARGE,
+                                       1e9F,     FLT_EPSILON,        LEAST / 4, 512};
   const uint32_t kind = fuzz_number(bytes, 1);
   starcat_real any;
   switch (kind % 8u) {
