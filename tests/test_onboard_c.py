@@ -218,7 +218,8 @@ def test_every_deviation_from_misra_is_explained():
     "target",
     [
         *("hostile", "misuse", "sanitize", "valgrind", "coverage", "cppcheck", "size"),
-        *("test-amalgamation", "test-install", "test-cpp", "test-rust"),
+        *("test-amalgamation", "test-install", "test-cpp", "test-rust", "test-ada"),
+        "microcontroller",
     ],
 )
 def test_tools_find_nothing(folder, target):
