@@ -30,7 +30,7 @@ COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stac
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("vendored") / "onboard"
-    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python"))
+    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python", "target"))
     return copy
 
 
@@ -214,7 +214,14 @@ def test_every_deviation_from_misra_is_explained():
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("target", ["sanitize", "valgrind", "coverage", "cppcheck", "size"])
+@pytest.mark.parametrize(
+    "target",
+    [
+        *("hostile", "misuse", "sanitize", "valgrind", "coverage", "cppcheck", "size"),
+        *("test-amalgamation", "test-install", "test-cpp", "test-rust", "test-ada"),
+        "microcontroller",
+    ],
+)
 def test_tools_find_nothing(folder, target):
     said = make(folder, target, f"BUILD=build-{target}")
     if target == "coverage":

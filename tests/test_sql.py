@@ -266,7 +266,8 @@ def test_every_named_query_answers(query, small_artifact, artifact_version):
 
 def test_the_values_of_a_named_query_have_its_types():
     query = named_query("crossmatch")
-    assert query.with_values({"radius_arcsec": "3"}) == {"radius_arcsec": 3.0}
+    given = query.with_values({"radius_arcsec": "3"})
+    assert given == {"radius_arcsec": 3.0, "epoch_jyear": 2000.0}
     for text in ("x", "nan", "1_0", "٧"):
         with pytest.raises(QueryError, match=f"'{text}' is not a number"):
             query.with_values({"radius_arcsec": text})

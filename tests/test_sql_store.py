@@ -14,11 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import scipy
 from astropy import units as u
 from cdshealpix.nested import healpix_to_lonlat, neighbours, vertices
 
 from starcat.errors import ProductError, QueryError
-from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.query.partitions import EXTENT, extents
 from starcat.query.session import Session, open_session
 from starcat.store.pixels import MAX_ORDER, Pixel, healpix_29
@@ -346,6 +347,24 @@ def test_two_stores_at_once(folder, sky, tmp_path):
         assert max(files_read(both, joined)) < 20
 
 
+def test_pairs_across_partitions_are_found(folder, sky, tmp_path):
+    shifted = sky.directions + np.random.default_rng(4).normal(scale=1e-4, size=(STARS, 3))
+    shifted /= np.linalg.norm(shifted, axis=1)[:, None]
+    ra, dec = radec_from_directions(shifted)
+    table = pa.table({"ra_deg": ra, "dec_deg": dec, "row": np.arange(STARS)})
+    pq.write_table(table, tmp_path / "shifted.parquet")
+    with open_session([str(folder), str(tmp_path / "shifted.parquet")]) as both:
+        asked = "SELECT a_star_id, b_row FROM crossmatch('a', 'b', 60)"
+        with both.ask(asked) as answer:
+            found = answer.rows(10**6)
+    apart = scipy.spatial.cKDTree(sky.directions).sparse_distance_matrix(
+        scipy.spatial.cKDTree(shifted), 2 * np.sin(np.radians(30 / 3600)), output_type="ndarray"
+    )
+    assert sorted(found) == sorted(zip(apart["i"].tolist(), apart["j"].tolist(), strict=True))
+    pixels = healpix_29(*radec_from_directions(sky.directions)), healpix_29(ra, dec)
+    assert any(pixels[0][i] >> 42 != pixels[1][j] >> 42 for i, j in found), "across borders"
+
+
 def test_the_preamble_of_a_store_gives_any_duckdb_the_same(starcat, folder, session):
     with duckdb.connect() as connection:
         connection.execute(starcat(["sql", folder, "--preamble"]).out)
@@ -407,8 +426,15 @@ def test_a_table_without_places_is_told(sky, tmp_path, kind):
         pq.write_table(table, target)
     with open_session([str(target)]) as opened:
         assert rows(opened, "SELECT count(*) FROM stars") == [(STARS,)]
-        for place in ("cone(1, 2, 3)", "box(1, 2, 3, 4)", "field(1, 2, 3, 4, 5)"):
-            with pytest.raises(QueryError, match="stars has no column ra_deg; cone, box and field"):
+        for place in (
+            "cone(1, 2, 3)",
+            "box(1, 2, 3, 4)",
+            "field(1, 2, 3, 4, 5)",
+            "crossmatch('stars', 'stars', 1)",
+        ):
+            with pytest.raises(
+                QueryError, match="stars has no column ra_deg; cone, box, field and crossmatch"
+            ):
                 rows(opened, f"FROM {place}")
 
 

@@ -18,23 +18,48 @@ extern "C" {
 #endif
 
 #define STARCAT_VERSION "0.2.0"
+#define STARCAT_VERSION_MAJOR 0
+#define STARCAT_VERSION_MINOR 2
+#define STARCAT_VERSION_PATCH 0
+#define STARCAT_VERSION_NUMBER \
+  (10000 * STARCAT_VERSION_MAJOR + 100 * STARCAT_VERSION_MINOR + STARCAT_VERSION_PATCH)
 
-/* Largest number of centroids that a frame may have. */
+/* Largest number of centroids that a frame may have, in plain digits. */
 #ifndef STARCAT_MAX_CENTROIDS
-#define STARCAT_MAX_CENTROIDS 64u
+#define STARCAT_MAX_CENTROIDS 64
+#endif
+#if (STARCAT_MAX_CENTROIDS < 4) || (STARCAT_MAX_CENTROIDS > 32767)
+#error "STARCAT_MAX_CENTROIDS has to be from 4 (an answer has four stars) to 32767"
 #endif
 
 /* Largest number of stars in or next to a frame; an image that may exceed it is not opened. */
 #ifndef STARCAT_MAX_STARS
-#define STARCAT_MAX_STARS 192u
+#define STARCAT_MAX_STARS 192
+#endif
+#if (STARCAT_MAX_STARS < 4) || (STARCAT_MAX_STARS > 32767)
+#error "STARCAT_MAX_STARS has to be from 4 (an answer has four stars) to 32767"
 #endif
 
 /* Single precision by -DSTARCAT_SINGLE, double by default. */
 #ifdef STARCAT_SINGLE
-typedef float starcat_real;
+#define STARCAT_REAL float
 #else
-typedef double starcat_real;
+#define STARCAT_REAL double
 #endif
+typedef STARCAT_REAL starcat_real;
+
+/* Sizes of structures depend on these three. They are part of the symbols, so that a caller who was
+ * compiled with others than the library does not link: starcat_open_64_192_double is undefined. */
+#define STARCAT_JOINED(name, centroids, stars, real) name##_##centroids##_##stars##_##real
+#define STARCAT_JOIN(name, centroids, stars, real) STARCAT_JOINED(name, centroids, stars, real)
+#define STARCAT_SYMBOL(name) \
+  STARCAT_JOIN(name, STARCAT_MAX_CENTROIDS, STARCAT_MAX_STARS, STARCAT_REAL)
+#define starcat_camera_of STARCAT_SYMBOL(starcat_camera_of)
+#define starcat_default_options STARCAT_SYMBOL(starcat_default_options)
+#define starcat_open STARCAT_SYMBOL(starcat_open)
+#define starcat_identify STARCAT_SYMBOL(starcat_identify)
+#define starcat_track STARCAT_SYMBOL(starcat_track)
+#define starcat_attitude STARCAT_SYMBOL(starcat_attitude)
 
 /* What a call came to. Values below 0 are errors of the caller or of the image. */
 typedef enum {
@@ -51,7 +76,7 @@ typedef enum {
   STARCAT_E_CRC = -8,               /* a damaged block; starcat_scrub names it */
   STARCAT_E_CAPACITY = -9,          /* more stars in a field than STARCAT_MAX_STARS */
   STARCAT_E_TOO_MANY_CENTROIDS = -10,
-  STARCAT_E_NOT_FINITE = -11,       /* a number of the options or of the prior is not finite */
+  STARCAT_E_NOT_FINITE = -11,       /* an option, the prior or a direction is not finite */
   STARCAT_E_CAMERA = -12,           /* a camera that cannot be */
   STARCAT_E_OPTIONS = -13,          /* an option out of range */
   STARCAT_E_BUDGET = -14            /* the steps are used up before an answer was found */
@@ -95,19 +120,22 @@ typedef struct {
   const uint8_t *manifest_sha256; /* 32 bytes */
 } starcat_image;
 
-/* A camera with square pixels; Brown's distortion as in OpenCV. */
+/* A camera with square pixels; Brown's distortion as in OpenCV. Its corners are up to 89.4 degrees
+ * from its axis. */
 typedef struct {
-  starcat_real width_px, height_px, focal_length_px;
+  starcat_real width_px, height_px;      /* 1 to 1e6 */
+  starcat_real focal_length_px;          /* 0.01 to 1e9 */
   starcat_real x0_px, y0_px;             /* principal point */
   starcat_real k1, k2, k3, p1, p2;       /* 0: none */
-  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: no limit */
+  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: any */
 } starcat_camera;
 
 typedef struct {
-  starcat_real tolerance_px;             /* largest error of a centroid, as a radius */
+  starcat_real tolerance_px;             /* largest error of a centroid, as a radius: 1e-6 to 1e6 */
   starcat_real noise_px;                 /* standard deviation on each axis; 0: not stated.
-                                            If stated, tolerance_px is 3 times this */
-  starcat_real noise_mag;                /* standard deviation of magnitudes; 0: not stated */
+                                            If stated, 1e-6 to 1e6; tolerance_px is 3 times this */
+  starcat_real noise_mag;                /* standard deviation of magnitudes, up to 1e6; 0: not
+                                            stated */
   starcat_real log_chance;               /* natural logarithm of the largest accepted probability
                                             that chance agrees as well */
   starcat_real fov_error;                /* largest relative error of the focal length, up to 0.5:
@@ -116,9 +144,10 @@ typedef struct {
   uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
-/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN where
- * unknown. The noises, standard deviations on each axis above 0, are the weights of the attitude of
- * an answer, and what its covariance and its chi-square are made of in place of noise_px. */
+/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN or
+ * infinite where unknown. The noises, standard deviations on each axis from 1e-6 to 1e6 px, are the
+ * weights of the attitude of an answer, and what its covariance and its chi-square are made of in
+ * place of noise_px. */
 typedef struct {
   uint32_t count;
   const starcat_real *x_px;
@@ -152,8 +181,9 @@ typedef struct {
 /* Memory that a call works in; its contents are nobody's business and need not be set. */
 typedef struct starcat_workspace starcat_workspace;
 
-/* The library's version, STARCAT_VERSION as it was compiled. */
+/* The library's version as it was compiled: STARCAT_VERSION, STARCAT_VERSION_NUMBER. */
 const char *starcat_version(void);
+uint32_t starcat_version_number(void);
 
 /* Fill in the camera that the image was built for, and the options that the ground uses. */
 void starcat_camera_of(const starcat_image *image, starcat_camera *camera);
@@ -179,7 +209,8 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,
                              starcat_workspace *work, starcat_result *result);
 
-/* Find the rotation that best turns `icrs` into `body`, pairs of unit vectors by rows. */
+/* Find the rotation that best turns `icrs` into `body`, pairs of unit vectors by rows. No number of
+ * them may be beyond 2. */
 starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
                                 uint32_t count, starcat_real q_body_from_icrs[4]);
 

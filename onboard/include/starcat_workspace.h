@@ -39,9 +39,8 @@ struct starcat_workspace {
   uint32_t row[STARCAT_MAX_CENTROIDS];
   starcat_real x[STARCAT_MAX_CENTROIDS];
   starcat_real y[STARCAT_MAX_CENTROIDS];
-  starcat_real magnitude[STARCAT_MAX_CENTROIDS];
-  starcat_real brightness[STARCAT_MAX_CENTROIDS]; /* magnitude, a large one where unknown */
-  starcat_real square[STARCAT_MAX_CENTROIDS];     /* of the distance from the centre */
+  starcat_real magnitude[STARCAT_MAX_CENTROIDS]; /* a large one where unknown */
+  starcat_real square[STARCAT_MAX_CENTROIDS];    /* of the distance from the centre */
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
   starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length of an attitude */
 
@@ -91,6 +90,7 @@ struct starcat_workspace {
   starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
   starcat_real sums[4][STARCAT_MAX_CENTROIDS + 1];
   starcat_real log_largest[4];
+  uint32_t n_some[4]; /* of those numbers that are not 0 */
 
   starcat_agreement found;
   starcat_agreement wider;

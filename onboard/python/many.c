@@ -67,7 +67,7 @@ static int identify(const starcat_search *search, uint32_t count, const double *
     star[i] = row < 0 ? row : search->rows[row];
   }
   if ((status == STARCAT_IDENTIFIED) && (search->directions != NULL)) {
-    sc_fit_answer(search->image, search->directions, sigma_px, &memory->work, result);
+    starcat_fit_answer(search->image, search->directions, sigma_px, &memory->work, result);
   }
   if (has_stars) {
     tell(result, answer);

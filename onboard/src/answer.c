@@ -5,7 +5,7 @@
 #include "internal.h"
 
 /* Say why there is no answer, and how good the best agreement was. */
-static void refuse(const sc_call *call, starcat_result *result) {
+static void refuse(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   result->best_n_matched = w->best.n_matched;
   result->best_log_chance = w->best.log_bound;
@@ -24,7 +24,7 @@ static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
   if (sigma_px == NULL) {
     return noise_px;
   }
-  return sigma_px[row] - sigma_px[row] == R(0.0) ? sigma_px[row] : R(0.0);
+  return starcat_are_finite(sigma_px + row, 1) ? sigma_px[row] : R(0.0);
 }
 
 /* List the centroids of the best agreement that are stars, with directions of the image or others,
@@ -38,7 +38,7 @@ static void take_stars(const starcat_image *image, const real *directions, const
     const int32_t star = w->best.star[i];
     if (star >= 0) {
       real *icrs = w->seen_icrs[n];
-      sc_star(image, (uint32_t)star, icrs);
+      starcat_star(image, (uint32_t)star, icrs);
       for (uint32_t k = 0; k < 3u; k++) {
         w->seen_body[n][k] = body[i][k];
         icrs[k] = directions != NULL ? directions[3u * (size_t)star + k] : icrs[k];
@@ -54,48 +54,52 @@ static void take_stars(const starcat_image *image, const real *directions, const
   for (uint32_t i = 0; i < n; i++) {
     const real ratio = w->weight[i] > R(0.0) ? least / w->weight[i] : R(0.0);
     const real weight = ratio * ratio;
-    w->weight[i] = weight > SC_LEAST_WEIGHT ? weight : SC_LEAST_WEIGHT;
+    w->weight[i] = weight > STARCAT_LEAST_WEIGHT ? weight : STARCAT_LEAST_WEIGHT;
     w->weight[i] = least > R(0.0) ? w->weight[i] : R(1.0);
   }
 }
 
 static void set_attitude(const real m[9], starcat_result *result) {
-  sc_quaternion(m, result->q_body_from_icrs);
-  sc_matrix(result->q_body_from_icrs, result->matrix);
+  starcat_quaternion(m, result->q_body_from_icrs);
+  starcat_matrix(result->q_body_from_icrs, result->matrix);
 }
 
 /* Fit the attitude of the answer to the stars that are listed. */
 static void fit_stars(const starcat_workspace *w, starcat_result *result) {
   real square = R(0.0);
-  sc_refine(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight, w->n_seen,
-            4);
+  starcat_refine(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
+                 w->n_seen, 4);
   set_attitude(result->matrix, result);
   for (uint32_t i = 0; i < w->n_seen; i++) {
     real turned[3];
-    sc_turn(result->matrix, w->seen_icrs[i], turned);
-    square += sc_chord_square(w->seen_body[i], turned);
+    starcat_turn(result->matrix, w->seen_icrs[i], turned);
+    square += starcat_chord_square(w->seen_body[i], turned);
   }
   result->residual_rad = STARCAT_SQRT(square / (real)w->n_seen);
 }
 
+#ifdef STARCAT_GROUND
 /* Fit the attitude of an answer once more, with other directions than those of the image. */
-void sc_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                   starcat_workspace *work, starcat_result *result) {
+void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
+                        starcat_workspace *work, starcat_result *result) {
   take_stars(image, directions, sigma_px, work);
   fit_stars(work, result);
 }
+#endif
 
 /* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
  * the attitude. Sums the squared residuals of stated noise, in it, and counts these centroids. */
-static real residuals(const sc_call *call, const real m[9], real *chi_square, uint32_t *n_stated) {
+static real residuals(const starcat_call *call, const real m[9], real *chi_square,
+                      uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
   real square = R(0.0);
   for (uint32_t n = 0; n < w->n_seen; n++) {
     const uint32_t i = w->seen[n];
     const real noise = noise_of(call->sigma_px, call->noise_px, w->row[i]);
     real body[3], x = w->x[i], y = w->y[i];
-    sc_turn(m, w->seen_icrs[n], body);
-    (void)sc_pixel(&call->camera, body, &x, &y); /* it was within reach of its centroid before */
+    starcat_turn(m, w->seen_icrs[n], body);
+    (void)starcat_pixel(&call->camera, body, &x,
+                        &y); /* it was within reach of its centroid before */
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     square += dx * dx + dy * dy;
     if (noise > R(0.0)) {
@@ -103,12 +107,13 @@ static real residuals(const sc_call *call, const real m[9], real *chi_square, ui
       (*n_stated)++;
     }
   }
-  return STARCAT_SQRT(square / (real)(2u * w->n_seen - 3u)); /* there are SC_MIN_STARS at least */
+  return STARCAT_SQRT(square /
+                      (real)(2u * w->n_seen - 3u)); /* there are STARCAT_MIN_STARS at least */
 }
 
 /* Tell the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the turns t that the noises of
  * centroids stand for, and the reduced chi-square. */
-static void tell_errors(const sc_call *call, starcat_result *result) {
+static void tell_errors(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
@@ -128,13 +133,13 @@ static void tell_errors(const sc_call *call, starcat_result *result) {
     h[3] += v * (R(1.0) - b[1] * b[1]);
     h[4] -= v * b[1] * b[2];
     h[5] += v * (R(1.0) - b[2] * b[2]);
-    sc_turns_of_pixel(&call->camera, b, turn);
+    starcat_turns_of_pixel(&call->camera, b, turn);
     for (uint32_t k = 0; k < 9u; k++) {
       const uint32_t i = k / 3u, j = k % 3u;
       s[i][j] += scale * scale * (turn[0][i] * turn[0][j] + turn[1][i] * turn[1][j]);
     }
   }
-  if (!sc_solve(h, s[0], unused, inverse)) {
+  if (!starcat_solve(h, s[0], unused, inverse)) {
     return; /* all stars are at one place */
   }
   const real p[3][3] = {{inverse[0], inverse[1], inverse[2]},
@@ -142,20 +147,21 @@ static void tell_errors(const sc_call *call, starcat_result *result) {
                         {inverse[2], inverse[4], inverse[5]}};
   for (uint32_t k = 0; k < 9u; k++) {
     for (uint32_t i = 0; i < 3u; i++) {
-      result->covariance_rad2[k] += p[k / 3u][i] * sc_dot(s[i], p[k % 3u]);
+      result->covariance_rad2[k] += p[k / 3u][i] * starcat_dot(s[i], p[k % 3u]);
     }
   }
 }
 
-starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result) {
+starcat_status starcat_end(starcat_call *call, const starcat_options *options,
+                           starcat_result *result) {
   starcat_workspace *w = call->work;
   result->steps = options->max_steps - w->steps_left;
   result->n_tried = w->n_tried;
-  if ((w->best.n_matched < SC_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
+  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
     refuse(call, result);
     return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
   }
-  sc_set_focal(call, w->best.focal);
+  starcat_set_focal(call, w->best.focal);
   take_stars(call->image, NULL, call->sigma_px, w);
   set_attitude(w->best.matrix, result);
   result->residual_rad = w->best.residual_rad;

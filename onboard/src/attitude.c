@@ -6,17 +6,18 @@
 
 /* The attitude that turns a1 into b1 exactly, and a2 into the plane of b1 and b2 (TRIAD; Black
  * 1964). Returns 0 if two directions coincide. */
-int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]) {
+int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
+                  real m[9]) {
   real bn[3], an[3], bt[3], at[3];
-  sc_cross(b1, b2, bn);
-  sc_cross(a1, a2, an);
-  const real b = sc_dot(bn, bn), a = sc_dot(an, an);
+  starcat_cross(b1, b2, bn);
+  starcat_cross(a1, a2, an);
+  const real b = starcat_dot(bn, bn), a = starcat_dot(an, an);
   if (!(b > R(1e-14)) || !(a > R(1e-14))) {
     return 0;
   }
   const real scale = R(1.0) / STARCAT_SQRT(a * b);
-  sc_cross(bn, b1, bt);
-  sc_cross(an, a1, at);
+  starcat_cross(bn, b1, bt);
+  starcat_cross(an, a1, at);
   for (uint32_t i = 0; i < 3u; i++) {
     for (uint32_t j = 0; j < 3u; j++) {
       m[3u * i + j] = b1[i] * a1[j] + scale * (bn[i] * an[j] + bt[i] * at[j]);
@@ -27,12 +28,12 @@ int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2
 
 /* Solve a symmetric system of three: m is xx, xy, xz, yy, yz, zz, and so is its inverse.
  * Returns 0 if the matrix is not positive definite. */
-int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
+int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
   const real xx = m[3] * m[5] - m[4] * m[4];
   const real xy = m[2] * m[4] - m[1] * m[5];
   const real xz = m[1] * m[4] - m[2] * m[3];
   const real determinant = m[0] * xx + m[1] * xy + m[2] * xz;
-  if (!(determinant > R(0.0))) {
+  if (!(determinant > STARCAT_LEAST_DETERMINANT)) {
     return 0;
   }
   const real scale = R(1.0) / determinant;
@@ -49,14 +50,14 @@ int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
 }
 
 /* Invert a matrix of four. Returns 0 if it is not positive definite. */
-int sc_invert(const sc_information *m, sc_information *inverse) {
+int starcat_invert(const starcat_information *m, starcat_information *inverse) {
   const real *c = m->with_scale;
   real along[3], of_angles[6];
-  if (!sc_solve(m->angles, c, along, of_angles)) {
+  if (!starcat_solve(m->angles, c, along, of_angles)) {
     return 0;
   }
-  const real left = m->scale - sc_dot(c, along);
-  if (!(left > R(0.0))) {
+  const real left = m->scale - starcat_dot(c, along);
+  if (!(left > STARCAT_LEAST_DETERMINANT)) {
     return 0;
   }
   const real scale = R(1.0) / left;
@@ -75,12 +76,12 @@ int sc_invert(const sc_information *m, sc_information *inverse) {
 /* Turn an attitude by the small angles w about the camera's axes (Cayley's rotation). */
 static void turn_by(real m[9], const real w[3]) {
   const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};
-  const real scale = R(2.0) / (R(1.0) + sc_dot(h, h));
+  const real scale = R(2.0) / (R(1.0) + starcat_dot(h, h));
   for (uint32_t k = 0; k < 3u; k++) {
     const real v[3] = {m[k], m[k + 3u], m[k + 6u]};
     real first[3], second[3];
-    sc_cross(h, v, first);
-    sc_cross(h, first, second);
+    starcat_cross(h, v, first);
+    starcat_cross(h, first, second);
     m[k] += scale * (first[0] + second[0]);
     m[k + 3u] += scale * (first[1] + second[1]);
     m[k + 6u] += scale * (first[2] + second[2]);
@@ -91,20 +92,20 @@ static void turn_by(real m[9], const real w[3]) {
  * Newton's method on Wahba's loss, whose steps square the error. body[i] belongs to
  * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
  * It works with differences of directions, so that narrow fields lose no digits. */
-void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               const real *weight, uint32_t count, uint32_t most) {
+void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+                    const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {
     real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
     for (uint32_t i = 0; i < count; i++) {
       const real *b = body + 3u * i;
       const real v = weight != NULL ? weight[i] : R(1.0);
       real a[3], e[3], c[3];
-      sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
+      starcat_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
       e[0] = b[0] - a[0];
       e[1] = b[1] - a[1];
       e[2] = b[2] - a[2];
-      sc_cross(a, e, c);
-      const real d = sc_dot(a, b), half = R(0.5) * v;
+      starcat_cross(a, e, c);
+      const real d = starcat_dot(a, b), half = R(0.5) * v;
       g[0] += v * c[0];
       g[1] += v * c[1];
       g[2] += v * c[2];
@@ -115,18 +116,18 @@ void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *wh
       h[4] -= half * (a[1] * b[2] + a[2] * b[1]);
       h[5] += v * (d - a[2] * b[2]);
     }
-    if (!sc_solve(h, g, w, inverse)) {
+    if (!starcat_solve(h, g, w, inverse)) {
       return;
     }
     turn_by(m, w);
-    if (sc_dot(w, w) < R(1e-12)) {
+    if (starcat_dot(w, w) < R(1e-12)) {
       return;
     }
   }
 }
 
 /* Quaternion of a rotation matrix; the largest component first (Shepperd 1978). */
-void sc_quaternion(const real m[9], real q[4]) {
+void starcat_quaternion(const real m[9], real q[4]) {
   const real trace = m[0] + m[4] + m[8];
   uint32_t i = 0;
   real largest = m[0];
@@ -161,7 +162,7 @@ void sc_quaternion(const real m[9], real q[4]) {
 }
 
 /* Rotation matrix of a unit quaternion. */
-void sc_matrix(const real q[4], real m[9]) {
+void starcat_matrix(const real q[4], real m[9]) {
   const real x = q[0], y = q[1], z = q[2], w = q[3];
   m[0] = R(1.0) - R(2.0) * (y * y + z * z);
   m[1] = R(2.0) * (x * y + z * w);
@@ -174,11 +175,16 @@ void sc_matrix(const real q[4], real m[9]) {
   m[8] = R(1.0) - R(2.0) * (x * x + y * y);
 }
 
+static int is_direction(const real v[3]) {
+  return starcat_are_finite(v, 3) && (starcat_absolute(v[0]) <= R(2.0)) &&
+         (starcat_absolute(v[1]) <= R(2.0)) && (starcat_absolute(v[2]) <= R(2.0));
+}
+
 /* How well two pairs determine an attitude: the sine of the angle between their directions. */
 static real spread(const real (*v)[3], uint32_t i, uint32_t j) {
   real normal[3];
-  sc_cross(v[i], v[j], normal);
-  return sc_dot(normal, normal);
+  starcat_cross(v[i], v[j], normal);
+  return starcat_dot(normal, normal);
 }
 
 starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
@@ -189,8 +195,7 @@ starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_rea
     return STARCAT_E_NULL;
   }
   for (uint32_t i = 0; i < count; i++) {
-    const real sum = body[i][0] + body[i][1] + body[i][2] + icrs[i][0] + icrs[i][1] + icrs[i][2];
-    if (!(sum - sum == R(0.0))) {
+    if (!is_direction(body[i]) || !is_direction(icrs[i])) {
       return STARCAT_E_NOT_FINITE;
     }
     const real apart = spread(body, 0, i);
@@ -199,10 +204,10 @@ starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_rea
       second = i;
     }
   }
-  if ((count < 2u) || !sc_triad(body[0], body[second], icrs[0], icrs[second], m)) {
+  if ((count < 2u) || !starcat_triad(body[0], body[second], icrs[0], icrs[second], m)) {
     return STARCAT_TOO_FEW_STARS;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
-  sc_quaternion(m, q_body_from_icrs);
+  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
+  starcat_quaternion(m, q_body_from_icrs);
   return STARCAT_IDENTIFIED;
 }

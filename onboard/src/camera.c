@@ -5,16 +5,20 @@
 #include "internal.h"
 
 #define NEWTON_STEPS 50u
-#define LARGEST_PX R(1e6)
+#define LEAST_SEEN (R(0.1) * STARCAT_LEAST_COSINE) /* of a star beside the detector */
 
-/* Square of the last step over that of the distance; the error left is about its square. */
+/* Square of the last step over that of the distance; the error left is about its square. Square of
+ * the farthest place that the search may come by, and its largest step: their powers are numbers
+ * still. */
 #ifdef STARCAT_SINGLE
 #define SMALL_STEP R(1e-11)
+#define FARTHEST R(400.0)
+#define LARGEST_STEP R(100.0)
 #else
 #define SMALL_STEP R(1e-16)
+#define FARTHEST R(1e24)
+#define LARGEST_STEP R(1e12)
 #endif
-
-static real absolute(real x) { return x < R(0.0) ? -x : x; }
 
 /* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
 static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) {
@@ -28,7 +32,7 @@ static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) 
 /* The same; returns 0 from the fold outwards. */
 static int distort(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
-  if ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius)) {
+  if (!(s < FARTHEST) || ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius))) {
     return 0;
   }
   image_of(c, u, v, x, y);
@@ -49,21 +53,27 @@ static void slopes(const starcat_camera *c, real u, real v, real slope[4]) {
 }
 
 /* The direction that the lens puts at the image x, y: Newton's method in the plane, started at
- * the image. Returns 0 if there is none inside the fold. */
+ * the image. Returns 0 if there is none inside the fold, or it is too far to be found. */
 static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) {
   *u = x;
   *v = y;
   for (uint32_t step = 0; step < NEWTON_STEPS; step++) {
     real there_x, there_y, slope[4];
+    if (!(*u * *u + *v * *v < FARTHEST)) {
+      return 0;
+    }
     image_of(c, *u, *v, &there_x, &there_y);
     slopes(c, *u, *v, slope);
     const real miss_x = there_x - x, miss_y = there_y - y;
     const real determinant = slope[0] * slope[3] - slope[1] * slope[2];
-    if (!(absolute(determinant) > R(1e-12))) {
+    real step_u = slope[3] * miss_x - slope[1] * miss_y;
+    real step_v = slope[0] * miss_y - slope[2] * miss_x;
+    if (!(starcat_absolute(step_u) + starcat_absolute(step_v) <
+          LARGEST_STEP * (starcat_absolute(determinant) - R(1e-12)))) {
       return 0;
     }
-    const real step_u = (slope[3] * miss_x - slope[1] * miss_y) / determinant;
-    const real step_v = (slope[0] * miss_y - slope[2] * miss_x) / determinant;
+    step_u /= determinant;
+    step_v /= determinant;
     *u -= step_u;
     *v -= step_v;
     const real size = *u * *u + *v * *v;
@@ -80,7 +90,7 @@ static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) 
   return 0;
 }
 
-int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]) {
+int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]) {
   const starcat_camera *c = &camera->given;
   const real x = (x_px - c->x0_px) / c->focal_length_px;
   const real y = (y_px - c->y0_px) / c->focal_length_px;
@@ -92,12 +102,12 @@ int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]) {
   body[0] = u * scale;
   body[1] = v * scale;
   body[2] = scale;
-  return 1;
+  return scale >= STARCAT_LEAST_COSINE;
 }
 
-int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px) {
+int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px) {
   const starcat_camera *c = &camera->given;
-  if (!(body[2] > R(0.0))) {
+  if (!(body[2] > LEAST_SEEN)) {
     return 0;
   }
   const real scale = R(1.0) / body[2];
@@ -111,15 +121,16 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
 }
 
 /* How a direction turns with its pixel's x and y: the turn, radians, for one pixel of each. */
-void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]) {
+void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], real turn[2][3]) {
   const real u = body[0] / body[2], v = body[1] / body[2];
   real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
   if (camera->distorted != 0) {
     slopes(&camera->given, u, v, s);
   }
-  /* b x db/du = z (b x e_x), and so for v. */
-  const real scale =
-      body[2] / (camera->given.focal_length_px * (s[0] * s[3] - s[1] * s[2]));
+  /* b x db/du = z (b x e_x), and so for v. At the very fold of a lens the turn has no bound. */
+  const real least = R(1e-6) * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + s[3] * s[3]) + R(1e-12);
+  const real determinant = starcat_larger(starcat_absolute(s[0] * s[3] - s[1] * s[2]), least);
+  const real scale = body[2] / (camera->given.focal_length_px * determinant);
   const real of_u[3] = {R(0.0), body[2], -body[1]}, of_v[3] = {-body[2], R(0.0), body[0]};
   for (uint32_t k = 0; k < 3u; k++) {
     turn[0][k] = scale * (s[3] * of_u[k] - s[2] * of_v[k]);
@@ -128,18 +139,19 @@ void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2]
 }
 
 static int is_possible(const starcat_camera *c) {
-  return sc_is_between(c->width_px, R(1.0), LARGEST_PX) &&
-         sc_is_between(c->height_px, R(1.0), LARGEST_PX) &&
-         sc_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
-         sc_is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
-         sc_is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) &&
-         sc_is_between(c->k1, R(-1e9), R(1e9)) && sc_is_between(c->k2, R(-1e9), R(1e9)) &&
-         sc_is_between(c->k3, R(-1e9), R(1e9)) &&
-         sc_is_between(c->p1, R(-1e9), R(1e9)) &&
-         sc_is_between(c->p2, R(-1e9), R(1e9)) && sc_is_between(c->fold_radius, R(0.0), R(1e9));
+  return starcat_are_finite(c, sizeof *c / sizeof(real)) &&
+         starcat_is_between(c->width_px, R(1.0), STARCAT_LARGEST_PX) &&
+         starcat_is_between(c->height_px, R(1.0), STARCAT_LARGEST_PX) &&
+         starcat_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
+         starcat_is_between(c->x0_px, -STARCAT_LARGEST_PX, STARCAT_LARGEST_PX) &&
+         starcat_is_between(c->y0_px, -STARCAT_LARGEST_PX, STARCAT_LARGEST_PX) &&
+         starcat_is_between(c->k1, R(-1e9), R(1e9)) && starcat_is_between(c->k2, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->k3, R(-1e9), R(1e9)) && starcat_is_between(c->p1, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->p2, R(-1e9), R(1e9)) &&
+         starcat_is_between(c->fold_radius, R(0.0), R(1e9));
 }
 
-starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera) {
+starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera) {
   real widest = R(1.0);
   if (!is_possible(given)) {
     return STARCAT_E_CAMERA;
@@ -147,12 +159,13 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   camera->given = *given;
   camera->half_width = R(0.5) * given->width_px;
   camera->half_height = R(0.5) * given->height_px;
-  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) +
-                       absolute(given->p1) + absolute(given->p2)) > R(0.0);
+  camera->distorted =
+      (starcat_absolute(given->k1) + starcat_absolute(given->k2) + starcat_absolute(given->k3) +
+       starcat_absolute(given->p1) + starcat_absolute(given->p2)) > R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);
-    if (!sc_direction(camera, x, y, camera->corner[n])) {
+    if (!starcat_direction(camera, x, y, camera->corner[n])) {
       return STARCAT_E_CAMERA;
     }
     if (camera->corner[n][2] < widest) {
@@ -168,13 +181,13 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
 
 /* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
  * Returns 0 where the lens would then form no image of a centroid. */
-static int scale_camera(sc_call *call, real focal) {
+static int scale_camera(starcat_call *call, real focal) {
   starcat_workspace *w = call->work;
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
-  int good = sc_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
+  int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
   for (uint32_t i = 0; good && (i < w->count); i++) {
-    good = sc_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
+    good = starcat_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
@@ -183,22 +196,22 @@ static int scale_camera(sc_call *call, real focal) {
 
 /* Use another focal length from now on, a multiple of the given one; the given one itself where the
  * lens forms no image with the other. */
-void sc_set_focal(sc_call *call, real focal) {
+void starcat_set_focal(starcat_call *call, real focal) {
   if ((focal != call->focal) && !scale_camera(call, focal)) {
     (void)scale_camera(call, R(1.0));
   }
 }
 
 /* Fit the focal length too from now on, where its error may be above 0. */
-void sc_allow_scales(sc_call *call, real fov_error) {
-  const sc_camera *camera = &call->camera;
+void starcat_allow_scales(starcat_call *call, real fov_error) {
+  const starcat_optics *camera = &call->camera;
   call->fov_error = fov_error;
   call->log_scales = R(0.0);
   call->bend = R(0.0);
   if (fov_error > R(0.0)) {
     const real radius_rad = STARCAT_ATAN2(camera->sin_radius, camera->cos_radius);
     call->log_scales = R(-2.0) * STARCAT_LOG(R(1.0) - fov_error);
-    call->bend = SC_CURVATURE * fov_error * radius_rad * radius_rad;
+    call->bend = STARCAT_CURVATURE * fov_error * radius_rad * radius_rad;
   }
 }
 

@@ -14,14 +14,13 @@
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
+#define LEAST_EXTENT R(1e-6) /* of stars on the detector, square pixels */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
-static real larger(real a, real b) { return a > b ? a : b; }
-
 /* How places move as the camera turns, summed over the matched centroids: the determinant, and
  * that with the focal length as a fourth unknown over the one without. */
-static real information_of_places(const sc_call *call, real *of_scale) {
+static real information_of_places(const starcat_call *call, real *of_scale) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, cross[3] = {0}, along = R(0.0), unused[6], share[3];
   for (uint32_t i = 0; i < w->count; i++) {
@@ -40,7 +39,7 @@ static real information_of_places(const sc_call *call, real *of_scale) {
       cross[1] -= x * (b + y * y);
     }
   }
-  *of_scale = sc_solve(h, cross, share, unused) ? along - sc_dot(cross, share) : R(0.0);
+  *of_scale = starcat_solve(h, cross, share, unused) ? along - starcat_dot(cross, share) : R(0.0);
   return h[0] * (h[3] * h[5] - h[4] * h[4]) + h[1] * (h[2] * h[4] - h[1] * h[5]) +
          h[2] * (h[1] * h[4] - h[2] * h[3]);
 }
@@ -50,39 +49,39 @@ static real information_of_places(const sc_call *call, real *of_scale) {
 static real log_unit_ball(uint32_t n, uint32_t unknowns) {
   const uint32_t k = n - 1u;
   if (unknowns > 3u) {
-    return (real)(n - 2u) * LOG_PI - sc_log_factorial(n - 2u);
+    return (real)(n - 2u) * LOG_PI - starcat_log_factorial(n - 2u);
   }
-  return (real)(k - 1u) * LOG_PI - sc_log_factorial(2u * k) + sc_log_factorial(k) +
+  return (real)(k - 1u) * LOG_PI - starcat_log_factorial(2u * k) + starcat_log_factorial(k) +
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
 /* Logarithm of the expected number of agreements of n centroids, by the number of unknowns that
  * are fitted: three angles, and the focal length. */
-static real log_expected(const sc_call *call, uint32_t n, real square_px, real log_information,
+static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_information,
                          uint32_t unknowns) {
-  return sc_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
+  return starcat_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
          R(0.5) * log_information + log_unit_ball(n, unknowns) +
-         R(0.5) * (real)(2u * n - unknowns) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
+         R(0.5) * (real)(2u * n - unknowns) * STARCAT_LOG(starcat_larger(square_px, LEAST_SQUARE)) -
          (real)n * call->camera.log_area;
 }
 
 /* Logarithm of the share of the probability that n of `most` stars are allotted where the noise
  * is stated: most to the number whose agreements are typically just certain, a tenth of it to the
  * next one, and so on. */
-static real log_share(const sc_call *call, uint32_t n, uint32_t most) {
+static real log_share(const starcat_call *call, uint32_t n, uint32_t most) {
   const starcat_camera *c = &call->camera.given;
   const real log_spread = STARCAT_LOG((c->width_px * c->width_px + c->height_px * c->height_px) /
                                       (R(12.0) * c->focal_length_px * c->focal_length_px));
   const real square_px = call->noise_px * call->noise_px;
-  uint32_t typical = SC_MIN_STARS;
+  uint32_t typical = STARCAT_MIN_STARS;
   real total = R(0.0), share = R(1.0);
   while ((typical < most) &&
          (log_expected(call, typical, (real)(2u * typical - 3u) * square_px,
                        R(3.0) * STARCAT_LOG((real)typical) + log_spread, 3) > LOG_NEARLY_CERTAIN)) {
     typical++;
   }
-  for (uint32_t distance = 0; distance <= most - SC_MIN_STARS; distance++) {
-    total += share * (real)((uint32_t)(typical >= SC_MIN_STARS + distance) +
+  for (uint32_t distance = 0; distance <= most - STARCAT_MIN_STARS; distance++) {
+    total += share * (real)((uint32_t)(typical >= STARCAT_MIN_STARS + distance) +
                             (uint32_t)((distance > 0u) && (typical + distance <= most)));
     share *= NEXT_SHARE;
   }
@@ -91,12 +90,12 @@ static real log_share(const sc_call *call, uint32_t n, uint32_t most) {
 
 /* Logarithm of the sum of two numbers whose logarithms are given. */
 static real log_of_sum(real a, real b) {
-  const real most = larger(a, b), apart = most - (a < b ? a : b);
-  return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / sc_exponential(apart)) : most;
+  const real most = starcat_larger(a, b), apart = most - starcat_smaller(a, b);
+  return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / starcat_exponential(apart)) : most;
 }
 
 /* Logarithm of the bound; 0 if it says nothing. */
-real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched) {
+real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched) {
   const starcat_workspace *w = call->work;
   const uint32_t fewer = w->count < w->n_within ? w->count : w->n_within;
   const int is_stated = call->noise_px > R(0.0);
@@ -105,12 +104,15 @@ real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched) {
   if (!(information > R(0.0))) {
     return R(0.0);
   }
-  sc_count_ways(call, is_stated ? fewer : n_matched);
+  starcat_count_ways(call, is_stated ? fewer : n_matched);
   real expected = log_expected(call, n_matched, square_px, STARCAT_LOG(information), 3);
   if ((call->log_scales > R(0.0)) && (of_scale > R(0.0))) {
-    expected = log_of_sum(expected, STARCAT_LOG(call->log_scales) +
-                                        log_expected(call, n_matched, square_px,
-                                                     STARCAT_LOG(information * of_scale), 4));
+    expected = log_of_sum(
+        expected,
+        STARCAT_LOG(call->log_scales) +
+            log_expected(call, n_matched, square_px,
+                         STARCAT_LOG(starcat_larger(information * of_scale, STARCAT_LEAST_NUMBER)),
+                         4));
   }
   expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(w->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
@@ -118,7 +120,7 @@ real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched) {
 
 /* Add the information that a direction gives about an attitude (Shuster and Oh 1981) and about the
  * focal length. */
-void sc_inform(sc_information *h, const real b[3]) {
+void starcat_inform(starcat_information *h, const real b[3]) {
   const real square = b[2] * b[2];
   h->angles[0] += R(1.0) - b[0] * b[0];
   h->angles[1] -= b[0] * b[1];
@@ -132,53 +134,55 @@ void sc_inform(sc_information *h, const real b[3]) {
 }
 
 /* Trace of the product of two matrices. */
-static real trace(const sc_information *a, const sc_information *b) {
+static real trace(const starcat_information *a, const starcat_information *b) {
   const real *c = a->angles, *h = b->angles;
   return c[0] * h[0] + c[3] * h[3] + c[5] * h[5] +
-         R(2.0) * (c[1] * h[1] + c[2] * h[2] + c[4] * h[4] + sc_dot(a->with_scale, b->with_scale)) +
+         R(2.0) *
+             (c[1] * h[1] + c[2] * h[2] + c[4] * h[4] + starcat_dot(a->with_scale, b->with_scale)) +
          a->scale * b->scale;
 }
 
 /* Error of the worst corner, in units of the error of a direction along one axis. */
-static real corner_deviation(const sc_information *covariance, const sc_camera *camera) {
+static real corner_deviation(const starcat_information *covariance, const starcat_optics *camera) {
   real worst = R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
-    sc_information h = {{0}, {0}, R(0.0)};
-    sc_inform(&h, camera->corner[n]);
-    worst = larger(worst, trace(covariance, &h));
+    starcat_information h = {{0}, {0}, R(0.0)};
+    starcat_inform(&h, camera->corner[n]);
+    worst = starcat_larger(worst, trace(covariance, &h));
   }
   return STARCAT_SQRT(worst);
 }
 
 /* What the covariance is without the focal length. Returns 0 if it determines no attitude. */
-static int invert_angles(const sc_information *matched, sc_information *covariance) {
-  const sc_information none = {{0}, {0}, R(0.0)};
+static int invert_angles(const starcat_information *matched, starcat_information *covariance) {
+  const starcat_information none = {{0}, {0}, R(0.0)};
   real unused[3];
   *covariance = none;
-  return sc_solve(matched->angles, matched->with_scale, unused, covariance->angles);
+  return starcat_solve(matched->angles, matched->with_scale, unused, covariance->angles);
 }
 
 /* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
  * whether its stars determine the whole frame, even where the focal length is not trusted. */
-void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found) {
+void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad,
+                   starcat_agreement *found) {
   const starcat_workspace *w = call->work;
   const real n = (real)found->n_matched;
-  sc_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
-  sc_information own, with_scale;
+  starcat_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
+  starcat_information own, with_scale;
   const int has_scale = call->fov_error > R(0.0);
   for (uint32_t i = 0; i < w->count; i++) {
-    sc_inform(&centroids, call->body[i]);
+    starcat_inform(&centroids, call->body[i]);
     if (w->match[i] >= 0) {
-      sc_inform(&matched, call->body[i]);
+      starcat_inform(&matched, call->body[i]);
     }
   }
-  const int is_whole = sc_invert(&matched, &with_scale);
+  const int is_whole = starcat_invert(&matched, &with_scale);
   real corner = R(0.0);
   found->is_firm = 0;
   if (is_whole != 0) {
     corner = found->residual_rad * STARCAT_SQRT(n / (R(2.0) * n - R(4.0))) *
              corner_deviation(&with_scale, &call->camera);
-    found->is_firm = corner <= (has_scale ? R(2.0) : R(1.0)) * SC_SURE_CORNER * tolerance_rad;
+    found->is_firm = corner <= (has_scale ? R(2.0) : R(1.0)) * STARCAT_SURE_CORNER * tolerance_rad;
   }
   if (found->n_matched >= w->n_within) {
     return;
@@ -189,10 +193,10 @@ void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_
   }
   for (uint32_t j = 0; j < w->n_within; j++) {
     real body[3];
-    sc_turn(m, w->near_icrs[w->within[j]], body);
-    sc_inform(&stars, body);
+    starcat_turn(m, w->near_icrs[w->within[j]], body);
+    starcat_inform(&stars, body);
   }
-  const sc_information *covariance = has_scale ? &with_scale : &own;
+  const starcat_information *covariance = has_scale ? &with_scale : &own;
   const real unknowns = has_scale ? R(4.0) : R(3.0);
   const real of_centroids = unknowns / trace(covariance, &centroids);
   found->share = unknowns / trace(covariance, &stars);
@@ -208,7 +212,7 @@ void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_
 }
 
 /* Whether the frame differs in scale from the stars that it matches: a wrong focal length. */
-int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px) {
+int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px) {
   const starcat_workspace *w = call->work;
   const real n = (real)n_matched;
   real mean_x = R(0.0), mean_y = R(0.0), off_x = R(0.0), off_y = R(0.0);
@@ -230,7 +234,7 @@ int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px) {
       product += x * (w->x[i] - w->x_of[j]) + y * (w->y[i] - w->y_of[j]);
     }
   }
-  const real excess = product / extent;
+  const real excess = product / starcat_larger(extent, LEAST_EXTENT);
   const real corner_px =
       STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                    call->camera.half_height * call->camera.half_height);
@@ -246,6 +250,6 @@ int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px) {
       left += x * x + y * y;
     }
   }
-  const real variance = left / (R(2.0) * n - R(4.0)) / extent;
-  return excess * excess > SC_SCALE_DEVIATIONS * SC_SCALE_DEVIATIONS * variance;
+  const real variance = left / (R(2.0) * n - R(4.0)) / starcat_larger(extent, LEAST_EXTENT);
+  return excess * excess > STARCAT_SCALE_DEVIATIONS * STARCAT_SCALE_DEVIATIONS * variance;
 }

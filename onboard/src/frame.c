@@ -6,7 +6,16 @@
 
 #define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
 #define WIDEST_FOV_ERROR R(0.5)
+#define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
+
+/* The exponent's part of a number's second byte, after the seven bits of its first. All are set
+ * where the number is infinite or not one. */
+#ifdef STARCAT_SINGLE
+#define EXPONENT 0x80u
+#else
+#define EXPONENT 0xf0u
+#endif
 
 void starcat_default_options(starcat_options *options) {
   options->tolerance_px = R(2.0);
@@ -17,16 +26,30 @@ void starcat_default_options(starcat_options *options) {
   options->max_steps = 4000000u;
 }
 
-static int is_finite(real x) { return x - x == R(0.0); }
+/* Whether so many numbers in a row are finite, by their exponents: where what is not a number is
+ * compared or subtracted, a processor may trap. */
+int starcat_are_finite(const void *numbers, uint32_t count) {
+  const uint16_t one = 1;
+  const size_t is_little = *(const uint8_t *)(const void *)&one;
+  const size_t first = is_little * (sizeof(real) - 1u);
+  const size_t second = 1u + is_little * (sizeof(real) - 3u);
+  int finite = 1;
+  for (uint32_t n = 0; n < count; n++) {
+    const uint8_t *bytes = (const uint8_t *)numbers + n * sizeof(real);
+    finite &= ((bytes[first] & 0x7fu) != 0x7fu) | ((bytes[second] & EXPONENT) != EXPONENT);
+  }
+  return finite;
+}
 
 static starcat_status check_options(const starcat_options *o) {
-  if (!is_finite(o->tolerance_px) || !is_finite(o->noise_px) || !is_finite(o->noise_mag) ||
-      !is_finite(o->log_chance) || !is_finite(o->fov_error)) {
+  if (!starcat_are_finite(o, 5)) {
     return STARCAT_E_NOT_FINITE;
   }
-  if ((o->noise_px < R(0.0)) || (o->noise_mag < R(0.0)) || (o->max_steps == 0u) ||
-      (o->fov_error < R(0.0)) || (o->fov_error > WIDEST_FOV_ERROR) ||
-      ((o->noise_px <= R(0.0)) && (o->tolerance_px <= R(0.0)))) {
+  if (!starcat_is_between(o->noise_px, R(0.0), STARCAT_LARGEST_PX) ||
+      !starcat_is_between(o->noise_mag, R(0.0), MOST_NOISE_MAG) ||
+      !starcat_is_between(o->fov_error, R(0.0), WIDEST_FOV_ERROR) || (o->max_steps == 0u) ||
+      !starcat_is_between(o->noise_px > R(0.0) ? o->noise_px : o->tolerance_px, STARCAT_LEAST_PX,
+                          STARCAT_LARGEST_PX)) {
     return STARCAT_E_OPTIONS;
   }
   return STARCAT_IDENTIFIED;
@@ -34,10 +57,10 @@ static starcat_status check_options(const starcat_options *o) {
 
 /* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
  * last; then the nearer to the centre; then by x and y. */
-static int comes_before(const starcat_workspace *w, real brightness, real square, real x, real y,
+static int comes_before(const starcat_workspace *w, real magnitude, real square, real x, real y,
                         uint32_t other) {
-  if ((w->has_magnitudes != 0u) && (brightness != w->brightness[other])) {
-    return brightness < w->brightness[other];
+  if ((w->has_magnitudes != 0u) && (magnitude != w->magnitude[other])) {
+    return magnitude < w->magnitude[other];
   }
   if (square != w->square[other]) {
     return square < w->square[other];
@@ -46,15 +69,14 @@ static int comes_before(const starcat_workspace *w, real brightness, real square
 }
 
 /* Put a centroid where it belongs among those that are in order. */
-static void insert(const sc_call *call, uint32_t row, real magnitude, real x, real y) {
+static void insert(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
-  const real brightness = is_finite(magnitude) ? magnitude : R(1e30), square = dx * dx + dy * dy;
+  const real square = dx * dx + dy * dy;
   uint32_t at = w->count;
-  while ((at > 0u) && comes_before(w, brightness, square, x, y, at - 1u)) {
+  while ((at > 0u) && comes_before(w, magnitude, square, x, y, at - 1u)) {
     w->row[at] = w->row[at - 1u];
     w->magnitude[at] = w->magnitude[at - 1u];
-    w->brightness[at] = w->brightness[at - 1u];
     w->square[at] = w->square[at - 1u];
     w->x[at] = w->x[at - 1u];
     w->y[at] = w->y[at - 1u];
@@ -62,7 +84,6 @@ static void insert(const sc_call *call, uint32_t row, real magnitude, real x, re
   }
   w->row[at] = row;
   w->magnitude[at] = magnitude;
-  w->brightness[at] = brightness;
   w->square[at] = square;
   w->x[at] = x;
   w->y[at] = y;
@@ -70,19 +91,20 @@ static void insert(const sc_call *call, uint32_t row, real magnitude, real x, re
 }
 
 /* Which centroids can be used; the others get their reason as their result. */
-static void take_usable(const sc_call *call, const starcat_frame *frame, starcat_result *result) {
+static void take_usable(const starcat_call *call, const starcat_frame *frame,
+                        starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
   starcat_workspace *w = call->work;
   w->has_magnitudes = 0;
   for (uint32_t i = 0; i < frame->count; i++) {
-    const real x = frame->x_px[i], y = frame->y_px[i];
+    const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
-    if (!is_finite(x) || !is_finite(y)) {
+    if (!starcat_are_finite(x, 1) || !starcat_are_finite(y, 1)) {
       result->star[i] = STARCAT_DROPPED_NOT_FINITE;
-    } else if ((x < R(0.0)) || (x >= camera->width_px) || (y < R(0.0)) ||
-               (y >= camera->height_px)) {
+    } else if ((*x < R(0.0)) || (*x >= camera->width_px) || (*y < R(0.0)) ||
+               (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
-    } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes[i])) {
+    } else if ((frame->magnitudes != NULL) && starcat_are_finite(frame->magnitudes + i, 1)) {
       w->has_magnitudes = 1;
     }
   }
@@ -109,17 +131,17 @@ static void drop_repeats(starcat_workspace *w, starcat_result *result) {
   w->count = kept;
 }
 
-static void set_limits(sc_call *call, const starcat_options *options) {
+static void set_limits(starcat_call *call, const starcat_options *options) {
   const starcat_workspace *w = call->work;
-  call->tolerance_px = options->noise_px > R(0.0) ? SC_SIGMAS_OF_TOLERANCE * options->noise_px
+  call->tolerance_px = options->noise_px > R(0.0) ? STARCAT_SIGMAS_OF_TOLERANCE * options->noise_px
                                                   : options->tolerance_px;
   call->noise_px = options->noise_px;
   call->focal = R(1.0);
   call->focal_px = call->camera.given.focal_length_px;
-  sc_allow_scales(call, options->fov_error);
+  starcat_allow_scales(call, options->fov_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
-  call->reach_px = SC_REACH * call->tolerance_px;
-  call->mag_reach = w->has_magnitudes != 0u ? SC_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->reach_px = STARCAT_REACH * call->tolerance_px;
+  call->mag_reach = w->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
   call->log_certain = options->log_chance;
@@ -131,9 +153,10 @@ static void set_limits(sc_call *call, const starcat_options *options) {
   }
 }
 
-starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
-                        const starcat_options *options, const starcat_frame *frame,
-                        starcat_workspace *work, starcat_result *result) {
+starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+                             const starcat_camera *camera, const starcat_options *options,
+                             const starcat_frame *frame, starcat_workspace *work,
+                             starcat_result *result) {
   if ((image == NULL) || (camera == NULL) || (options == NULL) || (frame == NULL) ||
       (work == NULL) || (result == NULL)) {
     return STARCAT_E_NULL;
@@ -159,7 +182,7 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   }
   starcat_status status = check_options(options);
   if (status == STARCAT_IDENTIFIED) {
-    status = sc_prepare_camera(camera, &call->camera);
+    status = starcat_prepare_camera(camera, &call->camera);
   }
   if (status != STARCAT_IDENTIFIED) {
     return status;
@@ -178,24 +201,27 @@ starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat
   call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
-    if ((frame->sigma_px != NULL) && (frame->sigma_px[i] <= R(0.0))) {
+    if ((frame->sigma_px != NULL) && starcat_are_finite(frame->sigma_px + i, 1) &&
+        !starcat_is_between(frame->sigma_px[i], STARCAT_LEAST_PX, STARCAT_LARGEST_PX)) {
       return STARCAT_E_OPTIONS;
     }
     if (result->star[i] == STARCAT_NO_STAR) {
-      insert(call, i, work->has_magnitudes != 0u ? frame->magnitudes[i] : R(0.0), frame->x_px[i],
+      const int is_known =
+          (work->has_magnitudes != 0u) && starcat_are_finite(frame->magnitudes + i, 1);
+      insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }
   }
   drop_repeats(work, result);
-  sc_list_columns(call);
+  starcat_list_columns(call);
   for (uint32_t i = 0; i < work->count; i++) {
-    if (!sc_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
+    if (!starcat_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
     }
   }
   set_limits(call, options);
   result->n_usable = work->count;
-  if (work->count < SC_MIN_STARS) {
+  if (work->count < STARCAT_MIN_STARS) {
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
   }

@@ -5,18 +5,21 @@
 #include "internal.h"
 
 #define WIDEST_PRIOR_RAD R(0.35)
+#define LARGEST_QUATERNION R(1e6)
+#define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
 
 starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result) {
-  sc_call call;
-  const starcat_status status = sc_begin(&call, image, camera, options, frame, work, result);
+  starcat_call call;
+  const starcat_status status = starcat_begin(&call, image, camera, options, frame, work, result);
   if (status != STARCAT_IDENTIFIED) {
     return status;
   }
-  sc_each_triangle(&call, image->method == SC_TRIANGLE ? sc_triangle : sc_pyramid);
-  return sc_end(&call, options, result);
+  starcat_each_triangle(&call,
+                        image->method == STARCAT_TRIANGLE ? starcat_triangle : starcat_pyramid);
+  return starcat_end(&call, options, result);
 }
 
 /* A prior attitude and how far from their predicted places it may put stars. */
@@ -28,25 +31,31 @@ typedef struct {
   int is_stale;                /* whether a verification has used the workspace since */
 } prior;
 
-static starcat_status set_prior(const sc_call *call, const real q[4], real uncertainty_rad,
+static starcat_status set_prior(const starcat_call *call, const real q[4], real uncertainty_rad,
                                 prior *p) {
-  const sc_camera *camera = &call->camera;
-  const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-  real unit[4];
-  if (!(square - square == R(0.0)) || !(uncertainty_rad - uncertainty_rad == R(0.0))) {
+  const starcat_optics *camera = &call->camera;
+  real unit[4], square = R(0.0);
+  if (!starcat_are_finite(q, 4) || !starcat_are_finite(&uncertainty_rad, 1)) {
     return STARCAT_E_NOT_FINITE;
   }
-  if (!(square > R(0.0)) || !(uncertainty_rad > R(0.0)) || (uncertainty_rad > WIDEST_PRIOR_RAD)) {
+  for (uint32_t n = 0; n < 4u; n++) {
+    if (starcat_absolute(q[n]) > LARGEST_QUATERNION) {
+      return STARCAT_E_OPTIONS;
+    }
+    square += q[n] * q[n];
+  }
+  if (!(square > LEAST_OF_QUATERNION) || !(uncertainty_rad > R(0.0)) ||
+      (uncertainty_rad > WIDEST_PRIOR_RAD)) {
     return STARCAT_E_OPTIONS;
   }
   for (uint32_t n = 0; n < 4u; n++) {
     unit[n] = q[n] / STARCAT_SQRT(square);
   }
-  sc_matrix(unit, p->matrix);
+  starcat_matrix(unit, p->matrix);
   const real c = STARCAT_COS(uncertainty_rad), s = STARCAT_SIN(uncertainty_rad);
   p->cos_radius = camera->cos_radius * c - camera->sin_radius * s;
   p->sin_radius = camera->sin_radius * c + camera->cos_radius * s;
-  if (!(p->cos_radius > R(0.0))) {
+  if (!(p->cos_radius > STARCAT_LEAST_COSINE)) {
     return STARCAT_E_OPTIONS;
   }
   const real stretch = R(1.0) / (p->cos_radius * p->cos_radius);
@@ -58,15 +67,15 @@ static starcat_status set_prior(const sc_call *call, const real q[4], real uncer
 
 /* Put the stars around the prior's frame where the prior predicts them. Returns 0 if they are too
  * many, or the budget is used up. */
-static int predict(const sc_call *call, prior *p) {
+static int predict(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
-    w->n_near = sc_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
-                          w->near_row, w->near_icrs);
-    if ((w->n_near > STARCAT_MAX_STARS) || !sc_spend(w, w->n_near)) {
+    w->n_near = starcat_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
+                               w->near_row, w->near_icrs);
+    if ((w->n_near > STARCAT_MAX_STARS) || !starcat_spend(w, w->n_near)) {
       return 0;
     }
-    sc_project(call, p->matrix, p->shift_px);
+    starcat_project(call, p->matrix, p->shift_px);
     p->is_stale = 0;
   }
   return 1;
@@ -78,14 +87,14 @@ static real square_from(const starcat_workspace *w, uint32_t star, real x, real 
 }
 
 /* The star predicted next farther from a centroid than `past`; -1 if none is within the slack. */
-static int32_t next_star(const sc_call *call, const prior *p, uint32_t centroid, real *past) {
+static int32_t next_star(const starcat_call *call, const prior *p, uint32_t centroid, real *past) {
   const starcat_workspace *w = call->work;
   real least = p->shift_px * p->shift_px;
   int32_t found = -1;
   for (uint32_t k = 0; k < w->n_within; k++) {
     const real square = square_from(w, k, w->x[centroid], w->y[centroid]);
     if ((square > *past) && (square <= least) &&
-        sc_compatible(call, centroid, w->near_row[w->within[k]])) {
+        starcat_compatible(call, centroid, w->near_row[w->within[k]])) {
       least = square;
       found = (int32_t)k;
     }
@@ -110,11 +119,12 @@ static uint32_t farthest(const starcat_workspace *w, uint32_t from) {
 
 /* If centroid a is a star, verify the attitude in which centroid b is the star nearest to where it
  * then has to be. Returns 1 if the search can end. */
-static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t b) {
+static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uint32_t b) {
   starcat_workspace *w = call->work;
-  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
-  const real apart = sc_angle_of_chord(sc_chord_square(w->body[a], w->body[b]));
-  const real low = sc_chord_of_angle(apart - error), high = sc_chord_of_angle(apart + error);
+  const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
+  const real apart = starcat_angle_of_chord(starcat_chord_square(w->body[a], w->body[b]));
+  const real low = starcat_chord_of_angle(apart - error),
+             high = starcat_chord_of_angle(apart + error);
   const real dx = w->x[b] - w->x[a], dy = w->y[b] - w->y[a];
   const real slack = R(2.0) * call->reach_px + p->turn * STARCAT_SQRT(dx * dx + dy * dy);
   const real *first = w->near_icrs[w->within[star]];
@@ -123,14 +133,14 @@ static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t
   for (uint32_t k = 0; k < w->n_within; k++) {
     const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
     if (square <= least) {
-      const real chord = sc_chord_square(first, w->near_icrs[w->within[k]]);
+      const real chord = starcat_chord_square(first, w->near_icrs[w->within[k]]);
       if ((chord >= low * low) && (chord <= high * high)) {
         least = square;
         partner = (int32_t)k;
       }
     }
   }
-  if (!sc_spend(w, w->n_within + 1u)) {
+  if (!starcat_spend(w, w->n_within + 1u)) {
     return 1;
   }
   if (partner < 0) {
@@ -143,22 +153,22 @@ static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t
     icrs[0][k] = first[k];
     icrs[1][k] = w->near_icrs[w->within[partner]][k];
   }
-  if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+  if (!starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
+  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
   p->is_stale = 1;
-  return sc_try(call, m, R(1.0));
+  return starcat_try(call, m, R(1.0));
 }
 
 /* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if
  * the search can end. */
-static int try_anchor(sc_call *call, prior *p, uint32_t a, uint32_t b) {
+static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
   starcat_workspace *w = call->work;
   real past = R(-1.0);
   int32_t star = 0;
   while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
-    if (!predict(call, p) || !sc_spend(w, w->n_within + 1u)) {
+    if (!predict(call, p) || !starcat_spend(w, w->n_within + 1u)) {
       return 1;
     }
     star = next_star(call, p, a, &past);
@@ -173,12 +183,12 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,
                              starcat_workspace *work, starcat_result *result) {
-  sc_call call;
+  starcat_call call;
   prior p;
   if (q_prior == NULL) {
     return STARCAT_E_NULL;
   }
-  starcat_status status = sc_begin(&call, image, camera, options, frame, work, result);
+  starcat_status status = starcat_begin(&call, image, camera, options, frame, work, result);
   if (status == STARCAT_IDENTIFIED) {
     status = set_prior(&call, q_prior, uncertainty_rad, &p);
   }
@@ -195,5 +205,5 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
       break;
     }
   }
-  return sc_end(&call, options, result);
+  return starcat_end(&call, options, result);
 }

@@ -12,10 +12,13 @@
 #define MANIFEST_AT 128u
 #define NAME_AT 160u
 #define OWN_AT 4092u
+#define MOST_EXPONENT (1023u + 40u)
+#define OUT_OF_RANGE R(1e13)
 
 enum { DIRECTIONS = 1, MAGNITUDES, STAR_IDS, GRID, KVECTOR, TRIANGLES, RADII, PAIRS };
 
 const char *starcat_version(void) { return STARCAT_VERSION; }
+uint32_t starcat_version_number(void) { return STARCAT_VERSION_NUMBER; }
 
 static uint16_t u16_at(const uint8_t *bytes, size_t offset) {
   return *(const uint16_t *)(const void *)(bytes + offset);
@@ -25,7 +28,12 @@ static uint32_t u32_at(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
+/* A number; a large one where its exponent is none that an image can have, which may not fit. */
 static real f64_at(const uint8_t *bytes, size_t offset) {
+  const uint64_t bits = *(const uint64_t *)(const void *)(bytes + offset);
+  if ((bits >> 52 & 0x7ffu) > MOST_EXPONENT) {
+    return OUT_OF_RANGE;
+  }
   return (real) * (const double *)(const void *)(bytes + offset);
 }
 
@@ -47,14 +55,14 @@ static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
 /* Check what stands in the first bytes, so that sizes can be believed. */
 static starcat_status check_start(const void *bytes, size_t size) {
   const uint8_t *image = bytes;
-  const char magic[8] = SC_MAGIC;
+  const char magic[8] = STARCAT_MAGIC;
   if (bytes == NULL) {
     return STARCAT_E_NULL;
   }
   if (((uintptr_t)bytes & 7u) != 0u) {
     return STARCAT_E_ALIGNMENT;
   }
-  if (size < SC_HEADER_BYTES) {
+  if (size < STARCAT_HEADER_BYTES) {
     return STARCAT_E_SHORT;
   }
   for (uint32_t n = 0; n < 8u; n++) {
@@ -62,20 +70,20 @@ static starcat_status check_start(const void *bytes, size_t size) {
       return STARCAT_E_MAGIC;
     }
   }
-  if (u32_at(image, 8) != SC_BYTE_ORDER) {
-    return u32_at(image, 8) == SC_BYTE_ORDER_SWAPPED ? STARCAT_E_BYTE_ORDER : STARCAT_E_MAGIC;
+  if (u32_at(image, 8) != STARCAT_BYTE_ORDER) {
+    return u32_at(image, 8) == STARCAT_BYTE_ORDER_SWAPPED ? STARCAT_E_BYTE_ORDER : STARCAT_E_MAGIC;
   }
-  if (u16_at(image, 12) != SC_VERSION_MAJOR) {
+  if (u16_at(image, 12) != STARCAT_FORMAT_MAJOR) {
     return STARCAT_E_VERSION;
   }
   const uint32_t total = u32_at(image, 20), data = u32_at(image, 24);
   if (size < total) {
     return STARCAT_E_SHORT;
   }
-  const uint32_t blocks = data / SC_BLOCK_BYTES;
-  const uint32_t checks = (blocks + SC_CRCS_OF_BLOCK - 1u) / SC_CRCS_OF_BLOCK;
-  if ((u32_at(image, 16) != SC_HEADER_BYTES) || (data % SC_BLOCK_BYTES != 0u) || (data == 0u) ||
-      (total < data) || (total - data != checks * SC_BLOCK_BYTES)) {
+  const uint32_t blocks = data / STARCAT_BLOCK_BYTES;
+  const uint32_t checks = (blocks + STARCAT_CRCS_OF_BLOCK - 1u) / STARCAT_CRCS_OF_BLOCK;
+  if ((u32_at(image, 16) != STARCAT_HEADER_BYTES) || (data % STARCAT_BLOCK_BYTES != 0u) ||
+      (data == 0u) || (total < data) || (total - data != checks * STARCAT_BLOCK_BYTES)) {
     return STARCAT_E_LAYOUT;
   }
   return STARCAT_IDENTIFIED;
@@ -87,15 +95,16 @@ static int is_sound(const uint8_t *block) {
 }
 
 static int block_is_sound(const uint8_t *image, uint32_t data, uint32_t block) {
-  const uint32_t blocks = data / SC_BLOCK_BYTES;
-  const uint8_t *at = image + (size_t)block * SC_BLOCK_BYTES;
+  const uint32_t blocks = data / STARCAT_BLOCK_BYTES;
+  const uint8_t *at = image + (size_t)block * STARCAT_BLOCK_BYTES;
   if (block >= blocks) {
     return is_sound(at);
   }
-  const uint8_t *check = image + data + (size_t)(block / SC_CRCS_OF_BLOCK) * SC_BLOCK_BYTES;
+  const uint8_t *check =
+      image + data + (size_t)(block / STARCAT_CRCS_OF_BLOCK) * STARCAT_BLOCK_BYTES;
   /* Where the check block itself is damaged it is the one to be named, not this one. */
-  return (crc32(0, at, SC_BLOCK_BYTES) ==
-          u32_at(check, 4u * (size_t)(block % SC_CRCS_OF_BLOCK))) ||
+  return (crc32(0, at, STARCAT_BLOCK_BYTES) ==
+          u32_at(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK))) ||
          !is_sound(check);
 }
 
@@ -111,7 +120,7 @@ starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uin
     return status;
   }
   const uint32_t data = u32_at(image, 24);
-  const uint32_t blocks = u32_at(image, 20) / SC_BLOCK_BYTES;
+  const uint32_t blocks = u32_at(image, 20) / STARCAT_BLOCK_BYTES;
   const uint32_t end = (count == 0u) || (count > blocks - (first < blocks ? first : blocks))
                            ? blocks
                            : first + count;
@@ -143,7 +152,7 @@ static int find_sections(const uint8_t *image, uint32_t data, sections *found) {
     const size_t entry = SECTION_TABLE + 16u * (size_t)n;
     const uint32_t kind = u32_at(image, entry), offset = u32_at(image, entry + 4u);
     const uint32_t bytes = u32_at(image, entry + 8u);
-    if ((offset % SECTION_ALIGNMENT != 0u) || (offset < SC_HEADER_BYTES) || (offset > data) ||
+    if ((offset % SECTION_ALIGNMENT != 0u) || (offset < STARCAT_HEADER_BYTES) || (offset > data) ||
         (bytes > data - offset)) {
       return 0;
     }
@@ -165,11 +174,13 @@ static int is_complete(const starcat_image *image, const sections *found) {
   const int common = has(found, DIRECTIONS, stars, 12) && has(found, MAGNITUDES, stars, 2) &&
                      has(found, STAR_IDS, stars, 8) && has(found, GRID, cells, 4) &&
                      has(found, KVECTOR, image->n_kvector, 4);
-  if (image->method == SC_TRIANGLE) {
+  if (image->method == STARCAT_TRIANGLE) {
     return common && has(found, TRIANGLES, image->n_features, 3u * index) &&
-           has(found, RADII, image->n_features, 2) && (image->radius_quantum_rad > R(0.0));
+           has(found, RADII, image->n_features, 2) &&
+           starcat_is_between(image->radius_quantum_rad, R(1e-15), R(1e6));
   }
-  return common && (image->method == SC_PYRAMID) && has(found, PAIRS, image->n_features, 2u * index);
+  return common && (image->method == STARCAT_PYRAMID) &&
+         has(found, PAIRS, image->n_features, 2u * index);
 }
 
 static void read_numbers(const uint8_t *bytes, starcat_image *image) {
@@ -201,8 +212,8 @@ static starcat_status check_numbers(const starcat_image *image) {
   }
   if ((image->grid_bands == 0u) || (image->grid_sectors == 0u) || (image->n_kvector < 2u) ||
       (image->grid_bands > 65535u) || (image->grid_sectors > 65535u) ||
-      !(image->kvector_slope > R(0.0)) || !(image->kvector_slope < R(1e6)) ||
-      !(image->kvector_intercept > R(-1e6)) || !(image->kvector_intercept < R(1e6))) {
+      !starcat_is_between(image->kvector_slope, R(1e-25), R(1e6)) ||
+      !starcat_is_between(image->kvector_intercept, R(-1e6), R(1e6))) {
     return STARCAT_E_LAYOUT;
   }
   return u32_at(image->bytes, 56) > STARCAT_MAX_STARS ? STARCAT_E_CAPACITY : STARCAT_IDENTIFIED;
@@ -234,7 +245,7 @@ starcat_status starcat_open(starcat_image *image, const void *bytes, size_t size
   image->star_ids = (const int64_t *)(const void *)found.at[STAR_IDS];
   image->grid = (const uint32_t *)(const void *)found.at[GRID];
   image->kvector = (const uint32_t *)(const void *)found.at[KVECTOR];
-  image->features = found.at[image->method == SC_TRIANGLE ? TRIANGLES : PAIRS];
+  image->features = found.at[image->method == STARCAT_TRIANGLE ? TRIANGLES : PAIRS];
   image->radii = (const uint16_t *)(const void *)found.at[RADII];
   return STARCAT_IDENTIFIED;
 }

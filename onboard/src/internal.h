@@ -7,49 +7,67 @@
 
 #include "vectors.h"
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0))
+#error "compile starcat without -ffast-math: centroids that are not numbers would not be found"
+#endif
+
 /* Image format, docs/onboard-format.md. */
-#define SC_MAGIC "STARCAT"
-#define SC_VERSION_MAJOR 1u
-#define SC_BYTE_ORDER 0x01020304u
-#define SC_BYTE_ORDER_SWAPPED 0x04030201u
-#define SC_HEADER_BYTES 512u
-#define SC_BLOCK_BYTES 4096u
-#define SC_CRCS_OF_BLOCK 1022u
-#define SC_TRIANGLE 1u
-#define SC_PYRAMID 2u
-#define SC_RADIUS_OVERFLOW 65535u
-#define SC_UNIT R(4.656612875245796924105750827168e-10) /* 1 / 2147483647 */
+#define STARCAT_MAGIC "STARCAT"
+#define STARCAT_FORMAT_MAJOR 1u
+#define STARCAT_BYTE_ORDER 0x01020304u
+#define STARCAT_BYTE_ORDER_SWAPPED 0x04030201u
+#define STARCAT_HEADER_BYTES 512u
+#define STARCAT_BLOCK_BYTES 4096u
+#define STARCAT_CRCS_OF_BLOCK 1022u
+#define STARCAT_TRIANGLE 1u
+#define STARCAT_PYRAMID 2u
+#define STARCAT_RADIUS_OVERFLOW 65535u
+#define STARCAT_UNIT R(4.656612875245796924105750827168e-10) /* 1 / 2147483647 */
 
 /* The same rules as the ground's, starcat/matcher/. */
-#define SC_MIN_STARS 4u
-#define SC_MIN_SHARE (R(1.0) / R(3.0))
-#define SC_SURE_SHARE (R(2.0) / R(3.0))
-#define SC_REACH R(1.5)          /* largest distance of a match, in tolerances */
-#define SC_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
-#define SC_SURE_CORNER R(0.5)    /* largest error of a corner that firm stars leave, tolerances */
-#define SC_OTHER_SCALES R(0.05)  /* errors of the focal length that are looked for */
-#define SC_FOCAL_MARGIN R(0.02)  /* of the field's radius, where the focal length is fitted */
-#define SC_OVER_CHANCE R(2.0)    /* of the centroids within a smaller reach, over its area's share */
-#define SC_CURVATURE (R(2.0) / R(3.0))
-#define SC_REFINEMENTS 4u
-#define SC_LOG_ROUNDING R(1e-4)   /* logarithms of chances that differ by less are the same */
-#define SC_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
-#define SC_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
-#define SC_SCALE_DEVIATIONS R(3.0)
-#define SC_SIGMAS_OF_TOLERANCE R(3.0)
-#define SC_MAG_DEVIATIONS R(3.5)
-#define SC_MIN_SIDE_PX R(10.0)
-#define SC_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
-#define SC_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
-#define SC_FEW_CENTROIDS 12u
-/* Least weight of a centroid over the largest, which rounding still leaves room for. */
+#define STARCAT_MIN_STARS 4u
+#define STARCAT_MIN_SHARE (R(1.0) / R(3.0))
+#define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
+#define STARCAT_REACH R(1.5)          /* largest distance of a match, in tolerances */
+#define STARCAT_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
+#define STARCAT_SURE_CORNER R(0.5)    /* largest error of a corner of firm stars, in tolerances */
+#define STARCAT_OTHER_SCALES R(0.05)  /* errors of the focal length that are looked for */
+#define STARCAT_FOCAL_MARGIN R(0.02)  /* of the field's radius, where the focal length is fitted */
+#define STARCAT_OVER_CHANCE \
+  R(2.0) /* of the centroids within a smaller reach, over its area's share */
+#define STARCAT_CURVATURE (R(2.0) / R(3.0))
+#define STARCAT_REFINEMENTS 4u
+#define STARCAT_LOG_ROUNDING R(1e-4)   /* logarithms of chances that differ by less are the same */
+#define STARCAT_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
+#define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
+#define STARCAT_SCALE_DEVIATIONS R(3.0)
+#define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
+#define STARCAT_MAG_DEVIATIONS R(3.5)
+#define STARCAT_MIN_SIDE_PX R(10.0)
+#define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
+#define STARCAT_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
+#define STARCAT_FEW_CENTROIDS 12u
+#define STARCAT_LEAST_COSINE R(0.01)  /* of the angle from the axis to what a camera sees */
+#define STARCAT_LEAST_PX R(1e-6)      /* of a tolerance or a noise */
+#define STARCAT_LARGEST_PX R(1e6)
+#define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
+/* Least weight of a centroid over the largest, which rounding still leaves room for; least side of
+ * a triangle whose corners rounding still tells apart; numbers below which a determinant is due to
+ * rounding; and the least one that is a number still. */
 #ifdef STARCAT_SINGLE
-#define SC_LEAST_WEIGHT R(1e-4)
+#define STARCAT_LEAST_WEIGHT R(1e-4)
+#define STARCAT_LEAST_SIDE R(1e-6)
+#define STARCAT_LEAST_DETERMINANT R(1e-12)
+#define STARCAT_LEAST_NUMBER R(1e-37)
 #else
-#define SC_LEAST_WEIGHT R(1e-8)
+#define STARCAT_LEAST_WEIGHT R(1e-8)
+#define STARCAT_LEAST_SIDE R(1e-15)
+#define STARCAT_LEAST_DETERMINANT R(1e-60)
+#define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
-#define SC_SPREAD_CENTROIDS 400u /* that make triangles with their neighbours, the first ones */
-#define SC_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
+#define STARCAT_SPREAD_CENTROIDS \
+  400u /* that make triangles with their neighbours, the first ones */
+#define STARCAT_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
 
 /* A camera as a call uses it. */
 typedef struct {
@@ -59,13 +77,13 @@ typedef struct {
   real log_area, log_focal;     /* of the detector, square pixels; of the focal length */
   real corner[4][3];
   int distorted;
-} sc_camera;
+} starcat_optics;
 
 /* One call. Where the focal length is fitted, the camera and the directions of the centroids are
  * those of the attitude that is tried; the rest does not change while it lasts. */
 typedef struct {
   const starcat_image *image;
-  sc_camera camera;
+  starcat_optics camera;
   real (*body)[3];
   real focal, focal_px; /* of the camera over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
@@ -78,7 +96,7 @@ typedef struct {
   real log_certain;
   const real *sigma_px; /* noise of the frame's centroids; null: not stated */
   starcat_workspace *work;
-} sc_call;
+} starcat_call;
 
 /* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles, how the logarithm of the
  * focal length goes with each of them, and its own. */
@@ -86,19 +104,19 @@ typedef struct {
   real angles[6];
   real with_scale[3];
   real scale;
-} sc_information;
+} starcat_information;
 
 /* The direction of a star. */
-static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3]) {
+static inline void starcat_star(const starcat_image *image, uint32_t row, real icrs[3]) {
   const int32_t *direction = image->directions + 3u * (size_t)row;
-  icrs[0] = SC_UNIT * (real)direction[0];
-  icrs[1] = SC_UNIT * (real)direction[1];
-  icrs[2] = SC_UNIT * (real)direction[2];
+  icrs[0] = STARCAT_UNIT * (real)direction[0];
+  icrs[1] = STARCAT_UNIT * (real)direction[1];
+  icrs[2] = STARCAT_UNIT * (real)direction[2];
 }
 
 /* The rows of the stars of a feature. */
-static inline void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
-                              uint32_t rows[3]) {
+static inline void starcat_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
+                                   uint32_t rows[3]) {
   const size_t at = (size_t)feature * width;
   if (image->index_bytes == 2u) {
     const uint16_t *indices = image->features;
@@ -113,63 +131,72 @@ static inline void sc_rows_of(const starcat_image *image, uint32_t feature, uint
   }
 }
 
+/* frame.c */
+int starcat_are_finite(const void *numbers, uint32_t count);
+
 /* attitude.c */
-int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]);
-int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
-int sc_invert(const sc_information *m, sc_information *inverse);
-void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               const real *weight, uint32_t count, uint32_t most);
-void sc_quaternion(const real m[9], real q[4]);
-void sc_matrix(const real q[4], real m[9]);
+int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
+                  real m[9]);
+int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
+int starcat_invert(const starcat_information *m, starcat_information *inverse);
+void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+                    const real *weight, uint32_t count, uint32_t most);
+void starcat_quaternion(const real m[9], real q[4]);
+void starcat_matrix(const real q[4], real m[9]);
 
 /* camera.c */
-starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera);
-void sc_set_focal(sc_call *call, real focal);
-void sc_allow_scales(sc_call *call, real fov_error);
-int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]);
-int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px);
-void sc_turns_of_pixel(const sc_camera *camera, const real body[3], real turn[2][3]);
+starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera);
+void starcat_set_focal(starcat_call *call, real focal);
+void starcat_allow_scales(starcat_call *call, real fov_error);
+int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
+int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);
+void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], real turn[2][3]);
 
 /* sky.c */
-uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real sin_r,
-                   uint32_t most, uint32_t *rows, real (*icrs)[3]);
+uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
+                        uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
-real sc_log_factorial(uint32_t n);
-real sc_exponential(real x);
-void sc_count_ways(const sc_call *call, uint32_t most);
-real sc_log_ways(const sc_call *call, uint32_t n);
+real starcat_log_factorial(uint32_t n);
+real starcat_exponential(real x);
+void starcat_count_ways(const starcat_call *call, uint32_t most);
+real starcat_log_ways(const starcat_call *call, uint32_t n);
 
 /* chance.c */
-real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);
-void sc_inform(sc_information *h, const real b[3]);
-void sc_weigh(const sc_call *call, const real m[9], real tolerance_rad, starcat_agreement *found);
-int sc_is_scaled(const sc_call *call, uint32_t n_matched, real tolerance_px);
+real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched);
+void starcat_inform(starcat_information *h, const real b[3]);
+void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad,
+                   starcat_agreement *found);
+int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
-int sc_spend(starcat_workspace *work, uint32_t steps);
-int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row);
-int sc_try(sc_call *call, const real m[9], real focal);
-void sc_project(const sc_call *call, const real m[9], real margin_px);
-void sc_list_columns(sc_call *call);
+int starcat_spend(starcat_workspace *work, uint32_t steps);
+int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
+int starcat_try(starcat_call *call, const real m[9], real focal);
+void starcat_project(const starcat_call *call, const real m[9], real margin_px);
+void starcat_list_columns(starcat_call *call);
 
 /* frame.c */
-starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
-                        const starcat_options *options, const starcat_frame *frame,
-                        starcat_workspace *work, starcat_result *result);
+starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+                             const starcat_camera *camera, const starcat_options *options,
+                             const starcat_frame *frame, starcat_workspace *work,
+                             starcat_result *result);
 
 /* answer.c */
-void sc_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                   starcat_workspace *work, starcat_result *result);
-starcat_status sc_end(sc_call *call, const starcat_options *options, starcat_result *result);
+#ifdef STARCAT_GROUND /* of Python, which knows directions before they were rounded */
+void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
+                        starcat_workspace *work, starcat_result *result);
+#endif
+starcat_status starcat_end(starcat_call *call, const starcat_options *options,
+                           starcat_result *result);
 
 /* triangles.c, pyramids.c */
-typedef int (*sc_look_up)(sc_call *call, const uint32_t triple[3], const real sides[3]);
-real sc_side(const sc_call *call, uint32_t i, uint32_t j);
-void sc_each_triangle(sc_call *call, sc_look_up look_up);
-void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
-                     uint32_t *stop);
-int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]);
-int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]);
+typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], const real sides[3]);
+real starcat_side(const starcat_call *call, uint32_t i, uint32_t j);
+void starcat_each_triangle(starcat_call *call, starcat_look_up look_up);
+void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+                          uint32_t *stop);
+int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
+int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 
 #endif

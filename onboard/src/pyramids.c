@@ -23,7 +23,7 @@ typedef struct {
 } base;
 
 /* Choose the side with the fewest pairs. Returns 0 if a side is longer than any pair. */
-static int choose_side(const sc_call *call, const uint32_t triple[3], const real sides[3],
+static int choose_side(const starcat_call *call, const uint32_t triple[3], const real sides[3],
                        real error, base *o) {
   const starcat_image *image = call->image;
   o->start = 0;
@@ -36,7 +36,7 @@ static int choose_side(const sc_call *call, const uint32_t triple[3], const real
     if (sides[n] - error > image->longest_rad) {
       continue;
     }
-    sc_rows_between(image, sides[n] - error, sides[n] + error, &start, &stop);
+    starcat_rows_between(image, sides[n] - error, sides[n] + error, &start, &stop);
     if (start > stop) {
       stop = start;
     }
@@ -51,21 +51,22 @@ static int choose_side(const sc_call *call, const uint32_t triple[3], const real
   return o->stop != UINT32_MAX;
 }
 
-static void describe(const sc_call *call, const real side[3], real error, base *o) {
+static void describe(const starcat_call *call, const real side[3], real error, base *o) {
   const starcat_workspace *w = call->work;
   real normal[3];
   const real *a = w->body[o->corner[0]], *b = w->body[o->corner[1]], *c = w->body[o->corner[2]];
   for (uint32_t n = 0; n < 3u; n++) {
-    const real low = sc_chord_of_angle(side[n] - error), high = sc_chord_of_angle(side[n] + error);
+    const real low = starcat_chord_of_angle(side[n] - error),
+               high = starcat_chord_of_angle(side[n] + error);
     o->low[n] = low * low;
     o->high[n] = high * high;
   }
-  sc_cross(a, b, normal);
-  const real square = sc_dot(normal, normal), ab = sc_dot(a, b);
-  const real ac = sc_dot(a, c), bc = sc_dot(b, c);
+  starcat_cross(a, b, normal);
+  const real square = starcat_dot(normal, normal), ab = starcat_dot(a, b);
+  const real ac = starcat_dot(a, c), bc = starcat_dot(b, c);
   o->sum[0] = (ac - ab * bc) / square;
   o->sum[1] = (bc - ab * ac) / square;
-  o->sum[2] = sc_dot(normal, c) / square;
+  o->sum[2] = starcat_dot(normal, c) / square;
   /* An error of the first side turns and shifts the third corner by a few of its own size, the
    * more the longer the other sides are. */
   const real longest = side[1] > side[2] ? side[1] : side[2];
@@ -87,24 +88,24 @@ static void mark_partners(const starcat_image *image, const uint32_t range[2],
     partners[n] = 0;
   }
   for (uint32_t pair = range[0]; pair < range[1]; pair++) {
-    sc_rows_of(image, pair, 2, rows);
+    starcat_rows_of(image, pair, 2, rows);
     partners[rows[0] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[1]) << (rows[0] % 32u);
     partners[rows[1] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[0]) << (rows[1] % 32u);
   }
 }
 
 /* Mark the stars that the first two corners may be. They are in pairs as far apart as the two are;
- * the third is in pairs of the other sides with such stars, and the first two are with such a third.
- * A side longer than all pairs says nothing. Stars whose rows differ by a multiple of the marks share
- * one. Returns 0 if the steps are used up. */
-static int mark_corners(const sc_call *call, base *o, const real side[3], real error) {
+ * the third is in pairs of the other sides with such stars, and the first two are with such a
+ * third. A side longer than all pairs says nothing. Stars whose rows differ by a multiple of the
+ * marks share one. Returns 0 if the steps are used up. */
+static int mark_corners(const starcat_call *call, base *o, const real side[3], real error) {
   const starcat_image *image = call->image;
   starcat_workspace *w = call->work;
   uint32_t range[3][2] = {{o->start, o->stop}, {0, 0}, {0, 0}}, count = 0;
   for (uint32_t n = 1; n < 3u; n++) {
     const real low = side[n] - MARGIN * error, high = side[n] + MARGIN * error;
     if (high <= image->longest_rad) {
-      sc_rows_between(image, low, high, range[n], range[n] + 1);
+      starcat_rows_between(image, low, high, range[n], range[n] + 1);
       count += range[n][1] > range[n][0] ? range[n][1] - range[n][0] : 0u;
     }
   }
@@ -127,29 +128,29 @@ static int mark_corners(const sc_call *call, base *o, const real side[3], real e
       w->third[k] &= w->corner[own][k];
     }
   }
-  return sc_spend(w, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS);
+  return starcat_spend(w, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS);
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */
-static int complete(sc_call *call, const base *o, const real first[3], const real second[3]) {
+static int complete(starcat_call *call, const base *o, const real first[3], const real second[3]) {
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
-  if (!sc_spend(call->work, STEPS_OF_THIRD)) {
+  if (!starcat_spend(call->work, STEPS_OF_THIRD)) {
     return 1;
   }
-  sc_cross(first, second, normal);
+  starcat_cross(first, second, normal);
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] = o->sum[0] * first[k] + o->sum[1] * second[k] + o->sum[2] * normal[k];
     for (uint32_t n = 0; n < 3u; n++) {
       body[n][k] = w->body[o->corner[n]][k];
     }
   }
-  const real scale = R(1.0) / STARCAT_SQRT(sc_dot(third, third));
+  const real scale = R(1.0) / STARCAT_SQRT(starcat_larger(starcat_dot(third, third), R(1e-6)));
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] *= scale;
   }
-  uint32_t count = sc_gather(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
+  uint32_t count = starcat_gather(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
   if (w->steps_left == 0u) {
     return 1;
   }
@@ -160,11 +161,11 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
     const real icrs[3][3] = {{first[0], first[1], first[2]},
                              {second[0], second[1], second[2]},
                              {found[n][0], found[n][1], found[n][2]}};
-    if (sc_is_between(sc_chord_square(first, found[n]), o->low[1], o->high[1]) &&
-        sc_is_between(sc_chord_square(second, found[n]), o->low[2], o->high[2]) &&
-        sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-      sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-      if (sc_try(call, m, R(1.0)) != 0) {
+    if (starcat_is_between(starcat_chord_square(first, found[n]), o->low[1], o->high[1]) &&
+        starcat_is_between(starcat_chord_square(second, found[n]), o->low[2], o->high[2]) &&
+        starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+      starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
+      if (starcat_try(call, m, R(1.0)) != 0) {
         return 1;
       }
     }
@@ -174,7 +175,7 @@ static int complete(sc_call *call, const base *o, const real first[3], const rea
 
 /* Complete a pair by a third star in both orders that its stars may have. Returns 1 if the search
  * can end. */
-static int try_stars(sc_call *call, const base *o, const uint32_t rows[2]) {
+static int try_stars(starcat_call *call, const base *o, const uint32_t rows[2]) {
   const starcat_workspace *w = call->work;
   uint32_t may[2] = {1, 1};
   real star[2][3];
@@ -184,9 +185,9 @@ static int try_stars(sc_call *call, const base *o, const uint32_t rows[2]) {
   if ((may[0] | may[1]) == 0u) {
     return 0;
   }
-  sc_star(call->image, rows[0], star[0]);
-  sc_star(call->image, rows[1], star[1]);
-  if (!sc_is_between(sc_chord_square(star[0], star[1]), o->low[0], o->high[0])) {
+  starcat_star(call->image, rows[0], star[0]);
+  starcat_star(call->image, rows[1], star[1]);
+  if (!starcat_is_between(starcat_chord_square(star[0], star[1]), o->low[0], o->high[0])) {
     return 0;
   }
   for (uint32_t n = 0; n < 2u; n++) {
@@ -197,26 +198,26 @@ static int try_stars(sc_call *call, const base *o, const uint32_t rows[2]) {
   return 0;
 }
 
-int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]) {
+int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   const starcat_image *image = call->image;
-  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
+  const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   base o;
   if (!choose_side(call, triple, sides, error, &o)) {
     return 0;
   }
-  const real side[3] = {sc_side(call, o.corner[0], o.corner[1]),
-                        sc_side(call, o.corner[0], o.corner[2]),
-                        sc_side(call, o.corner[1], o.corner[2])};
+  const real side[3] = {starcat_side(call, o.corner[0], o.corner[1]),
+                        starcat_side(call, o.corner[0], o.corner[2]),
+                        starcat_side(call, o.corner[1], o.corner[2])};
   describe(call, side, error, &o);
   if (!mark_corners(call, &o, side, error)) {
     return 1;
   }
   for (uint32_t pair = o.start; pair < o.stop; pair++) {
     uint32_t rows[3];
-    if (!sc_spend(call->work, 1)) {
+    if (!starcat_spend(call->work, 1)) {
       return 1;
     }
-    sc_rows_of(image, pair, 2, rows);
+    starcat_rows_of(image, pair, 2, rows);
     if ((rows[0] < image->n_stars) && (rows[1] < image->n_stars) && /* else a damaged image */
         try_stars(call, &o, rows)) {
       return 1;

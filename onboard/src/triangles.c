@@ -12,16 +12,18 @@
 
 /* Factors of a bound that rounding shall not make narrower. */
 #ifdef STARCAT_SINGLE
+#define LEAST_CHORD R(1e-12) /* square of the longest of a triangle of stars */
 #define BELOW R(0.99999)
 #define ABOVE R(1.00001)
 #else
+#define LEAST_CHORD R(1e-28)
 #define BELOW R(0.999999999)
 #define ABOVE R(1.000000001)
 #endif
 
 /* What the triangles of one frame are tried with. */
 typedef struct {
-  sc_look_up look_up;
+  starcat_look_up look_up;
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
   int poor; /* in the second round, those that the first has left out */
@@ -32,9 +34,9 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
   return i < j ? j * (j - 1u) / 2u + i : i * (i - 1u) / 2u + j;
 }
 
-real sc_side(const sc_call *call, uint32_t i, uint32_t j) {
+real starcat_side(const starcat_call *call, uint32_t i, uint32_t j) {
   const starcat_workspace *w = call->work;
-  return w->is_crowded != 0u ? sc_angle_of_chord(sc_chord_square(w->body[i], w->body[j]))
+  return w->is_crowded != 0u ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
                              : w->separation_rad[pair_of(i, j)];
 }
 
@@ -57,17 +59,18 @@ static int is_well_shaped(const real sides[3], real least, real cosine) {
 }
 
 /* Look a triangle up if it is of this round. Returns 1 if the search can end. */
-static int take(sc_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
+static int take(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
   const uint32_t triple[3] = {i, j, k};
-  const real sides[3] = {sc_side(call, j, k), sc_side(call, i, k), sc_side(call, i, j)};
-  const int good = is_well_shaped(sides, s->least_side_rad, SC_COS_MIN_ANGLE);
-  if (!sc_spend(call->work, 1)) {
+  const real sides[3] = {starcat_side(call, j, k), starcat_side(call, i, k),
+                         starcat_side(call, i, j)};
+  const int good = is_well_shaped(sides, s->least_side_rad, STARCAT_COS_MIN_ANGLE);
+  if (!starcat_spend(call->work, 1)) {
     return 1;
   }
   if ((s->poor != 0) == (good != 0)) {
     return 0;
   }
-  if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, SC_COS_LEAST_ANGLE)) {
+  if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, STARCAT_COS_LEAST_ANGLE)) {
     return 0;
   }
   if (s->left == 0u) {
@@ -78,15 +81,16 @@ static int take(sc_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
 }
 
 /* Separations of a centroid from all earlier ones. */
-static void separate(sc_call *call, uint32_t k) {
+static void separate(starcat_call *call, uint32_t k) {
   starcat_workspace *w = call->work;
   for (uint32_t i = 0; i < k; i++) {
-    w->separation_rad[pair_of(i, k)] = sc_angle_of_chord(sc_chord_square(w->body[i], w->body[k]));
+    w->separation_rad[pair_of(i, k)] =
+        starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[k]));
   }
 }
 
 /* Triangles by brightness: those whose faintest centroid is the brightest come first. */
-static int by_brightness(sc_call *call, search *s) {
+static int by_brightness(starcat_call *call, search *s) {
   for (uint32_t k = 0; k < s->count; k++) {
     if (s->poor == 0) {
       separate(call, k);
@@ -127,7 +131,7 @@ static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
 }
 
 /* All triangles whose longest side is that of a pair. */
-static int with_longest_side(sc_call *call, search *s, uint16_t pair) {
+static int with_longest_side(starcat_call *call, search *s, uint16_t pair) {
   const starcat_workspace *w = call->work;
   uint32_t q = 1;
   while ((q + 1u) * q / 2u <= pair) {
@@ -148,7 +152,7 @@ static int with_longest_side(sc_call *call, search *s, uint16_t pair) {
 
 /* Triangles by their longest side, the shortest first: the most fields hold these whole. The
  * pairs are sorted no further than they are needed. */
-static int by_longest_side(sc_call *call, search *s) {
+static int by_longest_side(starcat_call *call, search *s) {
   starcat_workspace *w = call->work;
   uint32_t count = s->count * (s->count - 1u) / 2u;
   if (s->poor == 0) {
@@ -162,7 +166,7 @@ static int by_longest_side(sc_call *call, search *s) {
   for (uint32_t n = count / 2u; n > 0u; n--) {
     sift(w, n - 1u, count);
   }
-  if (!sc_spend(w, 2u * count)) {
+  if (!starcat_spend(w, 2u * count)) {
     return 1;
   }
   while (count > 0u) {
@@ -178,12 +182,12 @@ static int by_longest_side(sc_call *call, search *s) {
 }
 
 /* List the nearest centroids of one, the nearest first. Returns how many. */
-static uint32_t list_neighbours(sc_call *call, uint32_t i, uint32_t count) {
+static uint32_t list_neighbours(starcat_call *call, uint32_t i, uint32_t count) {
   starcat_workspace *w = call->work;
   real square[STARCAT_NEIGHBOURS];
   uint32_t n = 0;
   for (uint32_t k = 0; k < count; k++) {
-    const real apart = sc_chord_square(w->body[i], w->body[k]);
+    const real apart = starcat_chord_square(w->body[i], w->body[k]);
     if ((k == i) || ((n == STARCAT_NEIGHBOURS) && !(apart < square[n - 1u]))) {
       continue;
     }
@@ -222,12 +226,12 @@ static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, ui
  * neighbours, then of every centroid the first and third nearest, the second and third, and so on.
  * A database holds the triangles of the brightest stars of its fields; in one place of a crowded
  * frame most are of the same few stars. */
-static int by_neighbours(sc_call *call, search *s) {
+static int by_neighbours(starcat_call *call, search *s) {
   const starcat_workspace *w = call->work;
   uint32_t most = 0;
   for (uint32_t i = 0; i < s->count; i++) {
     most = list_neighbours(call, i, s->count);
-    if (!sc_spend(call->work, s->count)) {
+    if (!starcat_spend(call->work, s->count)) {
       return 1;
     }
   }
@@ -248,20 +252,21 @@ static int by_neighbours(sc_call *call, search *s) {
   return 0;
 }
 
-void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
   starcat_workspace *w = call->work;
-  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0, SC_MOST_TRIANGLES};
-  s.least_side_rad = SC_MIN_SIDE_PX / call->focal_px;
+  search s = {look_up, w->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
+  s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
+  s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   w->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (w->has_magnitudes == 0u);
   if (w->is_crowded != 0u) {
-    s.count = s.count < SC_SPREAD_CENTROIDS ? s.count : SC_SPREAD_CENTROIDS;
+    s.count = s.count < STARCAT_SPREAD_CENTROIDS ? s.count : STARCAT_SPREAD_CENTROIDS;
     (void)by_neighbours(call, &s);
     return;
   }
   if (s.count > STARCAT_MOST_CENTROIDS) {
     s.count = STARCAT_MOST_CENTROIDS;
   }
-  const uint32_t rounds = s.count <= SC_FEW_CENTROIDS ? 2u : 1u;
+  const uint32_t rounds = s.count <= STARCAT_FEW_CENTROIDS ? 2u : 1u;
   for (uint32_t n = 0; n < rounds; n++) {
     s.poor = n > 0u;
     if ((w->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) != 0) {
@@ -271,8 +276,8 @@ void sc_each_triangle(sc_call *call, sc_look_up look_up) {
 }
 
 /* The rows of the features whose value is between two numbers, and few others. */
-void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
-                     uint32_t *stop) {
+void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+                          uint32_t *stop) {
   const real end = (real)(image->n_kvector - 1u);
   const real first = (low - image->kvector_intercept) / image->kvector_slope - R(0.001);
   const real last = (high - image->kvector_intercept) / image->kvector_slope + R(1.001);
@@ -296,48 +301,46 @@ typedef struct {
   real least[3], most[3]; /* the same by length, the shortest first */
   real sides[3], error, slack; /* of the sides; of the scale */
   int is_right_handed;
-} observed;
-
-static real shorter(real a, real b) { return a < b ? a : b; }
-static real longer(real a, real b) { return a > b ? a : b; }
+} sought;
 
 /* Put three numbers in order. */
 static void sort(real v[3]) {
-  const real less = shorter(v[0], v[1]), more = longer(v[0], v[1]), other = v[2];
-  v[0] = shorter(less, other);
-  v[1] = longer(less, shorter(more, other));
-  v[2] = longer(more, other);
+  const real less = starcat_smaller(v[0], v[1]), more = starcat_larger(v[0], v[1]), other = v[2];
+  v[0] = starcat_smaller(less, other);
+  v[1] = starcat_larger(less, starcat_smaller(more, other));
+  v[2] = starcat_larger(more, other);
 }
 
 /* What the chords may be where the scale is not known: the square of the longest, and those of the
- * others over it. If sides fit in any order they do by length, with the largest of the errors; and a
- * chord is shorter than its angle, the more so the longer it is. */
-static void bound_shape(const sc_call *call, observed *o) {
+ * others over it. If sides fit in any order they do by length, with the largest of the errors; and
+ * a chord is shorter than its angle, the more so the longer it is. */
+static void bound_shape(const starcat_call *call, sought *o) {
   const real shortest = R(1.0) - call->fov_error;
   real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
   sort(a);
   const real error = o->error + call->bend * a[2], narrowest = shortest - o->slack;
   const real angle = narrowest > R(0.01) ? (a[2] + error) / narrowest : HALF_TURN;
   const real widest = angle < HALF_TURN ? angle : HALF_TURN;
-  const real least = sc_chord_of_angle((a[2] - error) / (R(1.0) / shortest + o->slack));
-  const real most = sc_chord_of_angle(widest);
+  const real least = starcat_chord_of_angle((a[2] - error) / (R(1.0) / shortest + o->slack));
+  const real most = starcat_chord_of_angle(widest);
   for (uint32_t n = 0; n < 2u; n++) {
     const real low = a[n] > error ? (a[n] - error) / (a[2] + error) : R(0.0);
     const real high = a[2] > error ? widest / most * (a[n] + error) / (a[2] - error) : R(1.0);
     o->least[n] = BELOW * low * low;
     o->most[n] = ABOVE * high * high;
   }
-  o->least[2] = BELOW * least * least;
+  o->least[2] = starcat_larger(BELOW * least * least, LEAST_CHORD);
   o->most[2] = ABOVE * most * most;
 }
 
-static void observe(const sc_call *call, const uint32_t triple[3], const real sides[3],
-                    observed *o) {
+static void observe(const starcat_call *call, const uint32_t triple[3], const real sides[3],
+                    sought *o) {
   const starcat_workspace *w = call->work;
-  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
+  const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
   for (uint32_t n = 0; n < 3u; n++) {
-    const real low = sc_chord_of_angle(sides[n] - error), high = sc_chord_of_angle(sides[n] + error);
+    const real low = starcat_chord_of_angle(sides[n] - error),
+               high = starcat_chord_of_angle(sides[n] + error);
     o->triple[n] = triple[n];
     o->low[n] = low * low;
     o->high[n] = high * high;
@@ -346,25 +349,25 @@ static void observe(const sc_call *call, const uint32_t triple[3], const real si
     o->sides[n] = sides[n];
   }
   o->error = error;
-  o->slack = error / shorter(shorter(sides[0], sides[1]), sides[2]);
+  o->slack = error / starcat_smaller(starcat_smaller(sides[0], sides[1]), sides[2]);
   sort(o->least);
   sort(o->most);
   if (call->fov_error > R(0.0)) {
     bound_shape(call, o);
   }
-  sc_cross(w->body[triple[0]], w->body[triple[1]], normal);
-  o->is_right_handed = sc_dot(normal, w->body[triple[2]]) > R(0.0);
+  starcat_cross(w->body[triple[0]], w->body[triple[1]], normal);
+  o->is_right_handed = starcat_dot(normal, w->body[triple[2]]) > R(0.0);
 }
 
 /* Whether the chords of stars may be those observed, in some order of the corners: most are not in
  * any. */
-static int may_fit(const observed *o, const real chords[3], int has_scale) {
+static int may_fit(const sought *o, const real chords[3], int has_scale) {
   real c[3] = {chords[0], chords[1], chords[2]};
   sort(c);
   const real unit = has_scale ? c[2] : R(1.0);
-  return sc_is_between(c[2], o->least[2], o->most[2]) &&
-         sc_is_between(c[0], o->least[0] * unit, o->most[0] * unit) &&
-         sc_is_between(c[1], o->least[1] * unit, o->most[1] * unit);
+  return starcat_is_between(c[2], o->least[2], o->most[2]) &&
+         starcat_is_between(c[0], o->least[0] * unit, o->most[0] * unit) &&
+         starcat_is_between(c[1], o->least[1] * unit, o->most[1] * unit);
 }
 
 /* Directions as a camera with a multiple of the focal length sees them. */
@@ -372,7 +375,7 @@ static void scale_to(real body[3][3], real focal) {
   for (uint32_t n = 0; n < 3u; n++) {
     real *b = body[n];
     b[2] *= focal;
-    const real scale = R(1.0) / STARCAT_SQRT(sc_dot(b, b));
+    const real scale = R(1.0) / STARCAT_SQRT(starcat_dot(b, b));
     b[0] *= scale;
     b[1] *= scale;
     b[2] *= scale;
@@ -380,12 +383,13 @@ static void scale_to(real body[3][3], real focal) {
 }
 
 static real around(real v[3][3]) {
-  return sc_chord_square(v[0], v[1]) + sc_chord_square(v[1], v[2]) + sc_chord_square(v[2], v[0]);
+  return starcat_chord_square(v[0], v[1]) + starcat_chord_square(v[1], v[2]) +
+         starcat_chord_square(v[2], v[0]);
 }
 
 /* The focal length with which three centroids are as far apart as their stars; the centroids are
  * changed to that. Twice, because angles are no tangents. */
-static real fit_scale(const sc_call *call, real body[3][3], real icrs[3][3]) {
+static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]) {
   const real shortest = R(1.0) - call->fov_error, apart = around(icrs);
   real focal = R(1.0);
   for (uint32_t n = 0; n < 2u; n++) {
@@ -399,7 +403,7 @@ static real fit_scale(const sc_call *call, real body[3][3], real icrs[3][3]) {
 }
 
 /* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
-static int try_order(sc_call *call, const observed *o, real stars[3][3],
+static int try_order(starcat_call *call, const sought *o, real stars[3][3],
                      const uint8_t order[3]) {
   const starcat_workspace *w = call->work;
   const uint32_t *t = o->triple;
@@ -413,27 +417,28 @@ static int try_order(sc_call *call, const observed *o, real stars[3][3],
   if (call->fov_error > R(0.0)) {
     focal = fit_scale(call, body, icrs);
   }
-  if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+  if (!starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  sc_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-  return sc_try(call, m, focal);
+  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
+  return starcat_try(call, m, focal);
 }
 
 /* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
  * that of least squares. */
-static int is_similar(const sc_call *call, const observed *o, const real apart[3],
+static int is_similar(const starcat_call *call, const sought *o, const real apart[3],
                       const uint8_t order[3]) {
   const real u = apart[order[0]], v = apart[order[1]], t = apart[order[2]];
-  const real scale = (o->sides[0] * u + o->sides[1] * v + o->sides[2] * t) / (u * u + v * v + t * t);
+  const real scale =
+      (o->sides[0] * u + o->sides[1] * v + o->sides[2] * t) / (u * u + v * v + t * t);
   const real shortest = R(1.0) - call->fov_error;
-  if (!sc_is_between(scale, shortest - o->slack, R(1.0) / shortest + o->slack)) {
+  if (!starcat_is_between(scale, shortest - o->slack, R(1.0) / shortest + o->slack)) {
     return 0;
   }
   for (uint32_t n = 0; n < 3u; n++) {
     const real miss = apart[order[n]] * scale - o->sides[n];
     const real most = o->error + call->bend * o->sides[n];
-    if (!sc_is_between(miss, -most, most)) {
+    if (!starcat_is_between(miss, -most, most)) {
       return 0;
     }
   }
@@ -441,38 +446,38 @@ static int is_similar(const sc_call *call, const observed *o, const real apart[3
 }
 
 /* Whether the chords of stars, in an order of the corners, are those observed. */
-static int is_same(const observed *o, const real chords[3], const uint8_t order[3]) {
+static int is_same(const sought *o, const real chords[3], const uint8_t order[3]) {
   int fits = 1;
   for (uint32_t n = 0; n < 3u; n++) {
-    fits = fits && sc_is_between(chords[order[n]], o->low[n], o->high[n]);
+    fits = fits && starcat_is_between(chords[order[n]], o->low[n], o->high[n]);
   }
   return fits;
 }
 
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
-static int compare(sc_call *call, const observed *o, uint32_t feature) {
+static int compare(starcat_call *call, const sought *o, uint32_t feature) {
   static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
                                        {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
   uint32_t rows[3];
   real stars[3][3], normal[3], chords[3];
-  sc_rows_of(call->image, feature, 3, rows);
+  starcat_rows_of(call->image, feature, 3, rows);
   for (uint32_t n = 0; n < 3u; n++) {
     if (rows[n] >= call->image->n_stars) { /* a damaged image */
       return 0;
     }
-    sc_star(call->image, rows[n], stars[n]);
+    starcat_star(call->image, rows[n], stars[n]);
   }
-  chords[0] = sc_chord_square(stars[1], stars[2]);
-  chords[1] = sc_chord_square(stars[0], stars[2]);
-  chords[2] = sc_chord_square(stars[0], stars[1]);
+  chords[0] = starcat_chord_square(stars[1], stars[2]);
+  chords[1] = starcat_chord_square(stars[0], stars[2]);
+  chords[2] = starcat_chord_square(stars[0], stars[1]);
   const int has_scale = call->fov_error > R(0.0);
   if (!may_fit(o, chords, has_scale)) {
     return 0;
   }
-  sc_cross(stars[0], stars[1], normal);
-  const int is_right_handed = sc_dot(normal, stars[2]) > R(0.0);
+  starcat_cross(stars[0], stars[1], normal);
+  const int is_right_handed = starcat_dot(normal, stars[2]) > R(0.0);
   for (uint32_t n = 0; has_scale && (n < 3u); n++) {
-    chords[n] = sc_angle_of_chord(chords[n]);
+    chords[n] = starcat_angle_of_chord(chords[n]);
   }
   for (uint32_t k = 0; k < 6u; k++) {
     const uint8_t *order = orders[k];
@@ -494,11 +499,12 @@ static void features_of(const real sides[3], real error, real *area, real *area_
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
   const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
-  const real square = a2 * u + b2 * v + c2 * t;
-  *area = R(0.25) * STARCAT_SQRT(square > R(1e-30) ? square : R(1e-30));
+  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
+  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
+  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
   const real scale = R(0.125) / *area;
   const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
-  *radius = R(0.25) * a * b * c / *area;
+  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
   *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
   const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
   *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
@@ -509,7 +515,7 @@ static uint16_t quantised(real radius, real quantum) {
   if (!(scaled > R(0.0))) {
     return 0;
   }
-  return scaled < R(65535.0) ? (uint16_t)scaled : (uint16_t)SC_RADIUS_OVERFLOW;
+  return scaled < R(65535.0) ? (uint16_t)scaled : (uint16_t)STARCAT_RADIUS_OVERFLOW;
 }
 
 /* Whether one of a block of radii is in a range; written so that compilers use vectors. */
@@ -522,22 +528,22 @@ static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
 }
 
 /* Compare the triangles of stars of some areas and circumradii. Returns 1 if the search can end. */
-static int look_up(sc_call *call, const observed *o, const real area[2], const real radius[2]) {
+static int look_up(starcat_call *call, const sought *o, const real area[2], const real radius[2]) {
   const starcat_image *image = call->image;
   const real quantum = image->radius_quantum_rad;
   const uint16_t low = quantised(radius[0] - quantum, quantum);
   const uint16_t width = (uint16_t)(quantised(radius[1] + R(2.0) * quantum, quantum) - low);
   uint32_t start, stop;
-  sc_rows_between(image, area[0], area[1], &start, &stop);
+  starcat_rows_between(image, area[0], area[1], &start, &stop);
   for (uint32_t row = start; row < stop; row += BLOCK) {
     const uint32_t count = stop - row < BLOCK ? stop - row : BLOCK;
-    if (!sc_spend(call->work, count)) {
+    if (!starcat_spend(call->work, count)) {
       return 1;
     }
     if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
       for (uint32_t n = 0; n < count; n++) {
         if (((uint16_t)(image->radii[row + n] - low) <= width) &&
-            (!sc_spend(call->work, STEPS_OF_SIDES) || compare(call, o, row + n))) {
+            (!starcat_spend(call->work, STEPS_OF_SIDES) || compare(call, o, row + n))) {
           return 1;
         }
       }
@@ -548,7 +554,7 @@ static int look_up(sc_call *call, const observed *o, const real area[2], const r
 
 /* Look up the triangles of stars that an observed one is similar to: area over squared circumradius
  * is the same, so that an area tells the circumradius. Returns 1 if the search can end. */
-static int look_up_similar(sc_call *call, const observed *o, real area, real area_error,
+static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
                            real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;
   const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
@@ -578,10 +584,10 @@ static int look_up_similar(sc_call *call, const observed *o, real area, real are
 }
 
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
-int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]) {
+int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   real area, area_error, radius, radius_error;
-  observed o;
-  features_of(sides, SC_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
+  sought o;
+  features_of(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
               &radius_error);
   observe(call, triple, sides, &o);
   if (call->fov_error > R(0.0)) {

@@ -12,34 +12,40 @@ typedef starcat_real real;
 
 #define R(number) ((real)(number))
 
-/* Whether a number is in a closed range; not so where one of the three is not a number. */
-static inline int sc_is_between(real x, real low, real high) { return (x >= low) && (x <= high); }
+/* Whether a number is in a closed range. */
+static inline int starcat_is_between(real x, real low, real high) {
+  return (x >= low) && (x <= high);
+}
 
-static inline real sc_dot(const real a[3], const real b[3]) {
+static inline real starcat_larger(real a, real b) { return a > b ? a : b; }
+static inline real starcat_smaller(real a, real b) { return a < b ? a : b; }
+static inline real starcat_absolute(real x) { return x < R(0.0) ? -x : x; }
+
+static inline real starcat_dot(const real a[3], const real b[3]) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-static inline void sc_cross(const real a[3], const real b[3], real c[3]) {
+static inline void starcat_cross(const real a[3], const real b[3], real c[3]) {
   c[0] = a[1] * b[2] - a[2] * b[1];
   c[1] = a[2] * b[0] - a[0] * b[2];
   c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 /* body = m * icrs */
-static inline void sc_turn(const real m[9], const real icrs[3], real body[3]) {
-  body[0] = sc_dot(m, icrs);
-  body[1] = sc_dot(m + 3, icrs);
-  body[2] = sc_dot(m + 6, icrs);
+static inline void starcat_turn(const real m[9], const real icrs[3], real body[3]) {
+  body[0] = starcat_dot(m, icrs);
+  body[1] = starcat_dot(m + 3, icrs);
+  body[2] = starcat_dot(m + 6, icrs);
 }
 
-static inline real sc_chord_square(const real a[3], const real b[3]) {
+static inline real starcat_chord_square(const real a[3], const real b[3]) {
   const real x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2];
   return x * x + y * y + z * z;
 }
 
 /* The angle between two unit vectors from the square of their distance. Below 17 degrees the
  * series of the arcsine is exact to 1e-12 of the angle. */
-static inline real sc_angle_of_chord(real square) {
+static inline real starcat_angle_of_chord(real square) {
   const real s = R(0.25) * square;
   const real half = STARCAT_SQRT(s);
   if (s < R(0.0225)) {
@@ -55,7 +61,7 @@ static inline real sc_angle_of_chord(real square) {
 }
 
 /* The distance of two unit vectors that are an angle apart; 0 for negative angles. */
-static inline real sc_chord_of_angle(real angle_rad) {
+static inline real starcat_chord_of_angle(real angle_rad) {
   return angle_rad > R(0.0) ? R(2.0) * STARCAT_SIN(R(0.5) * angle_rad) : R(0.0);
 }
 

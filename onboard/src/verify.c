@@ -9,7 +9,7 @@
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
 
 /* Take steps from what is left of the budget. Returns 0 if it is used up. */
-int sc_spend(starcat_workspace *work, uint32_t steps) {
+int starcat_spend(starcat_workspace *work, uint32_t steps) {
   if (steps >= work->steps_left) {
     work->steps_left = 0;
     return 0;
@@ -19,27 +19,27 @@ int sc_spend(starcat_workspace *work, uint32_t steps) {
 }
 
 /* Whether a centroid may be a star, by their magnitudes. */
-int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row) {
+int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
   const int16_t stored = call->image->magnitudes[row];
-  if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN)) {
+  if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN) ||
+      !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
     return 1;
   }
   const real apart = observed - R(0.001) * (real)stored;
-  /* Also true where the centroid's magnitude is not a number. */
-  return !((apart > call->mag_reach) || (-apart > call->mag_reach));
+  return (apart <= call->mag_reach) && (-apart <= call->mag_reach);
 }
 
 /* Put the stars around the field on the detector; keep those within a margin of it. */
-void sc_project(const sc_call *call, const real m[9], real margin_px) {
+void starcat_project(const starcat_call *call, const real m[9], real margin_px) {
   starcat_workspace *w = call->work;
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
   const real most_x = x0 + margin_px, most_y = y0 + margin_px;
   uint32_t count = 0;
   for (uint32_t j = 0; j < w->n_near; j++) {
     real body[3], x, y;
-    sc_turn(m, w->near_icrs[j], body);
-    if (sc_pixel(&call->camera, body, &x, &y) != 0) {
+    starcat_turn(m, w->near_icrs[j], body);
+    if (starcat_pixel(&call->camera, body, &x, &y) != 0) {
       const real dx = x - x0, dy = y - y0;
       w->x_of[count] = x;
       w->y_of[count] = y;
@@ -51,7 +51,7 @@ void sc_project(const sc_call *call, const real m[9], real margin_px) {
 }
 
 /* The column of the detector that a place is in; the first or the last one outside of it. */
-static uint32_t column_of(const sc_call *call, real x_px) {
+static uint32_t column_of(const starcat_call *call, real x_px) {
   const real scaled = x_px * call->columns_per_px;
   if (!(scaled > R(0.0))) {
     return 0;
@@ -60,7 +60,7 @@ static uint32_t column_of(const sc_call *call, real x_px) {
 }
 
 /* List the centroids by the column of the detector that they are in. */
-void sc_list_columns(sc_call *call) {
+void starcat_list_columns(starcat_call *call) {
   starcat_workspace *w = call->work;
   call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
   for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
@@ -81,7 +81,7 @@ void sc_list_columns(sc_call *call) {
 
 /* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
  * them is the nearest to it, and to which it is the nearest so far. */
-static void match_star(const sc_call *call, uint32_t k, real reach_px, real reach) {
+static void match_star(const starcat_call *call, uint32_t k, real reach_px, real reach) {
   starcat_workspace *w = call->work;
   const real x = w->x_of[k], y = w->y_of[k];
   const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
@@ -90,7 +90,7 @@ static void match_star(const sc_call *call, uint32_t k, real reach_px, real reac
     const uint32_t i = w->in_column[n];
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     const real square = dx * dx + dy * dy;
-    if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
+    if ((square <= reach) && starcat_compatible(call, i, w->near_row[w->within[k]])) {
       if ((w->match[i] < 0) || (square < w->match_square[i])) {
         w->match_square[i] = square;
         w->match[i] = (int16_t)k;
@@ -106,7 +106,7 @@ static void match_star(const sc_call *call, uint32_t k, real reach_px, real reac
 
 /* Match centroids and stars that are the nearest to each other, within reach. Returns how many
  * do. */
-static uint32_t match(const sc_call *call, real reach_px) {
+static uint32_t match(const starcat_call *call, real reach_px) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
   for (uint32_t i = 0; i < w->count; i++) {
@@ -137,48 +137,50 @@ static int is_as_before(starcat_workspace *w) {
 
 /* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
  * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
-static void refine(sc_call *call, real m[9], const uint16_t *of, const real *icrs,
+static void refine(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
                    const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
-    sc_information h = {{0}, {0}, R(0.0)};
+    starcat_information h = {{0}, {0}, R(0.0)};
     real turn[3] = {0}, shrink = R(0.0), along[3], unused[6], step = R(0.0);
     for (uint32_t i = 0; i < n; i++) {
       const real *b = call->body[of[i]];
       real a[3], left[3], moved[3];
-      sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
+      starcat_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
       for (uint32_t k = 0; k < 3u; k++) {
         left[k] = b[k] - a[k];
       }
-      sc_cross(a, left, moved);
+      starcat_cross(a, left, moved);
       for (uint32_t k = 0; k < 3u; k++) {
         turn[k] += moved[k];
       }
-      shrink += b[2] * b[2] * sc_dot(b, left) - b[2] * left[2];
-      sc_inform(&h, b);
+      shrink += b[2] * b[2] * starcat_dot(b, left) - b[2] * left[2];
+      starcat_inform(&h, b);
     }
-    if (sc_solve(h.angles, h.with_scale, along, unused) != 0) {
-      const real of_scale = h.scale - sc_dot(h.with_scale, along);
-      if (of_scale > R(0.0)) {
-        step = (shrink - sc_dot(along, turn)) / of_scale;
+    if (starcat_solve(h.angles, h.with_scale, along, unused) != 0) {
+      const real of_scale = h.scale - starcat_dot(h.with_scale, along);
+      const real excess = shrink - starcat_dot(along, turn);
+      if (starcat_absolute(excess) < of_scale) {
+        step = excess / of_scale;
+      } else if (of_scale > R(0.0)) { /* farther than a step may go */
+        step = excess > R(0.0) ? R(1.0) : R(-1.0);
       }
     }
-    step = step > R(1.0) ? R(1.0) : (step < R(-1.0) ? R(-1.0) : step);
-    real focal = call->focal * sc_exponential(step);
+    real focal = call->focal * starcat_exponential(step);
     const real shortest = R(1.0) - call->fov_error;
     focal = focal < shortest ? shortest : focal;
-    sc_set_focal(call, focal * shortest > R(1.0) ? R(1.0) / shortest : focal);
+    starcat_set_focal(call, focal * shortest > R(1.0) ? R(1.0) / shortest : focal);
   }
   for (uint32_t i = 0; i < n; i++) {
     body[i][0] = call->body[of[i]][0];
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  sc_refine(m, &body[0][0], icrs, which, NULL, n, 4);
+  starcat_refine(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
 /* Refine on all matches. */
-static void refine_matched(sc_call *call, real m[9]) {
+static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
   uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
   uint32_t n = 0;
@@ -204,21 +206,21 @@ static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
  * is used up. */
-static int gather(const sc_call *call, const real m[9]) {
+static int gather(const starcat_call *call, const real m[9]) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
   if (call->fov_error > R(0.0)) {
-    const real radius_rad = (R(1.0) + SC_FOCAL_MARGIN) * STARCAT_ATAN2(s, c);
+    const real radius_rad = (R(1.0) + STARCAT_FOCAL_MARGIN) * STARCAT_ATAN2(s, c);
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
   }
-  w->n_near = sc_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
+  w->n_near = starcat_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
   return w->n_near <= STARCAT_MAX_STARS;
 }
 
 /* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
  * around the field are too many or the budget is used up. */
-static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
+static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
   if (!gather(call, m)) {
@@ -227,15 +229,15 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
   for (uint32_t i = 0; i < w->count; i++) {
     w->before[i] = -2;
   }
-  for (uint32_t n = 0; n < r->count + SC_REFINEMENTS; n++) {
+  for (uint32_t n = 0; n < r->count + STARCAT_REFINEMENTS; n++) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
-    sc_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
+    starcat_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
     matched = match(call, factor * call->reach_px);
-    if (!sc_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
+    if (!starcat_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
       return 0;
     }
-    if ((matched < SC_MIN_STARS) || (is_as_before(w) && is_final)) {
+    if ((matched < STARCAT_MIN_STARS) || (is_as_before(w) && is_final)) {
       break;
     }
     refine_matched(call, m);
@@ -245,14 +247,14 @@ static uint32_t fit(sc_call *call, real m[9], const reaches *r) {
 
 /* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
  * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
-static int spend_on_bound(const sc_call *call) {
+static int spend_on_bound(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const uint32_t most = w->count < w->n_within ? w->count : w->n_within;
   uint32_t steps = STEPS_OF_MATCH * (w->count + w->n_within);
   if (call->mag_reach > R(0.0)) {
     steps += w->count * w->n_within + (w->count + w->n_within) * most;
   }
-  return sc_spend(w, steps);
+  return starcat_spend(w, steps);
 }
 
 static void withhold(starcat_agreement *found, uint32_t reason) {
@@ -261,7 +263,7 @@ static void withhold(starcat_agreement *found, uint32_t reason) {
 }
 
 /* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
-static void judge(const sc_call *call, const real m[9], uint32_t matched, real factor,
+static void judge(const starcat_call *call, const real m[9], uint32_t matched, real factor,
                   starcat_agreement *found) {
   starcat_workspace *w = call->work;
   real square_px = R(0.0), square_rad = R(0.0);
@@ -276,7 +278,7 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
   found->share = R(1.0);
   found->withheld = 0;
   found->is_firm = 1;
-  if (matched < SC_MIN_STARS) {
+  if (matched < STARCAT_MIN_STARS) {
     return;
   }
   if (!spend_on_bound(call)) {
@@ -288,30 +290,30 @@ static void judge(const sc_call *call, const real m[9], uint32_t matched, real f
     if (w->match[i] >= 0) {
       const uint32_t j = w->within[w->match[i]];
       real body[3];
-      sc_turn(m, w->near_icrs[j], body);
-      square_rad += sc_chord_square(call->body[i], body);
+      starcat_turn(m, w->near_icrs[j], body);
+      square_rad += starcat_chord_square(call->body[i], body);
       square_px += w->match_square[i];
       found->star[i] = (int32_t)w->near_row[j];
     }
   }
   found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
-  found->log_bound = sc_log_chance(call, square_px, matched);
+  found->log_bound = starcat_log_chance(call, square_px, matched);
   found->log_chance = found->log_bound;
   if (found->log_bound < R(0.0)) {
-    sc_weigh(call, m, factor * call->tolerance_rad, found);
-    if ((found->share < SC_MIN_SHARE) &&
-        !((found->is_firm != 0u) && (found->log_bound <= SC_LOG_FIRM_CHANCE))) {
+    starcat_weigh(call, m, factor * call->tolerance_rad, found);
+    if ((found->share < STARCAT_MIN_SHARE) &&
+        !((found->is_firm != 0u) && (found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
-    } else if (sc_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
+    } else if (starcat_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
       withhold(found, STARCAT_REASON_SCALE);
     }
   }
 }
 
 /* List the centroids without a star that are near the star of another one. */
-static void find_rivals(const sc_call *call) {
+static void find_rivals(const starcat_call *call) {
   starcat_workspace *w = call->work;
-  const real reach_px = SC_RIVAL_REACH * call->reach_px;
+  const real reach_px = STARCAT_RIVAL_REACH * call->reach_px;
   w->n_rivals = 0;
   for (uint32_t i = 0; i < w->count; i++) {
     real least = reach_px * reach_px;
@@ -326,7 +328,7 @@ static void find_rivals(const sc_call *call) {
         }
       }
     }
-    if ((of < w->count) && sc_compatible(call, i, w->near_row[w->within[w->match[of]]])) {
+    if ((of < w->count) && starcat_compatible(call, i, w->near_row[w->within[w->match[of]]])) {
       w->rival[w->n_rivals] = (uint16_t)i;
       w->rival_of[w->n_rivals] = (uint16_t)of;
       w->n_rivals++;
@@ -335,7 +337,7 @@ static void find_rivals(const sc_call *call) {
 }
 
 /* Give the star of a centroid to its rival, and fit the attitude to that. */
-static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
+static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
   const starcat_workspace *w = call->work;
   real icrs[STARCAT_MAX_CENTROIDS][3];
   uint16_t of[STARCAT_MAX_CENTROIDS];
@@ -343,7 +345,7 @@ static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9
   for (uint32_t i = 0; i < w->count; i++) {
     const uint32_t owner = i == rival ? centroid : i;
     if ((i != centroid) && (w->found.star[owner] >= 0)) {
-      sc_star(call->image, (uint32_t)w->found.star[owner], icrs[n]);
+      starcat_star(call->image, (uint32_t)w->found.star[owner], icrs[n]);
       of[n] = (uint16_t)i;
       n++;
     }
@@ -352,17 +354,17 @@ static void fit_rival(sc_call *call, uint32_t rival, uint32_t centroid, real m[9
 }
 
 /* Begin again from the attitude and the focal length of an agreement. */
-static void begin_at(sc_call *call, const starcat_agreement *from, real m[9]) {
+static void begin_at(starcat_call *call, const starcat_agreement *from, real m[9]) {
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = from->matrix[k];
   }
-  sc_set_focal(call, from->focal);
+  starcat_set_focal(call, from->focal);
 }
 
 /* A false spot beside a star far from the others can turn the attitude so that it is the nearest
- * to the star itself. The star's own spot then has no star, and fits better: the first such rival is
- * taken. */
-static void try_rivals(sc_call *call) {
+ * to the star itself. The star's own spot then has no star, and fits better: the first such rival
+ * is taken. */
+static void try_rivals(starcat_call *call) {
   starcat_workspace *w = call->work;
   find_rivals(call);
   for (uint32_t n = 0; n < w->n_rivals; n++) {
@@ -371,7 +373,7 @@ static void try_rivals(sc_call *call) {
     fit_rival(call, w->rival[n], w->rival_of[n], m);
     judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
     /* The fit may lead back to where it began, but for rounding. */
-    if (w->wider.log_chance < w->found.log_chance - SC_LOG_ROUNDING) {
+    if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
       w->found = w->wider;
       return;
     }
@@ -385,7 +387,7 @@ static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
 }
 
 /* How many of the matched centroids are within smaller reaches: halves of the one before. */
-static void count_nearer(const sc_call *call, uint32_t nearer[3]) {
+static void count_nearer(const starcat_call *call, uint32_t nearer[3]) {
   const starcat_workspace *w = call->work;
   for (uint32_t k = 0; k < 3u; k++) {
     const real reach = call->reach_px / (real)(2u << k);
@@ -399,14 +401,14 @@ static void count_nearer(const sc_call *call, uint32_t nearer[3]) {
 /* Try smaller reaches where more centroids are near their stars than chance would bring there:
  * where centroids are better than the tolerance allows, the true stars of a crowded frame are
  * outnumbered by those that chance puts within its reach. */
-static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) {
+static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t count) {
   starcat_workspace *w = call->work;
   reaches r = {0, {R(0.5), R(0.25), R(0.125)}, R(1.0)};
   for (uint32_t k = 0; k < 3u; k++) {
     r.count = k;
     r.last = r.first[k];
-    if ((nearer[k] >= SC_MIN_STARS) &&
-        ((real)nearer[k] >= SC_OVER_CHANCE * r.last * r.last * (real)count)) {
+    if ((nearer[k] >= STARCAT_MIN_STARS) &&
+        ((real)nearer[k] >= STARCAT_OVER_CHANCE * r.last * r.last * (real)count)) {
       real m[9];
       begin_at(call, &w->found, m);
       judge(call, m, fit(call, m, &r), r.last, &w->wider);
@@ -418,17 +420,17 @@ static void try_nearer(sc_call *call, const uint32_t nearer[3], uint32_t count) 
 }
 
 /* Withhold the agreement if the frame agrees better with another focal length. */
-static void try_other_scales(sc_call *call) {
+static void try_other_scales(starcat_call *call) {
   starcat_workspace *w = call->work;
   const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                                       call->camera.half_height * call->camera.half_height);
   real m[9];
   begin_at(call, &w->found, m);
-  sc_allow_scales(call, SC_OTHER_SCALES);
+  starcat_allow_scales(call, STARCAT_OTHER_SCALES);
   judge(call, m, fit(call, m, &ROUGH), R(1.0), &w->wider);
-  sc_allow_scales(call, R(0.0));
+  starcat_allow_scales(call, R(0.0));
   const real moved = corner_px * (call->focal - R(1.0));
-  sc_set_focal(call, R(1.0));
+  starcat_set_focal(call, R(1.0));
   if ((w->wider.log_bound < w->found.log_bound) &&
       ((moved > call->tolerance_px) || (-moved > call->tolerance_px))) {
     withhold(&w->found, STARCAT_REASON_SCALE);
@@ -437,7 +439,7 @@ static void try_other_scales(sc_call *call) {
 
 /* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
  * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
-int sc_try(sc_call *call, const real m[9], real focal) {
+int starcat_try(starcat_call *call, const real m[9], real focal) {
   static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
@@ -448,10 +450,10 @@ int sc_try(sc_call *call, const real m[9], real focal) {
     attitude[k] = m[k];
   }
   w->n_tried++;
-  if (!sc_spend(w, STEPS_OF_TRY)) {
+  if (!starcat_spend(w, STEPS_OF_TRY)) {
     return 1;
   }
-  sc_set_focal(call, focal);
+  starcat_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
   count_nearer(call, nearer);
@@ -461,7 +463,7 @@ int sc_try(sc_call *call, const real m[9], real focal) {
   if (!(found->log_chance <= call->log_certain)) {
     try_nearer(call, nearer, count);
   }
-  if ((found->n_matched >= SC_MIN_STARS) && (found->share < SC_SURE_SHARE)) {
+  if ((found->n_matched >= STARCAT_MIN_STARS) && (found->share < STARCAT_SURE_SHARE)) {
     /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
      * edge of a cluster may have spoilt an attitude that is nearly right. */
     begin_at(call, found, attitude);
@@ -471,7 +473,7 @@ int sc_try(sc_call *call, const real m[9], real focal) {
     }
   }
   if ((found->log_chance < R(0.0)) && !is_scaled &&
-      ((found->is_firm == 0u) || (found->share < SC_SURE_SHARE))) {
+      ((found->is_firm == 0u) || (found->share < STARCAT_SURE_SHARE))) {
     try_other_scales(call);
   }
   if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {

@@ -7,10 +7,16 @@
 
 #define LEAST R(-1e30) /* logarithm of no way at all */
 #define SMALL 16u
+/* Numbers up to 1 whose polynomials are below the exponential of so many, a number still. */
+#ifdef STARCAT_SINGLE
+#define MOST_OF_SUM 80u
+#else
+#define MOST_OF_SUM 700u
+#endif
 #define FAR_MAGNITUDE R(1e30) /* of a star whose own is not known, which is counted apart */
 
 /* Logarithm of a factorial, from 16 on by Stirling's series. */
-real sc_log_factorial(uint32_t n) {
+real starcat_log_factorial(uint32_t n) {
   static const real table[16] = {
       R(0.0),                  R(0.0),                  R(0.69314718055994530942),
       R(1.7917594692280550008), R(3.1780538303479456197), R(4.7874917427820459943),
@@ -27,7 +33,7 @@ real sc_log_factorial(uint32_t n) {
 }
 
 /* Exponential of a number from -1 to 20, without another function of libm. */
-real sc_exponential(real x) {
+real starcat_exponential(real x) {
   const real y = x * R(1.0 / 256.0);
   real power = R(1.0) + y * (R(1.0) + y * (R(0.5) + y * (R(1.0 / 6.0) +
                                                         y * (R(1.0 / 24.0) + y * R(1.0 / 120.0)))));
@@ -38,19 +44,25 @@ real sc_exponential(real x) {
 }
 
 /* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
- * the largest one. From the third bound on the numbers n stand for (n!)^(1/n). */
+ * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
 static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
                    uint32_t most) {
   const int is_tight = bound >= 2u;
   real *sums = w->sums[bound];
+  uint32_t unit = 1;
   uint32_t top = 1;
   real shares[SMALL] = {0};
   for (uint32_t i = 0; i < count; i++) {
     top = numbers[i] > top ? numbers[i] : top;
   }
+  while (count / unit > MOST_OF_SUM) { /* so many numbers, that the sums would have no end */
+    unit *= 2u;
+  }
   const real largest =
-      is_tight ? sc_exponential(sc_log_factorial(top) / (real)top) : (real)top;
+      (real)unit *
+      (is_tight ? starcat_exponential(starcat_log_factorial(top) / (real)top) : (real)top);
   w->log_largest[bound] = STARCAT_LOG(largest);
+  w->n_some[bound] = 0;
   sums[0] = R(1.0);
   for (uint32_t k = 1; k <= most; k++) {
     sums[k] = R(0.0);
@@ -60,9 +72,11 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
     if (own == 0u) {
       continue;
     }
+    w->n_some[bound]++;
     real share = shares[place];
     if ((place == 0u) || !(share > R(0.0))) { /* else it was worked out before: many are alike */
-      share = (is_tight ? sc_exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
+      share = (is_tight ? starcat_exponential(starcat_log_factorial(own) / (real)own) : (real)own) /
+              largest;
       shares[place] = share;
     }
     for (uint32_t k = i < most ? i + 1u : most; k > 0u; k--) { /* beyond it all are 0 */
@@ -73,19 +87,20 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
 
 /* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
 static real filled(uint32_t others, uint32_t n) {
-  return (real)(others - n) / (real)others * sc_log_factorial(others) -
-         sc_log_factorial(others - n);
+  return (real)(others - n) / (real)others * starcat_log_factorial(others) -
+         starcat_log_factorial(others - n);
 }
 
 /* Logarithm of the bound of the ways to assign n of the centroids to n stars, after
- * sc_count_ways. */
-real sc_log_ways(const sc_call *call, uint32_t n) {
+ * starcat_count_ways. */
+real starcat_log_ways(const starcat_call *call, uint32_t n) {
   const starcat_workspace *w = call->work;
   real least = w->log_ways[n];
   for (uint32_t bound = 0; (bound < 4u) && (call->mag_reach > R(0.0)); bound++) {
     real logarithm = LEAST;
-    if (w->sums[bound][n] > R(0.0)) {
-      logarithm = STARCAT_LOG(w->sums[bound][n]) + (real)n * w->log_largest[bound];
+    if (n <= w->n_some[bound]) { /* else no way; where there is one, its sum may round to 0 */
+      logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
+                  (real)n * w->log_largest[bound];
       if (bound >= 2u) {
         logarithm += filled(bound == 2u ? w->n_within : w->count, n);
       }
@@ -97,7 +112,7 @@ real sc_log_ways(const sc_call *call, uint32_t n) {
 
 /* Count the stars that each centroid may be, and the centroids that each star may be. What says
  * which of them are near each other is not needed any more, and gives its memory. */
-static void count_compatible(const sc_call *call) {
+static void count_compatible(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const real reach = call->mag_reach;
   uint16_t unknown = 0;
@@ -110,7 +125,7 @@ static void count_compatible(const sc_call *call) {
   }
   for (uint32_t i = 0; i < w->count; i++) {
     const real observed = w->magnitude[i];
-    const int is_known = observed - observed == R(0.0);
+    const int is_known = observed < STARCAT_UNKNOWN_MAGNITUDE;
     uint16_t some = unknown;
     for (uint32_t j = 0; j < w->n_within; j++) {
       const real apart = observed - w->nearest_square[j];
@@ -125,9 +140,9 @@ static void count_compatible(const sc_call *call) {
   }
 }
 
-/* Prepare sc_log_ways for every n up to `most`: the number of all ways, and where magnitudes are
- * stated four bounds of those of like magnitude, from the centroids and from the stars. */
-void sc_count_ways(const sc_call *call, uint32_t most) {
+/* Prepare starcat_log_ways for every n up to `most`: the number of all ways, and where magnitudes
+ * are stated four bounds of those of like magnitude, from the centroids and from the stars. */
+void starcat_count_ways(const starcat_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
   const uint32_t stars = w->n_within;
   w->log_ways[0] = R(0.0);

@@ -10,6 +10,7 @@
 #include <string.h>
 
 #include "random_sky.h"
+#include "traps.h"
 
 typedef struct {
   const uint8_t *at;

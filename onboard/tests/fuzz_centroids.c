@@ -8,6 +8,14 @@
 
 #include "fuzz.h"
 
+#ifdef STARCAT_SINGLE
+#define LARGE 1e37F
+#define LEAST FLT_MIN
+#else
+#define LARGE 1e300
+#define LEAST DBL_MIN
+#endif
+
 int LLVMFuzzerInitialize(int *argc, char ***argv);
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
@@ -36,20 +44,21 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
 
 /* A number as it was, a little off, a plain one, one of the odd ones, or any bits at all. */
 static starcat_real changed(fuzz_bytes *bytes, starcat_real value) {
-  static const double odd[12] = {0.0,     -0.0,    1.0, -1.0,        INFINITY,    -INFINITY,
-                                 1e-300,  1e300,   1e9, DBL_EPSILON, DBL_MIN / 4, 512.0};
+  static const starcat_real odd[12] = {0,        -(starcat_real)0.0, 1,         -1,
+                                       INFINITY, -INFINITY,          LEAST,     LARGE,
+                                       1e9F,     FLT_EPSILON,        LEAST / 4, 512};
   const uint32_t kind = fuzz_number(bytes, 1);
-  double any;
+  starcat_real any;
   switch (kind % 8u) {
     case 1:
       return value * (starcat_real)(1.0 + 1e-6 * ((double)fuzz_number(bytes, 2) - 32768.0));
     case 2:
       return (starcat_real)((double)fuzz_number(bytes, 2) / 64.0 - 256.0);
     case 3:
-      return (starcat_real)odd[fuzz_number(bytes, 1) % 12u];
+      return odd[fuzz_number(bytes, 1) % 12u];
     case 4:
       fuzz_take(bytes, &any, sizeof any);
-      return (starcat_real)any;
+      return any;
     case 5:
       return (starcat_real)NAN;
     default:
@@ -67,11 +76,12 @@ static void change_camera(fuzz_bytes *bytes, starcat_camera *c) {
 }
 
 static void change_options(fuzz_bytes *bytes, starcat_options *o) {
-  starcat_real *const numbers[4] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance};
-  for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 4u; n++) {
+  starcat_real *const numbers[5] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
+                                    &o->fov_error};
+  for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 5u; n++) {
     *numbers[n] = changed(bytes, *numbers[n]);
   }
-  o->max_steps = fuzz_number(bytes, 2);
+  o->max_steps = 65535u - fuzz_number(bytes, 2);
 }
 
 /* A column of exactly as many numbers as there are centroids; its first ones those of the frame. */
@@ -89,6 +99,7 @@ static starcat_real *column(fuzz_bytes *bytes, const starcat_real *values, uint3
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   fuzz_bytes bytes = {data, size};
+  traps_on();
   const starcat_image *image = &images[fuzz_number(&bytes, 1) % 2u];
   uint64_t seed = fuzz_number(&bytes, 1);
   starcat_camera camera;
@@ -132,5 +143,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   free(x);
   free(y);
   free(magnitudes);
+  traps_off();
   return 0;
 }

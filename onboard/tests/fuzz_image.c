@@ -84,6 +84,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   starcat_image image;
   starcat_camera camera;
   uint32_t bad;
+  traps_on();
   uint8_t *made = make_image(&bytes, &size);
   if (made != NULL) {
     (void)starcat_open(&image, made, size, 0);
@@ -95,5 +96,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     }
   }
   free(made);
+  traps_off();
   return 0;
 }

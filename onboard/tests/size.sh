@@ -1,6 +1,6 @@
 #!/bin/sh
 # Code of the library for 32-bit ARM, the deepest stack of each call, and the workspace. Called by
-# `make size`; fails above 28 KiB of code or 16 KiB of stack.
+# `make size`; fails above 28 KiB of code or 8 KiB of stack.
 set -eu
 out=$BUILD/size
 mkdir -p "$out"

@@ -11,7 +11,7 @@
 #define SPOTS 40u
 
 static sky_frame truth;
-static sc_call call;
+static starcat_call call;
 static unit_sky sky; /* triangles of many stars */
 static uint32_t n_taken, n_again;
 static uint8_t is_taken[SPOTS][SPOTS][SPOTS];
@@ -23,10 +23,11 @@ static starcat_status identify(const unit_sky *of) {
 
 static starcat_status begin(const unit_sky *of) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
-  return sc_begin(&call, &of->image, &of->camera, &of->options, &frame, &unit_work, &unit_result);
+  return starcat_begin(&call, &of->image, &of->camera, &of->options, &frame, &unit_work,
+                       &unit_result);
 }
 
-static int count_taken(sc_call *of, const uint32_t triple[3], const starcat_real sides[3]) {
+static int count_taken(starcat_call *of, const uint32_t triple[3], const starcat_real sides[3]) {
   (void)of;
   CHECK((triple[0] < triple[1]) && (triple[1] < triple[2]));
   CHECK(sides[0] > (starcat_real)0.0);
@@ -75,7 +76,7 @@ static void check_each_once(void) {
   CHECK_IS(unit_work.count, SPOTS);
   n_taken = n_again = 0;
   memset(is_taken, 0, sizeof is_taken);
-  sc_each_triangle(&call, count_taken);
+  starcat_each_triangle(&call, count_taken);
   for (uint32_t k = 0; k < SPOTS; k++) {
     for (uint32_t j = 0; j < k; j++) {
       for (uint32_t i = 0; i < j; i++) {
@@ -104,7 +105,7 @@ static void check_most_taken(void) {
   }
   CHECK_IS(begin(&sky), STARCAT_IDENTIFIED);
   n_taken = 0;
-  sc_each_triangle(&call, count_taken);
+  starcat_each_triangle(&call, count_taken);
   CHECK_IS(n_taken, MOST_TAKEN);
   sky.options.max_steps = 10000000; /* of which it takes six million */
   CHECK_IS(identify(&sky), STARCAT_NO_MATCH);
@@ -139,8 +140,8 @@ static void check_nearer(void) {
     for (uint32_t k = 0; k < 9u; k++) {
       m[k] = (starcat_real)truth.matrix[k];
     }
-    if (sc_try(&call, m, (starcat_real)1.0) != 0) {
-      CHECK_IS(sc_end(&call, &sky.options, &unit_result), STARCAT_IDENTIFIED);
+    if (starcat_try(&call, m, (starcat_real)1.0) != 0) {
+      CHECK_IS(starcat_end(&call, &sky.options, &unit_result), STARCAT_IDENTIFIED);
       certain++;
       wrong += unit_wrong_stars(&truth);
     }

@@ -71,6 +71,9 @@ static void check_options(const starcat_frame *frame, const starcat_real q[4]) {
   }
   CHECK_IS(with_option(&o->tolerance_px, (starcat_real)0.0, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->tolerance_px, (starcat_real)-1.0, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->tolerance_px, (starcat_real)2e6, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->noise_px, (starcat_real)1e-7, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->noise_mag, (starcat_real)2e6, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->noise_px, (starcat_real)-1.0, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->noise_mag, (starcat_real)-1.0, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->fov_error, (starcat_real)-0.1, frame, q), STARCAT_E_OPTIONS);
@@ -111,6 +114,8 @@ static void check_priors(const starcat_frame *frame, const starcat_real q[4]) {
   }
   const starcat_real zero[4] = {0};
   CHECK_IS(track(&unit_scratch, frame, zero, PRIOR_RAD), STARCAT_E_OPTIONS);
+  const starcat_real large[4] = {0, 0, 0, (starcat_real)2e6};
+  CHECK_IS(track(&unit_scratch, frame, large, PRIOR_RAD), STARCAT_E_OPTIONS);
   CHECK_IS(track(&unit_scratch, frame, q, NAN_REAL), STARCAT_E_NOT_FINITE);
   CHECK_IS(track(&unit_scratch, frame, q, (starcat_real)0.0), STARCAT_E_OPTIONS);
   CHECK_IS(track(&unit_scratch, frame, q, (starcat_real)-0.1), STARCAT_E_OPTIONS);
@@ -150,7 +155,8 @@ void test_dropped(void) {
   starcat_real x[STARCAT_MAX_CENTROIDS], y[STARCAT_MAX_CENTROIDS];
   starcat_real magnitudes[STARCAT_MAX_CENTROIDS];
   sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
-  const starcat_frame clean = unit_frame_of(&truth), dirty = {truth.count + 6u, x, y, magnitudes, NULL};
+  const starcat_frame clean = unit_frame_of(&truth),
+                      dirty = {truth.count + 6u, x, y, magnitudes, NULL};
   const uint32_t n = truth.count;
   memcpy(x, truth.x, sizeof truth.x);
   memcpy(y, truth.y, sizeof truth.y);

@@ -87,6 +87,8 @@ static void check_numbers(void) {
   CHECK_IS(with_u32(56, STARCAT_MAX_STARS), STARCAT_IDENTIFIED);
   CHECK_IS(with_f64(96, 0.0), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, nan), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(96, 1e-300), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(96, 1e300), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, 1e7), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(88, -1e7), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(88, 1e7), STARCAT_E_LAYOUT);
@@ -131,11 +133,17 @@ void test_open(void) {
   CHECK_IS(with_u32(28, 2), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(104, 0.0), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(104, (double)NAN), STARCAT_E_LAYOUT);
+  CHECK_IS(with_f64(104, 1e-300), STARCAT_E_LAYOUT);
   check_sections(7);
   CHECK_IS(unit_triangle.image.n_stars, SKY_STARS);
   CHECK(strcmp(unit_triangle.image.name, "sky-1.0.0") == 0);
   CHECK_IS(unit_triangle.image.manifest_sha256[31], 0xa5);
+  char version[32];
+  (void)sprintf(version, "%d.%d.%d", STARCAT_VERSION_MAJOR, STARCAT_VERSION_MINOR,
+                STARCAT_VERSION_PATCH);
+  CHECK(strcmp(version, STARCAT_VERSION) == 0);
   CHECK(strcmp(starcat_version(), STARCAT_VERSION) == 0);
+  CHECK_IS(starcat_version_number(), STARCAT_VERSION_NUMBER);
 }
 
 /* Flip a bit; scrub has to find it, open has to refuse the image, and the block has to be named. */
@@ -202,7 +210,8 @@ static void use_scratch(void) {
   sky_frame truth;
   for (uint32_t n = 0; n < 3u; n++) {
     sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 2, &truth);
-    const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes, NULL};
+    const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes,
+                                 NULL};
     unit_scratch.options.max_steps = 20000;
     (void)starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                            &unit_work, &unit_result);

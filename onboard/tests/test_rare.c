@@ -8,7 +8,7 @@
 #include "unit.h"
 
 static sky_frame truth;
-static sc_call call;
+static starcat_call call;
 
 static starcat_status track(const unit_sky *sky, starcat_real uncertainty_rad) {
   const starcat_frame frame = unit_frame_of(&truth);
@@ -21,8 +21,8 @@ static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t
   sky_look(&sky->image, &sky->camera, &seed, 0.2, n_spots, n_false, &truth);
   CHECK_IS(unit_identify(sky, &truth), STARCAT_IDENTIFIED);
   const starcat_frame frame = unit_frame_of(&truth);
-  CHECK_IS(sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                    &unit_result),
+  CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                         &unit_result),
            STARCAT_IDENTIFIED);
 }
 
@@ -30,24 +30,24 @@ static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t
 static void check_degenerate(void) {
   const starcat_real zero[6] = {0}, v[3] = {1, 2, 3};
   starcat_real x[3], inverse[6], m[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
-  CHECK(!sc_solve(zero, v, x, inverse));
-  sc_refine(m, v, v, NULL, NULL, 0, 4);
+  CHECK(!starcat_solve(zero, v, x, inverse));
+  starcat_refine(m, v, v, NULL, NULL, 0, 4);
   CHECK(m[0] == (starcat_real)1.0);
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
+  CHECK(starcat_try(&call, unit_result.matrix, (starcat_real)1.0));
   const uint32_t n = unit_work.best.n_matched;
-  CHECK(sc_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
+  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
   starcat_agreement weighed = unit_work.best;
   weighed.residual_rad = (starcat_real)0.0;
   unit_work.n_within++; /* one more star than was matched, so that a share is worked out */
   unit_work.within[unit_work.n_within - 1u] = unit_work.within[0];
-  sc_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  starcat_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
   CHECK((weighed.share > (starcat_real)0.5) && (weighed.is_firm != 0u));
   for (uint32_t i = 0; i < unit_work.count; i++) {
     unit_work.match[i] = -1;
   }
-  CHECK(sc_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
-  sc_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
+  starcat_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
   CHECK((weighed.share <= (starcat_real)0.0) && (weighed.is_firm == 0u));
 }
 
@@ -61,14 +61,15 @@ static void check_coincident(void) {
   for (uint32_t n = 0; n < SKY_SPOTS * SKY_SPOTS * SKY_SPOTS; n++) {
     const uint32_t t[3] = {n % SKY_SPOTS, n / SKY_SPOTS % SKY_SPOTS, n / SKY_SPOTS / SKY_SPOTS};
     if ((t[0] != t[1]) && (t[0] != t[2]) && (t[1] != t[2])) {
-      const starcat_real sides[3] = {sc_angle_of_chord(sc_chord_square(body[t[1]], body[t[2]])),
-                                     sc_angle_of_chord(sc_chord_square(body[t[0]], body[t[2]])),
-                                     sc_angle_of_chord(sc_chord_square(body[t[0]], body[t[1]]))};
+      const starcat_real sides[3] = {
+          starcat_angle_of_chord(starcat_chord_square(body[t[1]], body[t[2]])),
+          starcat_angle_of_chord(starcat_chord_square(body[t[0]], body[t[2]])),
+          starcat_angle_of_chord(starcat_chord_square(body[t[0]], body[t[1]]))};
       memcpy(unit_work.body, body, sizeof body);
       unit_work.steps_left = 1000000;
       memcpy(unit_work.body[t[1]], unit_work.body[t[0]], sizeof body[0]);
-      CHECK_IS(sc_triangle(&call, t, sides), 0);
-      CHECK_IS(sc_triangle(&call, t, line), 0);
+      CHECK_IS(starcat_triangle(&call, t, sides), 0);
+      CHECK_IS(starcat_triangle(&call, t, line), 0);
     }
   }
   CHECK_IS(unit_work.n_tried, 0);
@@ -84,32 +85,33 @@ static void check_too_near(void) {
   unit_copy(&unit_pyramid);
   begin(&unit_scratch, 4, SKY_SPOTS, 0);
   memcpy(&at, unit_scratch.bytes + 256u + 4u, 4);
-  sc_rows_of(&unit_scratch.image, 0, 2, rows + 1);
+  starcat_rows_of(&unit_scratch.image, 0, 2, rows + 1);
   rows[0] = rows[1] == 0u ? rows[2] + 1u : rows[1] - 1u;
   const int32_t *place = unit_scratch.image.directions + 3u * (size_t)rows[0];
   for (uint32_t n = 0; n < 3u; n++) {
     const int32_t near[3] = {place[0] + steps[n][0], place[1] + steps[n][1], place[2]};
     memcpy(unit_scratch.bytes + at + 12u * (size_t)rows[n], near, 12);
     starcat_real *body = unit_work.body[n];
-    sc_star(&unit_scratch.image, rows[n], body);
-    const starcat_real length = STARCAT_SQRT(sc_dot(body, body));
+    starcat_star(&unit_scratch.image, rows[n], body);
+    const starcat_real length = STARCAT_SQRT(starcat_dot(body, body));
     for (uint32_t k = 0; k < 3u; k++) {
       body[k] /= length;
     }
   }
   for (uint32_t n = 0; n < 3u; n++) {
     const uint32_t a = (n + 1u) % 3u, b = (n + 2u) % 3u;
-    sides[n] = sc_angle_of_chord(sc_chord_square(unit_work.body[a], unit_work.body[b]));
+    sides[n] = starcat_angle_of_chord(starcat_chord_square(unit_work.body[a], unit_work.body[b]));
     unit_work.separation_rad[a > b ? a * (a - 1u) / 2u + b : b * (b - 1u) / 2u + a] = sides[n];
   }
   unit_scratch.image.kvector_slope = (starcat_real)1e5; /* every side is that of the first pairs */
   call.tolerance_rad = (starcat_real)2e-8;
-  CHECK_IS(sc_pyramid(&call, triple, sides), 0);
+  CHECK_IS(starcat_pyramid(&call, triple, sides), 0);
   CHECK_IS(unit_work.n_tried, 0);
 }
 #endif
 
-/* A camera of 180 degrees but for a millionth of an arcsecond: opposite corners are opposite. */
+/* A camera of 180 degrees but for a millionth of an arcsecond, too wide for a plane to show; and
+ * one whose stars, in opposite corners, are 178 degrees apart. */
 static void check_half_sky(void) {
   unit_copy(&unit_pyramid);
   unit_scratch.camera.width_px = (starcat_real)1e6;
@@ -124,6 +126,9 @@ static void check_half_sky(void) {
     truth.magnitudes[n] = (starcat_real)n;
   }
   unit_scratch.options.max_steps = 100000;
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_CAMERA);
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_CAMERA);
+  unit_scratch.camera.focal_length_px = (starcat_real)10000.0;
   CHECK(unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED);
   CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_OPTIONS);
 }
@@ -174,14 +179,14 @@ static void check_bounds_of_shapes(void) {
   static const double errors[4] = {1e-4, 0.01, 0.15, 2.0};
   const uint32_t triple[3] = {0, 1, 2};
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  sc_allow_scales(&call, (starcat_real)0.5);
+  starcat_allow_scales(&call, (starcat_real)0.5);
   for (uint32_t n = 0; n < 16u; n++) {
     const double *size = sizes[n % 4u];
     const starcat_real sides[3] = {(starcat_real)size[0], (starcat_real)size[1],
                                    (starcat_real)size[2]};
     call.tolerance_rad = (starcat_real)errors[n / 4u];
     unit_work.steps_left = 20000;
-    const int has_ended = sc_triangle(&call, triple, sides);
+    const int has_ended = starcat_triangle(&call, triple, sides);
     CHECK((has_ended == 0) || (unit_work.steps_left == 0u) ||
           (unit_work.best.log_chance <= call.log_certain));
   }
@@ -190,7 +195,7 @@ static void check_bounds_of_shapes(void) {
     starcat_real m[9];
     unit_work.x[SKY_SPOTS - 1u] = unit_work.x[0];
     unit_work.y[SKY_SPOTS - 1u] = unit_work.y[0];
-    sc_list_columns(&call);
+    starcat_list_columns(&call);
     for (uint32_t at = 1; (n > 0u) && (at < unit_work.count); at++) {
       if (unit_work.in_column[at] == SKY_SPOTS - 1u) {
         unit_work.in_column[at] = unit_work.in_column[at - 1u];
@@ -199,14 +204,14 @@ static void check_bounds_of_shapes(void) {
     }
     unit_work.steps_left = 1000000;
     unit_matrix_of(&truth, m);
-    (void)sc_try(&call, m, (starcat_real)1.0);
+    (void)starcat_try(&call, m, (starcat_real)1.0);
     CHECK(unit_work.found.star[0] >= 0);
     CHECK_IS(unit_work.found.star[SKY_SPOTS - 1u], -1);
   }
 }
 
-/* So many spots of unknown brightness that only near ones make triangles: stars on a crowded sky, and
- * a lattice; with any number of steps. */
+/* So many spots of unknown brightness that only near ones make triangles: stars on a crowded sky,
+ * and a lattice; with any number of steps. */
 static void check_spread(void) {
   unit_copy(&unit_crowded);
   for (uint32_t n = 0; n < 8u; n++) {
@@ -322,10 +327,10 @@ static void check_second_rows(void) {
 static void check_wide(void) {
   uint32_t start = 7, stop = 7;
   uint64_t seed = 4;
-  sc_rows_between(&unit_triangle.image, (starcat_real)-9.0, (starcat_real)-8.0, &start, &stop);
+  starcat_rows_between(&unit_triangle.image, (starcat_real)-9.0, (starcat_real)-8.0, &start, &stop);
   CHECK_IS(start, 0);
   CHECK_IS(stop, 0);
-  sc_rows_between(&unit_triangle.image, (starcat_real)8.0, (starcat_real)9.0, &start, &stop);
+  starcat_rows_between(&unit_triangle.image, (starcat_real)8.0, (starcat_real)9.0, &start, &stop);
   CHECK_IS(start, unit_triangle.image.n_features);
   CHECK_IS(stop, unit_triangle.image.n_features);
   const unit_sky *skies[3] = {&unit_pyramid, &unit_triangle, &unit_crowded};
@@ -334,8 +339,10 @@ static void check_wide(void) {
     unit_scratch.options.tolerance_px = (starcat_real)(n == 2u ? 20.0 : 250.0);
     unit_scratch.options.max_steps = 200000;
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.2, SKY_SPOTS, 0, &truth);
-    CHECK((unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED) || (unit_wrong_stars(&truth) == 0u));
-    CHECK((track(&unit_scratch, (starcat_real)0.3) != STARCAT_IDENTIFIED) || (unit_wrong_stars(&truth) == 0u));
+    CHECK((unit_identify(&unit_scratch, &truth) != STARCAT_IDENTIFIED) ||
+          (unit_wrong_stars(&truth) == 0u));
+    CHECK((track(&unit_scratch, (starcat_real)0.3) != STARCAT_IDENTIFIED) ||
+          (unit_wrong_stars(&truth) == 0u));
   }
 }
 
@@ -361,16 +368,26 @@ static void check_noises(void) {
  * number of all ways. */
 static void check_ways(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(sc_try(&call, unit_result.matrix, (starcat_real)1.0));
+  CHECK(starcat_try(&call, unit_result.matrix, (starcat_real)1.0));
   call.mag_reach = (starcat_real)100.0;
-  sc_count_ways(&call, 5);
+  starcat_count_ways(&call, 5);
   const double all = (double)unit_work.log_ways[5];
-  CHECK_NEAR((double)sc_log_ways(&call, 5), all, 1e-4);
+  CHECK_NEAR((double)starcat_log_ways(&call, 5), all, 1e-4);
+  /* Of more stars than single precision adds up in units of the largest number. */
+  const uint32_t stars = unit_work.n_within;
+  for (uint32_t j = stars; j < 180u; j++) {
+    unit_work.within[j] = unit_work.within[j - stars];
+  }
+  unit_work.n_within = 180;
+  starcat_count_ways(&call, SKY_SPOTS);
+  CHECK_NEAR((double)starcat_log_ways(&call, SKY_SPOTS), (double)unit_work.log_ways[SKY_SPOTS],
+             1e-3);
+  unit_work.n_within = stars;
   for (uint32_t i = 0; i < unit_work.count; i++) {
     unit_work.magnitude[i] = (starcat_real)1000.0;
   }
-  sc_count_ways(&call, 5);
-  CHECK(sc_log_ways(&call, 5) < (starcat_real)-1e29);
+  starcat_count_ways(&call, 5);
+  CHECK(starcat_log_ways(&call, 5) < (starcat_real)-1e29);
 }
 
 /* A prior that reaches beyond the fold of the lens, where nothing is seen; and one so wide that
@@ -414,12 +431,11 @@ static void check_cap(const double centre[3], double cosine, double sine, uint32
   const starcat_real margin = (starcat_real)IF_SINGLE(7e-7, 2e-9);
   uint32_t within = 0, beside = 0, missing = 0;
   unit_work.steps_left = 1000000;
-  const uint32_t count =
-      sc_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
+  const uint32_t count = starcat_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real star[3];
-    sc_star(call.image, row, star);
-    const starcat_real nearness = sc_dot(star, c);
+    starcat_star(call.image, row, star);
+    const starcat_real nearness = starcat_dot(star, c);
     beside += (uint32_t)((nearness >= cos_r - margin) && (nearness < cos_r));
     if (nearness >= cos_r) {
       within++;
@@ -438,14 +454,14 @@ static void check_narrow_caps(void) {
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real centre[3], icrs[8][3];
     uint32_t rows[8];
-    sc_star(call.image, row, centre);
-    const starcat_real length = STARCAT_SQRT(sc_dot(centre, centre));
+    starcat_star(call.image, row, centre);
+    const starcat_real length = STARCAT_SQRT(starcat_dot(centre, centre));
     for (uint32_t k = 0; k < 3u; k++) {
       centre[k] /= length;
     }
     unit_work.steps_left = 1000000;
-    const uint32_t count = sc_gather(&call, centre, (starcat_real)(1.0 - 5e-13),
-                                     (starcat_real)1e-6, 8, rows, icrs);
+    const uint32_t count = starcat_gather(&call, centre, (starcat_real)(1.0 - 5e-13),
+                                          (starcat_real)1e-6, 8, rows, icrs);
     missing += (uint32_t)!is_listed(rows, count, row);
   }
   CHECK_IS(missing, 0);
@@ -521,8 +537,8 @@ static void check_clusters(void) {
       }
     }
     const starcat_frame frame = unit_frame_of(&truth);
-    CHECK_IS(sc_begin(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
-                      &frame, &unit_work, &unit_result),
+    CHECK_IS(starcat_begin(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
+                           &frame, &unit_work, &unit_result),
              STARCAT_IDENTIFIED);
     unit_matrix_of(&truth, m);
     for (uint32_t k = 0; k < 3u; k++) { /* turned by up to five reaches about y, and about z */
@@ -533,15 +549,16 @@ static void check_clusters(void) {
       m[3u + k] = y - roll * x;
       m[6u + k] = z - turn * x;
     }
-    certain += (uint32_t)sc_try(&call, m, (starcat_real)1.0);
-    for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < unit_work.count); k++) {
+    certain += (uint32_t)starcat_try(&call, m, (starcat_real)1.0);
+    for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < unit_work.count);
+         k++) {
       const int32_t star = unit_work.best.star[k];
       wrong += (uint32_t)((star >= 0) && (truth.star[unit_work.row[k]] >= 0) &&
                           (star != truth.star[unit_work.row[k]]));
     }
     unit_work.found.n_matched = 6;
     unit_work.found.residual_rad = (starcat_real)0.1;
-    sc_weigh(&call, m, call.tolerance_rad, &unit_work.found);
+    starcat_weigh(&call, m, call.tolerance_rad, &unit_work.found);
   }
   CHECK((certain > 40u) && (certain < 240u));
   CHECK(wrong < 4u);

@@ -6,12 +6,12 @@
 #include "unit.h"
 
 static sky_frame truth;
-static sc_call call;
+static starcat_call call;
 
 static starcat_status begin(const unit_sky *sky) {
   const starcat_frame frame = unit_frame_of(&truth);
-  return sc_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                  &unit_result);
+  return starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                       &unit_result);
 }
 
 /* The focal length that was found, over the true one. */
@@ -55,18 +55,19 @@ static void check_lens(void) {
     sky_look(&unit_triangle.image, &unit_scratch.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
     unit_scratch.options.fov_error = (starcat_real)0.2;
     unit_scratch.camera.focal_length_px *= (starcat_real)(1.0 + 0.1 * sky_uniform(&state));
-    found += (uint32_t)((unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) && (unit_wrong_stars(&truth) == 0u));
+    found += (uint32_t)((unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) &&
+                        (unit_wrong_stars(&truth) == 0u));
   }
   CHECK(found >= 19u);
   CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
-  sc_set_focal(&call, (starcat_real)1.05);
+  starcat_set_focal(&call, (starcat_real)1.05);
   CHECK(call.focal == (starcat_real)1.05);
   CHECK(call.body == unit_work.scaled);
-  sc_set_focal(&call, (starcat_real)0.8);
+  starcat_set_focal(&call, (starcat_real)0.8);
   CHECK(call.focal == (starcat_real)1.0);
   CHECK(call.body == unit_work.body);
   CHECK(call.camera.given.focal_length_px == unit_scratch.camera.focal_length_px);
-  CHECK(sc_pixel(&call.camera, unit_work.body[0], &x, &y));
+  CHECK(starcat_pixel(&call.camera, unit_work.body[0], &x, &y));
   CHECK_NEAR(x, unit_work.x[0], 1e-3);
   CHECK_NEAR(y, unit_work.y[0], 1e-3);
 }
@@ -136,7 +137,7 @@ static void check_near(void) {
       unit_work.body[i][1] = (starcat_real)(scale * v);
       unit_work.body[i][2] = (starcat_real)scale;
     }
-    (void)sc_try(&call, m, (starcat_real)1.0);
+    (void)starcat_try(&call, m, (starcat_real)1.0);
     const starcat_real bound = unit_work.best.log_bound, focal = unit_work.best.focal;
     CHECK(bound - bound == (starcat_real)0.0);
     CHECK((focal >= (starcat_real)0.6999) && (focal <= (starcat_real)1.4287));
@@ -191,9 +192,9 @@ static void check_corners(void) {
         unit_crowded.camera.focal_length_px * (starcat_real)scales[n % 4u];
     unit_matrix_of(&truth, m);
     CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
-    (void)sc_try(&call, m, (starcat_real)1.0);
-    (void)sc_try(&call, other, (starcat_real)0.96);
-    if (sc_end(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED) {
+    (void)starcat_try(&call, m, (starcat_real)1.0);
+    (void)starcat_try(&call, other, (starcat_real)0.96);
+    if (starcat_end(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED) {
       for (uint32_t k = 0; k < truth.count; k++) {
         wrong += (uint32_t)((unit_result.star[k] >= 0) && (truth.star[k] >= 0) &&
                             (unit_result.star[k] != truth.star[k]));

@@ -4,6 +4,7 @@
  * SPDX-License-Identifier: MIT
  */
 #include "unit.h"
+#include "traps.h"
 
 #include <string.h>
 
@@ -72,12 +73,14 @@ int main(void) {
                {"answer", test_answer},   {"crowded", test_crowded}, {"scale", test_scale}};
   const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
   const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
+  traps_on();
   make_sky(&unit_triangle, &triangles);
   make_sky(&unit_pyramid, &pairs);
   make_sky(&unit_crowded, &crowded);
   for (size_t n = 0; n < sizeof tests / sizeof tests[0]; n++) {
     const unsigned before = check_failures;
     tests[n].run();
+    CHECK_IS(traps_seen(), 0);
     if (check_failures != before) {
       (void)fprintf(stderr, "test %s: %u failed\n", tests[n].name, check_failures - before);
     }

@@ -23,7 +23,13 @@ from starcat.query.gallery import macros
 from starcat.query.messages import Statement
 from starcat.query.names import quoted, short_names
 from starcat.query.result import RunningQuery, facts_by_name, result_column
-from starcat.query.spatial_macros import place_macros, place_statements, places_schema, reading
+from starcat.query.spatial_macros import (
+    moving_statements,
+    place_macros,
+    place_statements,
+    places_schema,
+    reading,
+)
 from starcat.query.targets import Target, View, open_targets
 
 PREAMBLE_GB = 1.0  # memory for looking into the footers of Parquet files
@@ -151,6 +157,8 @@ def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
 def preamble(targets: Sequence[Target]) -> str:
     """Return the SQL that makes the views and the macros of some targets."""
     tables = [macro for macro in macros() if macro.is_table]
+    # Those that stand for no target in particular are made once.
+    shared = [macro for macro in tables if "{places}" not in macro.text]
     lines = [macro.text + ";" for macro in macros() if not macro.is_table]
     lines.append(place_macros())
     for target in targets:
@@ -159,8 +167,29 @@ def preamble(targets: Sequence[Target]) -> str:
         lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
         for view in target.views:
             lines += _view_statements(f"{schema}.{view.name}", view)
-        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in tables]
+        own = [macro for macro in tables if macro not in shared]
+        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in own]
+    lines += moving_statements(_named_views(targets))
+    lines += [macro.text + ";" for macro in shared]
     return "\n".join(lines)
+
+
+def _named_views(targets: Sequence[Target]) -> dict[str, tuple[str, View]]:
+    """Return views by the names that ``crossmatch`` takes, each with its schema of places.
+
+    ``a.stars`` is also ``a``, and ``stars`` where there is one target.
+    """
+    found: dict[str, tuple[str, View]] = {}
+    for schema, target in schemas_of(targets).items():
+        places = places_schema(target)
+        stars = next((v for v in target.views if v.name == "stars"), target.views[0])
+        found[schema] = places, stars
+        for view in target.views:
+            found[f"{schema}.{view.name}"] = places, view
+    if len(targets) == 1:
+        views = [(places_schema(targets[0]), view) for view in targets[0].views]
+        found |= {view.name: (places, view) for places, view in views}
+    return found
 
 
 def preamble_of(given: Sequence[str]) -> str:

@@ -4,18 +4,38 @@ Each target has a schema of them beside its own, which SHOW TABLES leaves out. A
 table with ``_place_ra_deg`` and ``_place_dec_deg``, whatever these columns are called in it, and
 with the file of a row in ``_place_file`` where the table is spread over the sky in many files. What
 is known of these files is a variable of the view's name. A macro compares it with a constant place
-once, before DuckDB opens a file.
+once, before DuckDB opens a file. ``crossmatch`` looks at tables of several targets, by names in one
+schema.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from starcat.query.names import quoted, quoted_name
 from starcat.query.targets import POSITION, Target, View
 
 _MACROS = Path(__file__).parent / "sql" / "spatial_macros.sql"
+
+MOTION = ("epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+
+_MOVING_VIEW = """CREATE VIEW _moving."{name}" AS
+SELECT * EXCLUDE (_place_file, _place_ra_deg, _place_dec_deg, _at_east, _at_north),
+    cosd(_place_dec_deg) * cosd(_place_ra_deg) AS _at_x,
+    cosd(_place_dec_deg) * sind(_place_ra_deg) AS _at_y,
+    sind(_place_dec_deg) AS _at_z,
+    -_at_north * sind(_place_dec_deg) * cosd(_place_ra_deg) - _at_east * sind(_place_ra_deg)
+        AS _at_vx,
+    -_at_north * sind(_place_dec_deg) * sind(_place_ra_deg) + _at_east * cosd(_place_ra_deg)
+        AS _at_vy,
+    _at_north * cosd(_place_dec_deg) AS _at_vz
+FROM (
+    SELECT *, {jyear} AS _at_jyear,
+        radians(coalesce({east} + 0 * {north}, 0) / 3600e3) AS _at_east,
+        radians(coalesce({north} + 0 * {east}, 0) / 3600e3) AS _at_north
+    FROM {schema}.{view}
+);"""
 
 _NEAR = "_may_be_near(found, file, known, ra, dec, radius)"
 _BETWEEN = "_may_be_between(file, known, ra_min, ra_max, dec_min, dec_max)"
@@ -60,6 +80,21 @@ def place_statements(target: Target) -> Iterator[str]:
             yield f"SET VARIABLE {variable} = {_known_of_files(view)};"
 
 
+def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
+    """Give the SQL that makes the views which ``crossmatch`` reads, by their names in it.
+
+    Each is a view with places of a schema, with the unit vectors of its rows and their change in a
+    year, which is 0 where no motion or no epoch is known.
+    """
+    yield "CREATE SCHEMA IF NOT EXISTS _moving;"
+    for name, (schema, view) in views.items():
+        is_moving = {column.lower() for column in view.columns}.issuperset(MOTION)
+        jyear, east, north = MOTION if is_moving else ("NULL::DOUBLE", "0", "0")
+        yield _MOVING_VIEW.format(
+            name=name, schema=schema, view=view.name, jyear=jyear, east=east, north=north
+        )
+
+
 def reading(view: View, more: str = "") -> str:
     """Return the SQL that reads the files of a view."""
     files = ", ".join(map(quoted, view.files))
@@ -72,8 +107,8 @@ def _position(view: View) -> tuple[str, str]:
     missing = [name for name in view.position if name.lower() not in by_lower]
     if missing:
         told = quoted(
-            f"{view.name} has no column {' and no '.join(missing)}; cone, box and field are for "
-            "tables with places, name another with of := 'TABLE'"
+            f"{view.name} has no column {' and no '.join(missing)}; cone, box, field "
+            "and crossmatch are for tables with places, name another with of := 'TABLE'"
         )
         return f"error({told})::DOUBLE", f"error({told})::DOUBLE"
     ra, dec = (quoted_name(by_lower[name.lower()]) for name in view.position)
