@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ from hats_stores import write_catalog
 from served import in_background
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest, write_star_tables
 from starcat.catalog.source import give_map
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
 from starcat.pipeline.build import build
@@ -183,6 +186,7 @@ TOLD: dict[str, tuple[dict[str, Any], type[StarcatError], str]] = {
     "packed": ({"encoding": "gzip"}, DownloadError, "packs the body although"),
     "changed": ({"changes_to": b"x" * 5000}, ChecksumMismatch, "has changed.*remove that to read"),
     "no Parquet": ({"body": b"<html>" * 500}, ProductError, "is no Parquet file"),
+    "damaged": ({"body": b"?" * 900 + b"\x40\0\0\0PAR1"}, ProductError, "Npix=.*is damaged"),
     "empty": ({"body": b""}, DownloadError, "the server"),
     "stalled for ever": (
         {"stall": threading.Event(), "cut_after": [9] * 9},
@@ -217,6 +221,26 @@ def test_what_came_before_a_fault_is_kept(archive, folder):
 
 
 @SLOW
+def test_a_killed_read_goes_on(archive, folder, tmp_path):
+    address = archive.serve_folder("/sky", folder)
+    for remote in archive.remotes.values():
+        remote.pause_s = 0.05
+    command = [sys.executable, "-m", "starcat", "ingest", "sao", "--input", address, "-o"]
+    killed = subprocess.Popen([*command, tmp_path / "a.parquet"], stderr=subprocess.DEVNULL)
+    while sum("Npix" in one.path for one in archive.requests) < 8:
+        assert killed.poll() is None
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    for remote in archive.remotes.values():
+        remote.pause_s = 0.0
+    assert not (tmp_path / "a.parquet").exists()
+    subprocess.run([*command, tmp_path / "a.parquet"], check=True, stdout=subprocess.DEVNULL)
+    write_star_tables(read(folder), tmp_path / "b.parquet")
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+
+
+@SLOW
 def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_path, monkeypatch):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, address = read_spec(tmp_path / "spec.toml"), archive.serve_folder("/sky", folder)
@@ -229,6 +253,16 @@ def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "another"))
     with pytest.raises(ChecksumMismatch, match="has changed: what was read of it has sha256"):
         rebuild(made, {"sao": [input_path(address)]})
+
+
+@pytest.mark.parametrize(
+    "account", ["", "[]", "{}", '{"partitions": [{"order": "../../x", "pixel": 1, "repeated": 1}]}']
+)
+def test_what_a_server_says_becomes_no_path(archive, folder, account):
+    address = archive.serve_folder("/sky", folder)
+    archive.serve("/sky/store.json", account.encode())
+    with pytest.raises(ProductError, match=r"store\.json: cannot be read"):
+        read(address)
 
 
 LACKING: dict[str, tuple[str, str]] = {
