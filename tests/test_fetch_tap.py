@@ -98,6 +98,7 @@ RESUMED = {
     "result cut": [Fault("results/result", cut=700, times=2)],
     "result 502": [Fault("results/result", 502)],
     "result slow": [Fault("results/result", wait_s=1.5)],
+    "result packed": [Fault("results/result", is_packed=True, times=99)],
     "no deletion": [Fault("DELETE ", 500, times=50)],
 }
 

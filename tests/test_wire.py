@@ -17,6 +17,7 @@ from served import in_background
 
 from starcat.artifact.reader import open_artifact
 from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.source import give_map
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
 from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
@@ -123,6 +124,26 @@ def test_only_what_a_limit_leaves_is_asked_for(archive, folder):
     assert ends == ["bytes=-512"] * len(open_store(folder).catalog.partitions)
 
 
+MAP = """\
+name = "others"
+epoch = 2026.0
+columns = { star_id = "star_id", ra = "ra_deg", dec = "dec_deg" }
+magnitudes = { V = "mag" }
+"""
+
+
+def test_of_a_table_with_a_map_the_columns_of_the_map_are_asked_for(archive, folder, tmp_path):
+    (tmp_path / "others.toml").write_text(MAP)
+    assert give_map(tmp_path / "others.toml").name == "others"
+    note = input_path(archive.serve_folder("/sky", folder))
+    found, whole = (read_catalog("others", [one], read_limit_mag=4.0) for one in (note, folder))
+    assert found.stars.equals(whole.stars)
+    assert found.rejected_by_reason == whole.rejected_by_reason
+    assert found.files[0].name.startswith(archive.url("/sky/dataset/Norder="))
+    sent = sum(one.sent for one in archive.requests if "Npix" in one.path)
+    assert sent < 0.5 * sum(path.stat().st_size for path in folder.rglob("Npix*.parquet"))
+
+
 RESUMED: dict[str, dict[str, Any]] = {
     "cut in the end": {"cut_after": [100]},
     "cut twice": {"cut_after": [512, 4, 100, 50]},
@@ -138,7 +159,10 @@ RESUMED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(
     "fault",
-    [pytest.param(name, marks=SLOW) if name[:2] in ("st", "sl") else name for name in RESUMED],
+    [
+        pytest.param(name, marks=SLOW) if name not in ("cut twice", "500 once") else name
+        for name in RESUMED
+    ],
 )
 def test_a_fault_is_resumed(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
@@ -168,8 +192,11 @@ TOLD: dict[str, tuple[dict[str, Any], type[StarcatError], str]] = {
 }
 
 
+QUICK = ("500 for ever", "no ranges", "changed", "no Parquet")
+
+
 @pytest.mark.parametrize(
-    "fault", [pytest.param(name, marks=SLOW) if name[:2] == "st" else name for name in TOLD]
+    "fault", [pytest.param(name, marks=SLOW) if name not in QUICK else name for name in TOLD]
 )
 def test_a_fault_is_told(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
@@ -242,3 +269,16 @@ def test_a_note_elsewhere_is_no_address(archive, tmp_path):
     kept = note("http://127.0.0.1:9/sky")
     copy = kept.rename(tmp_path / kept.name)
     assert wire.address_of(copy) is None
+
+
+def test_no_service_makes_an_address_an_input():
+    rooms = Path(wire.__file__).parents[1]
+    sources = [path for room in ("service", "query", "vo") for path in (rooms / room).rglob("*.py")]
+    words = ("input_path", "catalog.tap", "store.wire", "is_address")
+    assert len(sources) > 50
+    assert not [path for path in sources for word in words if word in path.read_text()]
+
+
+def test_a_table_that_is_joined_is_read_from_a_file(archive, starcat):
+    ran = starcat(["build", "--preset", "gaia-12deg", "--input", "vsx=http://127.0.0.1:9/x"])
+    assert (ran.code, "vsx is read from a file; bring it here" in ran.err) == (2, True)

@@ -284,7 +284,7 @@ class _Fetch:
 
     def _ask(self, query: str, maxrec: int | None = None) -> OpenTable:
         """Run a query as a job, and read the VOTable that it gives."""
-        path = self.work / "answer.vot"
+        path = self.work / "answer.vot.gz"  # whether it is packed is up to the service
         try:
             return self._answer(query, path, maxrec)
         finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import re
 import threading
@@ -168,6 +169,7 @@ class Fault:
     wait_s: float = 0.0
     swap: tuple[bytes, bytes] = (b"", b"")  # in the answer's body, and in the request's
     times: int = 1
+    is_packed: bool = False  # by gzip, though nobody asked for it
 
 
 class RelayHandler(BaseHTTPRequestHandler):
@@ -192,11 +194,14 @@ class RelayHandler(BaseHTTPRequestHandler):
         connection.close()
         if fault is not None:
             data = data.replace(*fault.swap) if fault.swap[0] else data
+            data = gzip.compress(data) if fault.is_packed else data
         self.send_response(answer.status)
         for key, value in answer.getheaders():
             if key.lower() not in ("content-length", "transfer-encoding", "connection"):
                 self.send_header(key, value)
         self.send_header("Content-Length", str(len(data)))
+        if fault is not None and fault.is_packed:
+            self.send_header("Content-Encoding", "gzip")
         self.end_headers()
         self.wfile.write(data if fault is None or fault.cut is None else data[: fault.cut])
 
