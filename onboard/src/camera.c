@@ -147,7 +147,7 @@ static real distortion_of(const starcat_camera *c) {
 }
 
 static int is_possible(const starcat_camera *c) {
-  if (!starcat_are_finite(c, sizeof *c / sizeof(real))) {
+  if (!starcat_are_finite((const real *)(const void *)c, sizeof *c / sizeof(real))) {
     return 0;
   }
   const real most_px =

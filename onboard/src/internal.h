@@ -132,7 +132,7 @@ static inline void starcat_rows_of(const starcat_image *image, uint32_t feature,
 }
 
 /* frame.c */
-int starcat_are_finite(const void *numbers, uint32_t count);
+int starcat_are_finite(const real *numbers, uint32_t count);
 
 /* attitude.c */
 int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
