@@ -7,7 +7,7 @@ import pytest
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.geometry.proximity import nearest_neighbours, pairs_within
+from starcat.geometry.proximity import nearest_chords, nearest_neighbours, pairs_within
 from starcat.geometry.sphere import (
     directions_from_radec,
     radec_from_directions,
@@ -53,6 +53,21 @@ def test_nearest_neighbours(kind, random_directions):
     # By separation, not by row: of equally near ones either will do.
     assert np.abs(found - dense.min(axis=1)).max() < ROUNDING_RAD
     assert np.abs(dense[rows, index] - dense.min(axis=1)).max() < ROUNDING_RAD
+
+
+@pytest.mark.parametrize("name", ["even", "twins", "cluster"])
+def test_nearest_neighbours_of_many_are_those_of_each_alone(name, random_directions):
+    u = random_directions(12_000, 7)
+    if name == "twins":  # several at the same distance, of which the lowest rank counts
+        u = np.concatenate([u[:6000], u[:4000], u[:3000]])
+    elif name == "cluster":
+        u[::2] = u[0] + 1e-3 * u[::2]
+        u /= np.linalg.norm(u, axis=1)[:, None]
+    rows, rank = np.arange(len(u)), np.random.default_rng(3).permutation(len(u))
+    chord, index = nearest_chords(u, u, rows, rank)
+    parts = [nearest_chords(u[k], u, k, rank) for k in np.array_split(rows, 3)]
+    assert chord.tobytes() == np.concatenate([part[0] for part in parts]).tobytes()
+    assert index.tolist() == np.concatenate([part[1] for part in parts]).tolist()
 
 
 def test_nearest_neighbours_of_antipodes(random_directions):

@@ -28,6 +28,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         assert page.complaints == []
 
 
+@pytest.mark.slow
 def test_every_page_is_reached_by_the_menu_of_a_phone(page):
     look(page, "light", 360)
     names = []

@@ -360,7 +360,10 @@ def test_no_more_random_frames_agree_with_the_magnitudes_of_stars(
     assert (found <= 0.3).any()
 
 
-@pytest.mark.parametrize(("noise_px", "noise_mag"), [(0.01, None), (0.2, None), (0.01, 0.3)])
+@pytest.mark.parametrize(
+    ("noise_px", "noise_mag"),
+    [pytest.param(0.01, None, marks=pytest.mark.slow), (0.2, None), (0.01, 0.3)],
+)
 def test_no_more_random_frames_agree_where_noises_are_stated(
     random_directions, noise_px, noise_mag
 ):

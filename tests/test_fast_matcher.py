@@ -129,7 +129,8 @@ def test_what_cannot_be_used_is_reported_alike(sky):
     odd = [[nan, 5], [5, nan], [-1, 5], [1024, 5], [5, 1024], [0, 0], *frame.centroids_px[:3]]
     given_px = np.concatenate([odd, frame.centroids_px])
     mag = np.concatenate([[nan, 1, 2, 3, 4, nan, 1.0, 9.0, nan], frame.mag])
-    for magnitudes in (None, mag, np.full(len(mag), nan)):
+    infinite = np.where(np.isnan(mag), -np.inf, mag)
+    for magnitudes in (None, mag, infinite, np.full(len(mag), nan)):
         expected = in_numpy.identify(given_px, magnitudes=magnitudes)
         assert len(expected.dropped) == 8
         assert_same(in_c.identify(given_px, magnitudes=magnitudes), expected)

@@ -240,7 +240,7 @@ def test_the_undamaged_records_are_kept(tmp_path, source_name, layout_name):
     ("source_name", "layout_name"), [one for one in TARGETS if one[0] not in MADE_ONLY]
 )
 def test_damaged_records(tmp_path, source_name, layout_name):
-    run(tmp_path, source_name, layout_name, 100)
+    run(tmp_path, source_name, layout_name, 50)
 
 
 @pytest.mark.slow

@@ -233,7 +233,12 @@ def whole(catalogs_made: Path) -> tuple[Summary, pa.Table]:
 
 
 @pytest.mark.parametrize(
-    ("a", "b"), [("sao", "hipparcos.parquet"), ("sao.parquet", "hipparcos"), ("sao", "hipparcos")]
+    ("a", "b"),
+    [
+        ("sao", "hipparcos.parquet"),
+        pytest.param("sao.parquet", "hipparcos", marks=pytest.mark.slow),
+        pytest.param("sao", "hipparcos", marks=pytest.mark.slow),
+    ],
 )
 def test_a_store_and_a_file(a, b, catalogs_made, whole, tmp_path):
     wanted = Crossmatch(radius_arcsec=20.0)
@@ -385,6 +390,7 @@ def changed(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     pq.write_table(change(pq.ParquetFile(path).read()), path)
 
 
+@pytest.mark.slow
 def test_a_store_that_matches_itself_also_with_larger_texts(store):
     expected = matched(store)
     assert (expected.stars, expected.matched, expected.verdicts["unique"]) == (60, 60, 60)

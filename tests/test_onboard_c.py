@@ -30,7 +30,7 @@ COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stac
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("vendored") / "onboard"
-    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python"))
+    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python", "target"))
     return copy
 
 
@@ -205,6 +205,11 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
     assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
 
 
+def test_callers_of_other_configurations_do_not_link(folder):
+    said = make(folder, "misuse", "CFLAGS=-O0", "BUILD=build-misuse")
+    assert "3 callers of other configurations do not link, 5 flags do not compile" in said
+
+
 def test_every_deviation_from_misra_is_explained():
     text = (ONBOARD / "tests" / "cppcheck.txt").read_text()
     suppressed = re.findall(r"^misra-c2012-(\S+)|^(\w+):", text, re.MULTILINE)
@@ -215,7 +220,12 @@ def test_every_deviation_from_misra_is_explained():
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
-    "target", ["hostile", "misuse", "sanitize", "valgrind", "coverage", "cppcheck", "size"]
+    "target",
+    [
+        *("hostile", "sanitize", "valgrind", "coverage", "cppcheck", "size"),
+        *("test-amalgamation", "test-install", "test-cpp", "test-rust", "test-ada"),
+        "microcontroller",
+    ],
 )
 def test_tools_find_nothing(folder, target):
     said = make(folder, target, f"BUILD=build-{target}")

@@ -56,6 +56,7 @@ def error_rad(page: str, matrix: np.ndarray) -> float:
     return float(2.0 * np.arccos(np.clip(abs(true @ quaternion_in(page)), 0.0, 1.0)))
 
 
+@pytest.mark.slow
 def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     answer = asked(client, seed=SEED)
     assert answer.status_code == 200

@@ -174,7 +174,7 @@ def test_after_all_attempts_the_session_still_answers(session, folder):
     ],
     ids=["huge-join", "endless-recursion", "huge-sort"],
 )
-@pytest.mark.parametrize("form", ["rows", "batches"])
+@pytest.mark.parametrize("form", ["rows", pytest.param("batches", marks=pytest.mark.slow)])
 def test_what_takes_too_much_is_stopped(session, text, form):
     with (
         pytest.raises(QueryLimitError, match=r"stopped after 1 s|needs more than"),

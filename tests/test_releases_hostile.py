@@ -103,6 +103,7 @@ def test_nonsense_of_a_server_is_an_error_of_starcat(answer, tmp_path):
     gc.collect()
 
 
+@pytest.mark.slow
 @leaves_sockets
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer, tmp_path):

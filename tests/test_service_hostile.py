@@ -162,11 +162,16 @@ def build_of(name: str, /, **changes: str) -> Hostile:
 EVALUATE = {"kind": "evaluate", "database": "../../../etc"}
 INGEST = {"kind": "ingest", "source": "/etc/passwd"}
 PRESET = {"kind": "build", "preset": "../../x"}
+ADDRESS = "http://127.0.0.1:9/hats"
 FIELDS = [
     as_json("a path as a database to publish", "/api/v1/releases", (404, 422), {"database": ".."}),
     as_json("a path as a database to evaluate", JOBS, (404, 422), EVALUATE),
     as_json("a path as a catalog", JOBS, (404, 422), INGEST),
     as_json("a path as a preset", JOBS, (404, 422), PRESET),
+    as_json("an address as a catalog", JOBS, (404, 422), {**INGEST, "source": ADDRESS}),
+    as_json("an address as an input", JOBS, 422, {**INGEST, "source": "gaia", "inputs": [ADDRESS]}),
+    build_of("an address as the catalog of a build", catalog__source=f'"{ADDRESS}"'),
+    build_of("a TAP service as the catalog of a build", catalog__source=f'"tap:{ADDRESS}"'),
     build_of("a path as the name of a database", name='"../../x"'),
     build_of("a script as the name of a database", name=f'"{SCRIPT}"'),
     build_of("a file of the machine as a distortion", catalog__file='"/etc/passwd"'),

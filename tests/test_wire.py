@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,8 @@ from hats_stores import write_catalog
 from served import in_background
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest, write_star_tables
+from starcat.catalog.source import give_map
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
 from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
@@ -123,6 +127,26 @@ def test_only_what_a_limit_leaves_is_asked_for(archive, folder):
     assert ends == ["bytes=-512"] * len(open_store(folder).catalog.partitions)
 
 
+MAP = """\
+name = "others"
+epoch = 2026.0
+columns = { star_id = "star_id", ra = "ra_deg", dec = "dec_deg" }
+magnitudes = { V = "mag" }
+"""
+
+
+def test_of_a_table_with_a_map_the_columns_of_the_map_are_asked_for(archive, folder, tmp_path):
+    (tmp_path / "others.toml").write_text(MAP)
+    assert give_map(tmp_path / "others.toml").name == "others"
+    note = input_path(archive.serve_folder("/sky", folder))
+    found, whole = (read_catalog("others", [one], read_limit_mag=4.0) for one in (note, folder))
+    assert found.stars.equals(whole.stars)
+    assert found.rejected_by_reason == whole.rejected_by_reason
+    assert found.files[0].name.startswith(archive.url("/sky/dataset/Norder="))
+    sent = sum(one.sent for one in archive.requests if "Npix" in one.path)
+    assert sent < 0.5 * sum(path.stat().st_size for path in folder.rglob("Npix*.parquet"))
+
+
 RESUMED: dict[str, dict[str, Any]] = {
     "cut in the end": {"cut_after": [100]},
     "cut twice": {"cut_after": [512, 4, 100, 50]},
@@ -138,7 +162,10 @@ RESUMED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(
     "fault",
-    [pytest.param(name, marks=SLOW) if name[:2] in ("st", "sl") else name for name in RESUMED],
+    [
+        pytest.param(name, marks=SLOW) if name not in ("cut twice", "500 once") else name
+        for name in RESUMED
+    ],
 )
 def test_a_fault_is_resumed(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
@@ -159,6 +186,7 @@ TOLD: dict[str, tuple[dict[str, Any], type[StarcatError], str]] = {
     "packed": ({"encoding": "gzip"}, DownloadError, "packs the body although"),
     "changed": ({"changes_to": b"x" * 5000}, ChecksumMismatch, "has changed.*remove that to read"),
     "no Parquet": ({"body": b"<html>" * 500}, ProductError, "is no Parquet file"),
+    "damaged": ({"body": b"?" * 900 + b"\x40\0\0\0PAR1"}, ProductError, "Npix=.*is damaged"),
     "empty": ({"body": b""}, DownloadError, "the server"),
     "stalled for ever": (
         {"stall": threading.Event(), "cut_after": [9] * 9},
@@ -168,8 +196,11 @@ TOLD: dict[str, tuple[dict[str, Any], type[StarcatError], str]] = {
 }
 
 
+QUICK = ("500 for ever", "no ranges", "changed", "no Parquet")
+
+
 @pytest.mark.parametrize(
-    "fault", [pytest.param(name, marks=SLOW) if name[:2] == "st" else name for name in TOLD]
+    "fault", [pytest.param(name, marks=SLOW) if name not in QUICK else name for name in TOLD]
 )
 def test_a_fault_is_told(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
@@ -190,6 +221,26 @@ def test_what_came_before_a_fault_is_kept(archive, folder):
 
 
 @SLOW
+def test_a_killed_read_goes_on(archive, folder, tmp_path):
+    address = archive.serve_folder("/sky", folder)
+    for remote in archive.remotes.values():
+        remote.pause_s = 0.05
+    command = [sys.executable, "-m", "starcat", "ingest", "sao", "--input", address, "-o"]
+    killed = subprocess.Popen([*command, tmp_path / "a.parquet"], stderr=subprocess.DEVNULL)
+    while sum("Npix" in one.path for one in archive.requests) < 8:
+        assert killed.poll() is None
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    for remote in archive.remotes.values():
+        remote.pause_s = 0.0
+    assert not (tmp_path / "a.parquet").exists()
+    subprocess.run([*command, tmp_path / "a.parquet"], check=True, stdout=subprocess.DEVNULL)
+    write_star_tables(read(folder), tmp_path / "b.parquet")
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+
+
+@SLOW
 def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_path, monkeypatch):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, address = read_spec(tmp_path / "spec.toml"), archive.serve_folder("/sky", folder)
@@ -202,6 +253,16 @@ def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "another"))
     with pytest.raises(ChecksumMismatch, match="has changed: what was read of it has sha256"):
         rebuild(made, {"sao": [input_path(address)]})
+
+
+@pytest.mark.parametrize(
+    "account", ["", "[]", "{}", '{"partitions": [{"order": "../../x", "pixel": 1, "repeated": 1}]}']
+)
+def test_what_a_server_says_becomes_no_path(archive, folder, account):
+    address = archive.serve_folder("/sky", folder)
+    archive.serve("/sky/store.json", account.encode())
+    with pytest.raises(ProductError, match=r"store\.json: cannot be read"):
+        read(address)
 
 
 LACKING: dict[str, tuple[str, str]] = {
@@ -242,3 +303,16 @@ def test_a_note_elsewhere_is_no_address(archive, tmp_path):
     kept = note("http://127.0.0.1:9/sky")
     copy = kept.rename(tmp_path / kept.name)
     assert wire.address_of(copy) is None
+
+
+def test_no_service_makes_an_address_an_input():
+    rooms = Path(wire.__file__).parents[1]
+    sources = [path for room in ("service", "query", "vo") for path in (rooms / room).rglob("*.py")]
+    words = ("input_path", "catalog.tap", "store.wire", "is_address")
+    assert len(sources) > 50
+    assert not [path for path in sources for word in words if word in path.read_text()]
+
+
+def test_a_table_that_is_joined_is_read_from_a_file(archive, starcat):
+    ran = starcat(["build", "--preset", "gaia-12deg", "--input", "vsx=http://127.0.0.1:9/x"])
+    assert (ran.code, "vsx is read from a file; bring it here" in ran.err) == (2, True)

@@ -127,7 +127,7 @@ typedef struct {
   starcat_real focal_length_px;          /* 0.01 to 1e9 */
   starcat_real x0_px, y0_px;             /* principal point */
   starcat_real k1, k2, k3, p1, p2;       /* 0: none */
-  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: no limit */
+  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: any */
 } starcat_camera;
 
 typedef struct {
@@ -144,10 +144,10 @@ typedef struct {
   uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
-/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN or infinite
- * where unknown. The noises, standard deviations on each axis from 1e-6 to 1e6 px, are the weights of
- * the attitude of an answer, and what its covariance and its chi-square are made of in place of
- * noise_px. */
+/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN or
+ * infinite where unknown. The noises, standard deviations on each axis from 1e-6 to 1e6 px, are the
+ * weights of the attitude of an answer, and what its covariance and its chi-square are made of in
+ * place of noise_px. */
 typedef struct {
   uint32_t count;
   const starcat_real *x_px;

@@ -21,7 +21,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 ROOT = Path(__file__).resolve().parents[2]
 ONBOARD = ROOT / "onboard"
 MODULE = "starcat.matcher._onboard"
-DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192"}
+DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
 """The ground has memory for wider and denser fields than an onboard computer."""
 
 BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")

@@ -78,12 +78,14 @@ static void fit_stars(const starcat_workspace *w, starcat_result *result) {
   result->residual_rad = STARCAT_SQRT(square / (real)w->n_seen);
 }
 
+#ifdef STARCAT_GROUND
 /* Fit the attitude of an answer once more, with other directions than those of the image. */
 void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                   starcat_workspace *work, starcat_result *result) {
+                        starcat_workspace *work, starcat_result *result) {
   take_stars(image, directions, sigma_px, work);
   fit_stars(work, result);
 }
+#endif
 
 /* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
  * the attitude. Sums the squared residuals of stated noise, in it, and counts these centroids. */

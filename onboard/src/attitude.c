@@ -93,7 +93,7 @@ static void turn_by(real m[9], const real w[3]) {
  * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
  * It works with differences of directions, so that narrow fields lose no digits. */
 void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               const real *weight, uint32_t count, uint32_t most) {
+                    const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {
     real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
     for (uint32_t i = 0; i < count; i++) {

@@ -20,7 +20,6 @@
 #define LARGEST_STEP R(1e12)
 #endif
 
-
 /* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
 static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
@@ -139,17 +138,26 @@ void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], re
   }
 }
 
+/* The largest of the lens's terms; 0: there is no distortion. */
+static real distortion_of(const starcat_camera *c) {
+  return starcat_larger(
+      starcat_larger(starcat_absolute(c->k1), starcat_absolute(c->k2)),
+      starcat_larger(starcat_absolute(c->k3),
+                     starcat_larger(starcat_absolute(c->p1), starcat_absolute(c->p2))));
+}
+
 static int is_possible(const starcat_camera *c) {
-  return starcat_are_finite(c, sizeof *c / sizeof(real)) &&
-         starcat_is_between(c->width_px, R(1.0), STARCAT_LARGEST_PX) &&
-         starcat_is_between(c->height_px, R(1.0), STARCAT_LARGEST_PX) &&
+  if (!starcat_are_finite((const real *)(const void *)c, sizeof *c / sizeof(real))) {
+    return 0;
+  }
+  const real most_px =
+      starcat_larger(starcat_larger(c->width_px, c->height_px),
+                     starcat_larger(starcat_absolute(c->x0_px), starcat_absolute(c->y0_px)));
+  return (starcat_smaller(c->width_px, c->height_px) >= R(1.0)) &&
+         (most_px <= STARCAT_LARGEST_PX) &&
          starcat_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
-         starcat_is_between(c->x0_px, -STARCAT_LARGEST_PX, STARCAT_LARGEST_PX) &&
-         starcat_is_between(c->y0_px, -STARCAT_LARGEST_PX, STARCAT_LARGEST_PX) &&
-         starcat_is_between(c->k1, R(-1e9), R(1e9)) && starcat_is_between(c->k2, R(-1e9), R(1e9)) &&
-         starcat_is_between(c->k3, R(-1e9), R(1e9)) && starcat_is_between(c->p1, R(-1e9), R(1e9)) &&
-         starcat_is_between(c->p2, R(-1e9), R(1e9)) &&
-         starcat_is_between(c->fold_radius, R(0.0), R(1e9));
+         (starcat_larger(distortion_of(c), c->fold_radius) <= R(1e9)) &&
+         (c->fold_radius >= R(0.0));
 }
 
 starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera) {
@@ -160,9 +168,7 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
   camera->given = *given;
   camera->half_width = R(0.5) * given->width_px;
   camera->half_height = R(0.5) * given->height_px;
-  camera->distorted =
-      (starcat_absolute(given->k1) + starcat_absolute(given->k2) + starcat_absolute(given->k3) +
-       starcat_absolute(given->p1) + starcat_absolute(given->p2)) > R(0.0);
+  camera->distorted = distortion_of(given) > R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);

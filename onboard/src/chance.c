@@ -18,7 +18,6 @@
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
-
 /* How places move as the camera turns, summed over the matched centroids: the determinant, and
  * that with the focal length as a fourth unknown over the one without. */
 static real information_of_places(const starcat_call *call, real *of_scale) {

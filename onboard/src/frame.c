@@ -9,13 +9,11 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-/* A number as its bits, and those of the exponent: all are set where it is infinite or not one. */
+/* The exponent's part of a number's first two bytes: all set where it is infinite or not one. */
 #ifdef STARCAT_SINGLE
-typedef uint32_t word;
-#define EXPONENT 0x7f800000u
+#define EXPONENT 0x7f80u
 #else
-typedef uint64_t word;
-#define EXPONENT 0x7ff0000000000000u
+#define EXPONENT 0x7ff0u
 #endif
 
 void starcat_default_options(starcat_options *options) {
@@ -27,25 +25,27 @@ void starcat_default_options(starcat_options *options) {
   options->max_steps = 4000000u;
 }
 
-/* Whether so many numbers in a row are finite, by their exponents: where what is not a number is
- * compared or subtracted, a processor may trap. */
-int starcat_are_finite(const void *numbers, uint32_t count) {
-  const uint8_t *from = numbers;
+/* Whether a number is finite, by its exponent: where what is not a number is compared or subtracted,
+ * a processor may trap. */
+static int is_finite(const real *number) {
+  const uint8_t *bytes = (const uint8_t *)(const void *)number;
+  const uint16_t one = 1;
+  const size_t is_little = *(const uint8_t *)(const void *)&one;
+  const uint32_t first = bytes[is_little * (sizeof(real) - 1u)];
+  const uint32_t second = bytes[1u + is_little * (sizeof(real) - 3u)];
+  return ((first << 8 | second) & EXPONENT) != EXPONENT;
+}
+
+int starcat_are_finite(const real *numbers, uint32_t count) {
   int finite = 1;
   for (uint32_t n = 0; n < count; n++) {
-    word bits;
-    uint8_t *to = (uint8_t *)(void *)&bits;
-    for (uint32_t k = 0; k < sizeof bits; k++) {
-      to[k] = *from;
-      from++;
-    }
-    finite &= (bits & EXPONENT) != EXPONENT;
+    finite &= is_finite(numbers + n);
   }
   return finite;
 }
 
 static starcat_status check_options(const starcat_options *o) {
-  if (!starcat_are_finite(o, 5)) {
+  if (!starcat_are_finite((const real *)(const void *)o, 5)) {
     return STARCAT_E_NOT_FINITE;
   }
   if (!starcat_is_between(o->noise_px, R(0.0), STARCAT_LARGEST_PX) ||
@@ -102,12 +102,12 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
   for (uint32_t i = 0; i < frame->count; i++) {
     const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
-    if (!starcat_are_finite(x, 1) || !starcat_are_finite(y, 1)) {
+    if (!is_finite(x) || !is_finite(y)) {
       result->star[i] = STARCAT_DROPPED_NOT_FINITE;
     } else if ((*x < R(0.0)) || (*x >= camera->width_px) || (*y < R(0.0)) ||
                (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
-    } else if ((frame->magnitudes != NULL) && starcat_are_finite(frame->magnitudes + i, 1)) {
+    } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes + i)) {
       w->has_magnitudes = 1;
     }
   }
@@ -204,13 +204,13 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
   call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
-    if ((frame->sigma_px != NULL) && starcat_are_finite(frame->sigma_px + i, 1) &&
+    if ((frame->sigma_px != NULL) && is_finite(frame->sigma_px + i) &&
         !starcat_is_between(frame->sigma_px[i], STARCAT_LEAST_PX, STARCAT_LARGEST_PX)) {
       return STARCAT_E_OPTIONS;
     }
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
-          (work->has_magnitudes != 0u) && starcat_are_finite(frame->magnitudes + i, 1);
+          (work->has_magnitudes != 0u) && is_finite(frame->magnitudes + i);
       insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }

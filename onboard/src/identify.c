@@ -6,7 +6,7 @@
 
 #define WIDEST_PRIOR_RAD R(0.35)
 #define LARGEST_QUATERNION R(1e6)
-#define LEAST_SQUARE R(1e-12)
+#define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
 
 starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
@@ -44,7 +44,7 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
     }
     square += q[n] * q[n];
   }
-  if (!(square > LEAST_SQUARE) || !(uncertainty_rad > R(0.0)) ||
+  if (!(square > LEAST_OF_QUATERNION) || !(uncertainty_rad > R(0.0)) ||
       (uncertainty_rad > WIDEST_PRIOR_RAD)) {
     return STARCAT_E_OPTIONS;
   }
@@ -71,7 +71,7 @@ static int predict(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
     w->n_near = starcat_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
-                          w->near_row, w->near_icrs);
+                               w->near_row, w->near_icrs);
     if ((w->n_near > STARCAT_MAX_STARS) || !starcat_spend(w, w->n_near)) {
       return 0;
     }

@@ -30,8 +30,7 @@
 #define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
 #define STARCAT_REACH R(1.5)          /* largest distance of a match, in tolerances */
 #define STARCAT_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
-#define STARCAT_SURE_CORNER R(0.5) /* largest error of a corner that firm stars leave, tolerances \
-                                    */
+#define STARCAT_SURE_CORNER R(0.5)    /* largest error of a corner of firm stars, in tolerances */
 #define STARCAT_OTHER_SCALES R(0.05)  /* errors of the focal length that are looked for */
 #define STARCAT_FOCAL_MARGIN R(0.02)  /* of the field's radius, where the focal length is fitted */
 #define STARCAT_OVER_CHANCE \
@@ -52,9 +51,9 @@
 #define STARCAT_LEAST_PX R(1e-6)      /* of a tolerance or a noise */
 #define STARCAT_LARGEST_PX R(1e6)
 #define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
-/* Least weight of a centroid over the largest, which rounding still leaves room for; least side of a
- * triangle whose corners rounding still tells apart; and numbers below which a determinant is due to
- * rounding, and whose inverses can still be squared. */
+/* Least weight of a centroid over the largest, which rounding still leaves room for; least side of
+ * a triangle whose corners rounding still tells apart; numbers below which a determinant is due to
+ * rounding; and the least one that is a number still. */
 #ifdef STARCAT_SINGLE
 #define STARCAT_LEAST_WEIGHT R(1e-4)
 #define STARCAT_LEAST_SIDE R(1e-6)
@@ -117,7 +116,7 @@ static inline void starcat_star(const starcat_image *image, uint32_t row, real i
 
 /* The rows of the stars of a feature. */
 static inline void starcat_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
-                              uint32_t rows[3]) {
+                                   uint32_t rows[3]) {
   const size_t at = (size_t)feature * width;
   if (image->index_bytes == 2u) {
     const uint16_t *indices = image->features;
@@ -133,7 +132,7 @@ static inline void starcat_rows_of(const starcat_image *image, uint32_t feature,
 }
 
 /* frame.c */
-int starcat_are_finite(const void *numbers, uint32_t count);
+int starcat_are_finite(const real *numbers, uint32_t count);
 
 /* attitude.c */
 int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
@@ -141,7 +140,7 @@ int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const re
 int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
 int starcat_invert(const starcat_information *m, starcat_information *inverse);
 void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
-               const real *weight, uint32_t count, uint32_t most);
+                    const real *weight, uint32_t count, uint32_t most);
 void starcat_quaternion(const real m[9], real q[4]);
 void starcat_matrix(const real q[4], real m[9]);
 
@@ -155,7 +154,7 @@ void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], re
 
 /* sky.c */
 uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
-                   uint32_t most, uint32_t *rows, real (*icrs)[3]);
+                        uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
 real starcat_log_factorial(uint32_t n);
@@ -184,8 +183,10 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
                              starcat_result *result);
 
 /* answer.c */
+#ifdef STARCAT_GROUND /* of Python, which knows directions before they were rounded */
 void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                   starcat_workspace *work, starcat_result *result);
+                        starcat_workspace *work, starcat_result *result);
+#endif
 starcat_status starcat_end(starcat_call *call, const starcat_options *options,
                            starcat_result *result);
 
@@ -194,7 +195,7 @@ typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], con
 real starcat_side(const starcat_call *call, uint32_t i, uint32_t j);
 void starcat_each_triangle(starcat_call *call, starcat_look_up look_up);
 void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
-                     uint32_t *stop);
+                          uint32_t *stop);
 int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 

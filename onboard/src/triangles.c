@@ -277,7 +277,7 @@ void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
 
 /* The rows of the features whose value is between two numbers, and few others. */
 void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
-                     uint32_t *stop) {
+                          uint32_t *stop) {
   const real end = (real)(image->n_kvector - 1u);
   const real first = (low - image->kvector_intercept) / image->kvector_slope - R(0.001);
   const real last = (high - image->kvector_intercept) / image->kvector_slope + R(1.001);
@@ -301,8 +301,7 @@ typedef struct {
   real least[3], most[3]; /* the same by length, the shortest first */
   real sides[3], error, slack; /* of the sides; of the scale */
   int is_right_handed;
-} observed;
-
+} sought;
 
 /* Put three numbers in order. */
 static void sort(real v[3]) {
@@ -315,7 +314,7 @@ static void sort(real v[3]) {
 /* What the chords may be where the scale is not known: the square of the longest, and those of the
  * others over it. If sides fit in any order they do by length, with the largest of the errors; and
  * a chord is shorter than its angle, the more so the longer it is. */
-static void bound_shape(const starcat_call *call, observed *o) {
+static void bound_shape(const starcat_call *call, sought *o) {
   const real shortest = R(1.0) - call->fov_error;
   real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
   sort(a);
@@ -335,7 +334,7 @@ static void bound_shape(const starcat_call *call, observed *o) {
 }
 
 static void observe(const starcat_call *call, const uint32_t triple[3], const real sides[3],
-                    observed *o) {
+                    sought *o) {
   const starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
@@ -362,7 +361,7 @@ static void observe(const starcat_call *call, const uint32_t triple[3], const re
 
 /* Whether the chords of stars may be those observed, in some order of the corners: most are not in
  * any. */
-static int may_fit(const observed *o, const real chords[3], int has_scale) {
+static int may_fit(const sought *o, const real chords[3], int has_scale) {
   real c[3] = {chords[0], chords[1], chords[2]};
   sort(c);
   const real unit = has_scale ? c[2] : R(1.0);
@@ -404,7 +403,7 @@ static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]
 }
 
 /* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
-static int try_order(starcat_call *call, const observed *o, real stars[3][3],
+static int try_order(starcat_call *call, const sought *o, real stars[3][3],
                      const uint8_t order[3]) {
   const starcat_workspace *w = call->work;
   const uint32_t *t = o->triple;
@@ -427,7 +426,7 @@ static int try_order(starcat_call *call, const observed *o, real stars[3][3],
 
 /* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
  * that of least squares. */
-static int is_similar(const starcat_call *call, const observed *o, const real apart[3],
+static int is_similar(const starcat_call *call, const sought *o, const real apart[3],
                       const uint8_t order[3]) {
   const real u = apart[order[0]], v = apart[order[1]], t = apart[order[2]];
   const real scale =
@@ -447,7 +446,7 @@ static int is_similar(const starcat_call *call, const observed *o, const real ap
 }
 
 /* Whether the chords of stars, in an order of the corners, are those observed. */
-static int is_same(const observed *o, const real chords[3], const uint8_t order[3]) {
+static int is_same(const sought *o, const real chords[3], const uint8_t order[3]) {
   int fits = 1;
   for (uint32_t n = 0; n < 3u; n++) {
     fits = fits && starcat_is_between(chords[order[n]], o->low[n], o->high[n]);
@@ -456,7 +455,7 @@ static int is_same(const observed *o, const real chords[3], const uint8_t order[
 }
 
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
-static int compare(starcat_call *call, const observed *o, uint32_t feature) {
+static int compare(starcat_call *call, const sought *o, uint32_t feature) {
   static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
                                        {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
   uint32_t rows[3];
@@ -529,8 +528,7 @@ static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
 }
 
 /* Compare the triangles of stars of some areas and circumradii. Returns 1 if the search can end. */
-static int look_up(starcat_call *call, const observed *o, const real area[2],
-                   const real radius[2]) {
+static int look_up(starcat_call *call, const sought *o, const real area[2], const real radius[2]) {
   const starcat_image *image = call->image;
   const real quantum = image->radius_quantum_rad;
   const uint16_t low = quantised(radius[0] - quantum, quantum);
@@ -556,7 +554,7 @@ static int look_up(starcat_call *call, const observed *o, const real area[2],
 
 /* Look up the triangles of stars that an observed one is similar to: area over squared circumradius
  * is the same, so that an area tells the circumradius. Returns 1 if the search can end. */
-static int look_up_similar(starcat_call *call, const observed *o, real area, real area_error,
+static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
                            real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;
   const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
@@ -588,7 +586,7 @@ static int look_up_similar(starcat_call *call, const observed *o, real area, rea
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
 int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   real area, area_error, radius, radius_error;
-  observed o;
+  sought o;
   features_of(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
               &radius_error);
   observe(call, triple, sides, &o);

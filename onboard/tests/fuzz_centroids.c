@@ -19,15 +19,16 @@
 int LLVMFuzzerInitialize(int *argc, char ***argv);
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-static starcat_image images[2];
+static starcat_image images[3]; /* triangles, pairs, pairs of a crowded sky */
 static starcat_workspace work;
 static starcat_result result;
 
 int LLVMFuzzerInitialize(int *argc, char ***argv) {
   (void)argc;
   (void)argv;
-  for (uint32_t n = 0; n < 2u; n++) {
-    const sky_recipe recipe = {n + 1u, n == 0u ? 2u : 4u, 300, 0.4, 8};
+  for (uint32_t n = 0; n < 3u; n++) {
+    const sky_recipe recipe = {n == 0u ? 1u : 2u, n == 1u ? 4u : 2u, n == 2u ? 1500u : 300u,
+                               n == 2u ? 0.18 : 0.4, 8};
     static uint64_t words[SKY_MOST_BYTES / 8u];
     const size_t size = sky_image(&recipe, (uint8_t *)words);
     void *exact = malloc(size); /* so that reading past the end is found */
@@ -43,26 +44,28 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
 }
 
 /* A number as it was, a little off, a plain one, one of the odd ones, or any bits at all. */
-static starcat_real changed(fuzz_bytes *bytes, starcat_real value) {
-  static const starcat_real odd[12] = {
-      0,        -(starcat_real)0.0, 1,       -1,          INFINITY,    -INFINITY,
-      LEAST,    LARGE,              1e9F,    FLT_EPSILON, LEAST / 4,   512};
-  const uint32_t kind = fuzz_number(bytes, 1);
-  starcat_real any;
-  switch (kind % 8u) {
+static void change(fuzz_bytes *bytes, starcat_real *value) {
+  static const starcat_real odd[12] = {0,        -(starcat_real)0.0, 1,         -1,
+                                       INFINITY, -INFINITY,          LEAST,     LARGE,
+                                       1e9F,     FLT_EPSILON,        LEAST / 4, 512};
+  switch (fuzz_number(bytes, 1) % 8u) {
     case 1:
-      return value * (starcat_real)(1.0 + 1e-6 * ((double)fuzz_number(bytes, 2) - 32768.0));
+      *value *= (starcat_real)(1.0 + 1e-6 * ((double)fuzz_number(bytes, 2) - 32768.0));
+      break;
     case 2:
-      return (starcat_real)((double)fuzz_number(bytes, 2) / 64.0 - 256.0);
+      *value = (starcat_real)((double)fuzz_number(bytes, 2) / 64.0 - 256.0);
+      break;
     case 3:
-      return odd[fuzz_number(bytes, 1) % 12u];
+      *value = odd[fuzz_number(bytes, 1) % 12u];
+      break;
     case 4:
-      fuzz_take(bytes, &any, sizeof any);
-      return any;
+      fuzz_take(bytes, value, sizeof *value); /* a signalling NaN too, so by its bytes */
+      break;
     case 5:
-      return (starcat_real)NAN;
+      *value = (starcat_real)NAN;
+      break;
     default:
-      return value;
+      break;
   }
 }
 
@@ -71,7 +74,7 @@ static void change_camera(fuzz_bytes *bytes, starcat_camera *c) {
                                      &c->y0_px,    &c->k1,        &c->k2,              &c->k3,
                                      &c->p1,       &c->p2,        &c->fold_radius};
   for (uint32_t n = fuzz_number(bytes, 1) % 32u; n < 11u; n += 1u + fuzz_number(bytes, 1) % 8u) {
-    *numbers[n] = changed(bytes, *numbers[n]);
+    change(bytes, numbers[n]);
   }
 }
 
@@ -79,7 +82,7 @@ static void change_options(fuzz_bytes *bytes, starcat_options *o) {
   starcat_real *const numbers[5] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
                                     &o->fov_error};
   for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 5u; n++) {
-    *numbers[n] = changed(bytes, *numbers[n]);
+    change(bytes, numbers[n]);
   }
   o->max_steps = 65535u - fuzz_number(bytes, 2);
 }
@@ -91,7 +94,7 @@ static starcat_real *column(fuzz_bytes *bytes, const starcat_real *values, uint3
   for (uint32_t i = 0; (made != NULL) && (i < count); i++) {
     made[i] = values[i % known];
     if ((i >= known) || (fuzz_number(bytes, 1) % 8u < some)) {
-      made[i] = changed(bytes, made[i]);
+      change(bytes, &made[i]);
     }
   }
   return made;
@@ -100,24 +103,28 @@ static starcat_real *column(fuzz_bytes *bytes, const starcat_real *values, uint3
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   fuzz_bytes bytes = {data, size};
   traps_on();
-  const starcat_image *image = &images[fuzz_number(&bytes, 1) % 2u];
+  const uint32_t sky = fuzz_number(&bytes, 1) % 3u;
+  const starcat_image *image = &images[sky];
   uint64_t seed = fuzz_number(&bytes, 1);
   starcat_camera camera;
   starcat_options options;
   sky_frame truth;
   starcat_camera_of(image, &camera);
   starcat_default_options(&options);
-  sky_look(image, &camera, &seed, 0.2, SKY_SPOTS, fuzz_number(&bytes, 1) % 4u, &truth);
+  sky_look(image, &camera, &seed, 0.2, sky == 2u ? STARCAT_MAX_CENTROIDS : SKY_SPOTS,
+           fuzz_number(&bytes, 1) % 4u, &truth);
   change_camera(&bytes, &camera);
   change_options(&bytes, &options);
   starcat_real q[4], uncertainty_rad = (starcat_real)0.02;
   const uint32_t prior = fuzz_number(&bytes, 1);
   for (uint32_t n = 0; n < 4u; n++) {
-    q[n] = (prior >> n & 1u) != 0u ? changed(&bytes, truth.q_body_from_icrs[n])
-                                   : truth.q_body_from_icrs[n];
+    q[n] = truth.q_body_from_icrs[n];
+    if ((prior >> n & 1u) != 0u) {
+      change(&bytes, &q[n]);
+    }
   }
   if ((prior >> 4 & 1u) != 0u) {
-    uncertainty_rad = changed(&bytes, uncertainty_rad);
+    change(&bytes, &uncertainty_rad);
   }
   const uint32_t change = fuzz_number(&bytes, 1);
   const uint32_t count = (change & 1u) != 0u ? fuzz_number(&bytes, 1) % 70u : truth.count;

@@ -4,12 +4,16 @@
 set -eu
 out=$BUILD/size
 mkdir -p "$out"
-rm -f "$out"/*
+rm -rf "${out:?}"/*
 for source in src/*.c; do
   $ARM-gcc $FLAGS -Os -fcallgraph-info=su -c "$source" -o "$out/$(basename "$source" .c).o"
 done
 code=$($ARM-size "$out"/*.o | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }')
 echo "size: code and constants of the library for ARM, -Os: $code bytes (at most 28672)"
+sh amalgamate.sh "$out/one"
+$ARM-gcc $FLAGS -Os -c "$out/one/starcat.c" -o "$out/one.out"
+echo "size: the same of the two-file library: $($ARM-size "$out/one.out" |
+  awk 'NR > 1 { print $1 + $2 + $3 }') bytes"
 cat >"$out/sizes.c" <<'END'
 #include "starcat.h"
 char workspace[sizeof(starcat_workspace)];

@@ -98,7 +98,7 @@ static void check_one_place(const unit_sky *sky) {
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   const starcat_agreement best = unit_work.best;
   CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                    &unit_result),
+                         &unit_result),
            STARCAT_IDENTIFIED);
   unit_work.best = best;
   for (uint32_t i = 0; i < unit_work.count; i++) {

@@ -22,7 +22,7 @@ static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t
   CHECK_IS(unit_identify(sky, &truth), STARCAT_IDENTIFIED);
   const starcat_frame frame = unit_frame_of(&truth);
   CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                    &unit_result),
+                         &unit_result),
            STARCAT_IDENTIFIED);
 }
 
@@ -110,8 +110,8 @@ static void check_too_near(void) {
 }
 #endif
 
-/* A camera of 180 degrees but for a millionth of an arcsecond, too wide for a plane to show; and one
- * whose stars, in opposite corners, are 178 degrees apart. */
+/* A camera of 180 degrees but for a millionth of an arcsecond, too wide for a plane to show; and
+ * one whose stars, in opposite corners, are 178 degrees apart. */
 static void check_half_sky(void) {
   unit_copy(&unit_pyramid);
   unit_scratch.camera.width_px = (starcat_real)1e6;
@@ -431,8 +431,7 @@ static void check_cap(const double centre[3], double cosine, double sine, uint32
   const starcat_real margin = (starcat_real)IF_SINGLE(7e-7, 2e-9);
   uint32_t within = 0, beside = 0, missing = 0;
   unit_work.steps_left = 1000000;
-  const uint32_t count =
-      starcat_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
+  const uint32_t count = starcat_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real star[3];
     starcat_star(call.image, row, star);
@@ -462,7 +461,7 @@ static void check_narrow_caps(void) {
     }
     unit_work.steps_left = 1000000;
     const uint32_t count = starcat_gather(&call, centre, (starcat_real)(1.0 - 5e-13),
-                                     (starcat_real)1e-6, 8, rows, icrs);
+                                          (starcat_real)1e-6, 8, rows, icrs);
     missing += (uint32_t)!is_listed(rows, count, row);
   }
   CHECK_IS(missing, 0);
@@ -539,7 +538,7 @@ static void check_clusters(void) {
     }
     const starcat_frame frame = unit_frame_of(&truth);
     CHECK_IS(starcat_begin(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
-                      &frame, &unit_work, &unit_result),
+                           &frame, &unit_work, &unit_result),
              STARCAT_IDENTIFIED);
     unit_matrix_of(&truth, m);
     for (uint32_t k = 0; k < 3u; k++) { /* turned by up to five reaches about y, and about z */

@@ -3,8 +3,8 @@
  *
  * SPDX-License-Identifier: MIT
  */
-#include "traps.h"
 #include "unit.h"
+#include "traps.h"
 
 #include <string.h>
 

@@ -52,7 +52,7 @@ def build(
     output : str or path-like, default "dist"
         Folder that the folder ``<name>-<version>`` is made in.
     inputs : mapping of str to path or paths, optional
-        Files or folders by source; what is not named is looked for, as the command line does.
+        Files, folders or the address of a HATS catalog by source; others are looked for.
     replace : bool, default False
         Whether a different database of the same name and version may be replaced.
     workers : int, default 2
@@ -105,7 +105,7 @@ def ingest(
     source : str
         Such as ``sao``; ``starcat sources`` lists them. The path of a map stands for its source.
     inputs : path or sequence of paths, optional
-        Its files or folder; looked for by default, as the command line does.
+        Its files or folder, or the address of a HATS catalog; looked for by default.
     band : str, optional
         Band of the magnitudes; the source's first by default.
     epoch_jyear : float, optional

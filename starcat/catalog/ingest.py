@@ -151,7 +151,8 @@ def ingest(
     parse = partial(parse_block, options=options)
     for reading, parts in read_files(files.files, parse, workers, progress):
         for part in merged(parts, _PART_ROWS):
-            tables.add(part.stars, part.rejected, part.counted)
+            stars, rejected = part.stars.combine_chunks(), part.rejected.combine_chunks()
+            tables.add(stars, rejected, part.counted)
         facts.append(reading.facts)
         problems += reading.named_problems
         files.check_contents(facts)

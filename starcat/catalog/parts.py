@@ -287,7 +287,7 @@ def _tables(parts: Sequence[Part]) -> tuple[list[pa.Table], list[pa.Table]]:
 def _joined(parts: Sequence[Part]) -> Part:
     if len(parts) == 1:
         return parts[0]
-    stars, rejected = (pa.concat_tables(tables).combine_chunks() for tables in _tables(parts))
+    stars, rejected = (pa.concat_tables(tables) for tables in _tables(parts))
     return Part(
         sum(part.rows for part in parts),
         stars,

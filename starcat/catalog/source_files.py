@@ -246,10 +246,21 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
     raise SourceMissing(
         f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with --input "
         f"{source_name}=PATH, set ${CATALOGS_VARIABLE} to the folder that has "
-        f"{source.files[0].file_names[-1]}[.gz]"
-        + (f", or run 'starcat fetch {source_name}'" if source.table is None else ""),
+        f"{source.files[0].file_names[-1]}[.gz]" + _served(source),
         source=source_name,
     )
+
+
+def _served(source: DataSource) -> str:
+    """Say how a source comes over the wire, if it does."""
+    if source.table is None:
+        return f", or run 'starcat fetch {source.name}'"
+    remote = source.table.remote
+    ways = [] if remote is None else [
+        remote.tap and f"run 'starcat fetch {source.name} --limit-mag MAG -o DIR'",
+        remote.hats and f"give its address, --input {source.name}={remote.hats}",
+    ]  # fmt: skip
+    return "".join(f", or {way}" for way in ways if way)
 
 
 def _missing_where(lacks: Mapping[Path, tuple[str, ...] | None], folders: Sequence[Path]) -> str:

@@ -7,6 +7,7 @@ positions to the epoch of the build and parts the rejected records from the star
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -77,9 +78,15 @@ def table_from_columns(product: str, columns: Mapping[str, Values], count: int) 
         value = columns.get(field.name)
         if value is None:
             is_flag = field.type == pa.bool_() and not field.nullable
-            value = False if is_flag else pa.nulls(count, field.type)
+            value = False if is_flag else nulls(count, field.type)
         arrays.append(_as_array(value, field.type, count))
     return pa.Table.from_arrays(arrays, schema=schema)
+
+
+@lru_cache(maxsize=8)
+def nulls(count: int, kind: pa.DataType) -> pa.Array:
+    """Return a column without values; most archives lack many columns of the same type."""
+    return pa.nulls(count, kind)
 
 
 def with_columns(stars: pa.Table, columns: Mapping[str, Values]) -> pa.Table:
@@ -118,8 +125,18 @@ def split_by_verdict(stars: pa.Table, verdicts: Verdicts) -> tuple[pa.Table, pa.
     is_kept = verdicts.is_kept
     if is_kept.all():
         return stars, product_schema("rejected").arrow_schema.empty_table()
-    rejected = reject_rows(stars.filter(pa.array(~is_kept)), verdicts.reasons)
-    return stars.filter(pa.array(is_kept)), rejected
+    rejected = reject_rows(_where(stars, ~is_kept), verdicts.reasons)
+    return _where(stars, is_kept), rejected
+
+
+def _where(stars: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
+    """Return some rows; nothing is looked for in the columns that the archive does not have."""
+    mask, count = pa.array(chosen), int(np.count_nonzero(chosen))
+    columns = [
+        nulls(count, column.type) if column.null_count == len(stars) else column.filter(mask)
+        for column in stars.columns
+    ]
+    return pa.Table.from_arrays(columns, schema=stars.schema)
 
 
 def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:

@@ -124,6 +124,15 @@ class Flags(_Model):
     )
 
 
+class Remote(_Model):
+    """Where the table is served."""
+
+    checked: str = Field(description="when and how the addresses were last tried")
+    tap: str = Field("", description="address of a TAP service, which 'starcat fetch' asks")
+    table: str = Field("", description="name of the table there, as ADQL writes it")
+    hats: str = Field("", description="address of a HATS catalog of it, for --input")
+
+
 class TableMap(_Model):
     """What the columns of a table mean."""
 
@@ -159,6 +168,7 @@ class TableMap(_Model):
         {}, description=f"conditions on which a row is rejected: {', '.join(REJECTS)}"
     )
     quality: dict[str, str] = Field({}, description=f"conditions by bit: {', '.join(QUALITIES)}")
+    remote: Remote | None = Field(None, description="where the table is served")
 
     @model_validator(mode="after")
     def _check(self) -> TableMap:
@@ -250,5 +260,5 @@ class TableMap(_Model):
 
     def recorded(self) -> dict[str, Any]:
         """Return the map as a manifest holds it; JSON has no order of keys, so bands have one."""
-        held = self.model_dump(mode="json", exclude_defaults=True)
+        held = self.model_dump(mode="json", exclude_defaults=True, exclude={"remote"})
         return {**held, "bands": list(self.ordered_bands)}

@@ -1,4 +1,4 @@
-"""Commands about catalogs: sources, fetch, ingest, crossmatch, and their tables."""
+"""Commands about catalogs: sources, ingest, crossmatch, and their tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, print_things, progress_bars, say, show
+from starcat.cli.console import print_json, print_table, progress_bars, say, show
 from starcat.cli.options import (
     Json,
     OwnSources,
@@ -17,7 +17,6 @@ from starcat.cli.options import (
     inputs_by_source,
     to_either,
     to_file,
-    to_folder,
 )
 from starcat.errors import SourceError
 
@@ -55,48 +54,6 @@ def sources(
         return
     found = _source_facts()
     show(json, found, _print_sources, found)
-
-
-@app.command()
-def fetch(
-    source: Annotated[str, typer.Argument(help="A source, as 'starcat sources' lists them.")],
-    output: Annotated[
-        Path | None, to_folder("Where the files go; default: the download cache.")
-    ] = None,
-    part: Annotated[
-        list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
-    ] = None,
-    retries: Annotated[int, typer.Option(min=0, help="Tries again per address.")] = 3,
-    json: Json = False,
-) -> None:
-    """Download a catalog, check it, and remember its digest.
-
-    Example: starcat fetch tycho2
-    """
-    from starcat.catalog.fetch import fetch_source
-    from starcat.catalog.source import source_given
-    from starcat.catalog.source_files import cache_folder
-
-    with progress_bars() as progress:
-        report = fetch_source(
-            source_given(source),
-            output or cache_folder(),
-            parts=tuple(part or ()),
-            retries=retries,
-            progress=lambda name, done, total: progress(f"fetch {name}", done, total),
-        )
-    rows = [
-        {name: getattr(file, name) for name in ("name", "status", "rows", "bytes", "sha256")}
-        | {"path": str(file.path)}
-        for file in report.files
-    ]
-    columns = {
-        "file": "{0[name]}",
-        "status": "{0[status]}",
-        "rows": "{0[rows]:,}",
-        "bytes": "{0[bytes]:,}",
-    }
-    show(json, rows, print_things, report.source, rows, columns, (2, 3))
 
 
 ToFormat = Annotated[

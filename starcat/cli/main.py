@@ -26,6 +26,7 @@ from starcat.cli import (
     catalogs,
     evaluation,
     exchange,
+    fetching,
     interrupts,
     learning,
     matching,
@@ -53,7 +54,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 for part in (
-    *(catalogs, bands, specs, builds, artifacts, sql, exchange),
+    *(catalogs, fetching, bands, specs, builds, artifacts, sql, exchange),
     *(releases, matching, learning, evaluation, serving),
 ):
     app.add_typer(part.app)

@@ -13,6 +13,12 @@ from starcat.threads import map_in_order
 AT_ONCE = 50_000
 """Points whose neighbours a thread looks for at once."""
 
+SAMPLE = 1000
+"""Stars whose neighbours tell how far apart the others are."""
+
+MOST_NEAR = 8.0
+"""Stars within the radius of a star, on average, up to which all pairs are looked at."""
+
 
 def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's nearest other star.
@@ -39,11 +45,11 @@ def nearest_chords(
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = scipy.spatial.cKDTree(stars, leafsize=16, balanced_tree=False)
-    chord, found = _nearest(tree, points, 3, workers)
-    # Nearly always a point finds itself, one star and, farther away, another.
-    best, index = chord[:, 1].copy(), found[:, 1].copy()
-    rows = np.flatnonzero((found[:, 0] != itself) | ~(chord[:, 2] > chord[:, 1]))
-    count = 3
+    best, index = np.full(len(points), np.inf), np.full(len(points), len(stars))
+    if len(points) > 10 * SAMPLE and itself.min() >= 0:
+        best, index = (values[itself] for values in _nearest_of_pairs(tree, stars, rank))
+    rows = np.flatnonzero(np.isinf(best))
+    count = 3  # nearly always a point finds itself, one star and, farther away, another
     while len(rows):
         chord, found = _nearest(tree, points[rows], count, workers)
         furthest = chord[:, -1].copy()
@@ -56,6 +62,35 @@ def nearest_chords(
         # Where the last of those found is as near as the first, more may be.
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
+    return best, index
+
+
+def _nearest_of_pairs(
+    tree: scipy.spatial.cKDTree, stars: Directions, rank: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the nearest other star of most stars, in half of the time that each alone takes.
+
+    All pairs within a radius are looked at, in which nine of ten have another star. Where
+    that are too many, as in clusters, and for the tenth, chords are infinite.
+    """
+    best, index = np.full(len(stars), np.inf), np.full(len(stars), len(stars))
+    some = stars[np.random.default_rng(0).integers(len(stars), size=SAMPLE)]
+    radius = float(np.quantile(_nearest(tree, some, 2, 0)[0][:, 1], 0.9))
+    if tree.query_ball_point(some, radius, return_length=True).mean() > MOST_NEAR:
+        return best, index
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    legs = (stars[pairs[:, 0]] - stars[pairs[:, 1]]) ** 2
+    chord = np.sqrt(legs[:, 0] + legs[:, 1] + legs[:, 2])  # the same bits as the tree has
+    lowest = np.full(len(stars), np.iinfo(np.int64).max)
+    ways = (pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])
+    for one, _ in ways:
+        np.minimum.at(best, one, chord)
+    for one, other in ways:
+        is_nearest = chord == best[one]
+        np.minimum.at(lowest, one[is_nearest], rank[other[is_nearest]])
+    for one, other in ways:
+        is_first = (chord == best[one]) & (rank[other] == lowest[one])
+        index[one[is_first]] = other[is_first]
     return best, index
 
 

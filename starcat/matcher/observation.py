@@ -278,6 +278,8 @@ def observe(
 ) -> Observation:
     """Return the usable centroids of a frame, in order."""
     given, mag, camera = frame.centroids_px, frame.magnitudes, frame.camera
+    if mag is not None:  # an infinite one is as unknown as NaN
+        mag = np.where(np.isfinite(mag), mag, np.nan)
     usable = camera.contains(given)
     if usable.all():
         dropped, rows = [], _own_order(given, mag, camera)

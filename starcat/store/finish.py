@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
+from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
 from starcat.store.layout import DATASET
-from starcat.store.ledger import Digests, digests_of
 from starcat.store.neighbours import COLUMNS, add_neighbours
 from starcat.store.pixels import (
     HEALPIX_COLUMN,
@@ -60,14 +60,14 @@ def finish(
     index_path: Path,
     repeated_path: Path,
     is_alone: bool,
-) -> tuple[dict[str, Any], Digests]:
+) -> tuple[dict[str, Any], list[Path]]:
     """Write the partition of a pixel, and its stars that are in the margins of others.
 
     The files say what the runs hold, and which records are of a star read before; a star that is
     alone in the whole catalog has no neighbour.
     """
     index, repeated = read_index(index_path), _read_places(repeated_path)
-    stars = _in_order(read_shares(index.shares(pixel), pixel.first, pixel.end))
+    stars = read_shares(index.shares(pixel), pixel.first, pixel.end)
     stars, again = _without_repeated(stars, repeated)
     files: list[Path] = []
     if len(again):
@@ -75,23 +75,27 @@ def finish(
         path.parent.mkdir(exist_ok=True)
         with placed(path) as partial:
             schema = product_schema("stars").arrow_schema
+            again = again.take(pa.array(_ascending(again)))
             pq.write_table(with_constants(again, schema), partial, compression="zstd")
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
     if not len(stars):
-        return result, digests_of(files)
+        return result, files
 
     def around(reach_rad: float) -> Iterator[pa.Table]:
         return _around(index, pixel, reach_rad, repeated)
 
     stars = add_neighbours(stars, pixel, around, is_alone)
-    files += _write_borders(stars, plan, pixel, beside)
+    order = _ascending(stars)
+    pixels = stars[HEALPIX_COLUMN].to_numpy()[order]
+    result["map"] = _map(pixels)
+    files += _write_borders(stars, order, pixels, plan, pixel, beside)
     path = plan.catalog / DATASET / pixel.path
-    result["map"] = _map(stars[HEALPIX_COLUMN].to_numpy())
-    ordered, rows = bright_first(stars)
+    bright_first, rows = _bright_first(floats_of(stars, "mag")[order])
+    ordered = stars.take(pa.array(order[bright_first]))
     write_partition(with_constants(ordered, store_schema()), rows, path)
-    written = digests_of([*files, path])
-    return result | {"sha256": written[path], "bytes": path.stat().st_size}, written
+    result |= {"sha256": file_sha256(path), "bytes": path.stat().st_size}
+    return result, [*files, path]
 
 
 @lru_cache(maxsize=1)
@@ -101,13 +105,13 @@ def store_schema() -> pa.Schema:
     return pa.schema([pixel_field(), *schema], metadata=schema.metadata)
 
 
-def _in_order(stars: pa.Table) -> pa.Table:
-    """Return stars by pixel and number; records of the same star in reading order."""
+def _ascending(stars: pa.Table) -> NDArray[np.int64]:
+    """Return the rows by pixel and number; records of the same star in reading order."""
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     order = np.argsort(pixels, kind="stable")
     if (np.diff(pixels[order]) == 0).any():
         order = np.lexsort((places_of(stars), stars["star_id"].to_numpy(), pixels))
-    return stars.take(pa.array(order))
+    return order
 
 
 @lru_cache(maxsize=2)
@@ -142,18 +146,24 @@ def _map(pixels: Pixels) -> list[list[int]]:
 
 
 def _write_borders(
-    stars: pa.Table, plan: StorePlan, pixel: Pixel, beside: tuple[Pixel, ...]
+    stars: pa.Table,
+    order: NDArray[np.int64],
+    pixels: Pixels,
+    plan: StorePlan,
+    pixel: Pixel,
+    beside: tuple[Pixel, ...],
 ) -> list[Path]:
-    """Write the stars that are in the margins of other partitions: one batch for each of those."""
+    """Write the stars that are in the margins of other partitions: one batch for each of those.
+
+    The pixels are those of the rows in their order.
+    """
     if not beside:
         return []
     path = border_path(plan, pixel)
-    pixels = stars[HEALPIX_COLUMN].to_numpy()
     schema = store_schema()
     with arrow_writer(path, schema) as writer:
         for other in beside:
-            order, border = border_of(other, plan.margin_rad)
-            rows = rows_within(pixels, order, border, other)
+            rows = order[rows_within(pixels, *border_of(other, plan.margin_rad), other)]
             some = with_constants(stars.take(pa.array(rows)), schema)
             batches = some.combine_chunks().to_batches()
             empty = pa.RecordBatch.from_pylist([], schema=schema)
@@ -180,16 +190,16 @@ def border_path(plan: StorePlan, pixel: Pixel) -> Path:
 
 def write_margin(
     plan: StorePlan, pixel: Pixel, batches: tuple[tuple[Path, int], ...]
-) -> tuple[dict[str, Any], Digests]:
+) -> tuple[dict[str, Any], list[Path]]:
     """Write the margin of a partition, from batches of the files of its neighbours' stars."""
     stars = _read_borders(batches)
     if not len(stars):
-        return {"rows": 0}, {}
+        return {"rows": 0}, []
     path = plan.margin / DATASET / pixel.path
     keys = (stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy())
     ordered = stars.take(pa.array(np.lexsort(keys)))
     write_partition(ordered, (len(stars),), path)
-    return {"rows": len(stars), "bytes": path.stat().st_size}, digests_of([path])
+    return {"rows": len(stars), "bytes": path.stat().st_size}, [path]
 
 
 def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:
@@ -200,12 +210,11 @@ def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:
     return pa.Table.from_batches(found, found[0].schema).combine_chunks()
 
 
-def bright_first(stars: pa.Table) -> tuple[pa.Table, tuple[int, ...]]:
-    """Return the stars of a partition in the order in which they are written."""
-    group = _groups(floats_of(stars, "mag"))
-    order = np.argsort(group, kind="stable")
+def _bright_first(mag: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
+    """Return the order in which the stars of a partition are written, and the groups' rows."""
+    group = _groups(mag)
     counts = np.bincount(group)
-    return stars.take(pa.array(order)), tuple(counts[counts > 0].tolist())
+    return np.argsort(group, kind="stable"), tuple(counts[counts > 0].tolist())
 
 
 def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:

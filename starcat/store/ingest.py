@@ -29,7 +29,7 @@ from starcat.storage.atomic import Outcome, move_into_place, remove_partial, wri
 from starcat.storage.digests import file_sha256
 from starcat.store.cluster import cluster, run_tasks, versions
 from starcat.store.finish import border_path, finish, write_margin
-from starcat.store.ledger import RESUME_ADVICE, Digests, Task
+from starcat.store.ledger import RESUME_ADVICE, Task
 from starcat.store.metadata import Written, describe_store, make_manifest
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import StoreOptions, StorePlan, partition_pixels, rows_of_a_run, spill_order
@@ -224,7 +224,7 @@ def _task_of(
     step: str,
     content: str,
     pixel: Pixel,
-    function: Callable[..., tuple[dict[str, Any], Digests]],
+    function: Callable[..., tuple[dict[str, Any], list[Path]]],
     arguments: tuple[Any, ...],
 ) -> Task:
     name = f"{step}-{content}-{pixel.order}-{pixel.number}"

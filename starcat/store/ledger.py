@@ -1,8 +1,8 @@
-"""The ledger of a run: which of its tasks are done, and the digests of what they wrote.
+"""The ledger of a run: which of its tasks are done, and the checksums of what they wrote.
 
 A store is made in a hidden folder beside its final name. Each task writes its files there and
 then, as its last step, one line of facts that says so. A run that was killed goes on from these:
-a task counts as done if its files are there and have their digests.
+a task counts as done if its files are there and have their checksums.
 """
 
 from __future__ import annotations
@@ -15,21 +15,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from isal import isal_zlib
+
 from starcat.errors import ConfigError, OutputError
 from starcat.storage.atomic import writing
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.digests import json_bytes
 
 OPTIONS_NAME = "options.json"
 RESUME_ADVICE = "what is done is kept: make room, then go on with --resume"
 _DONE = "done"
 
-Digests = dict[Path, str]
-"""Files and their SHA-256."""
 
-
-def digests_of(files: Iterable[Path]) -> Digests:
-    """Return the digests of files."""
-    return {file: file_sha256(file) for file in files}
+def _checksum(path: Path) -> str:
+    """Return the CRC-32 of a file: it tells what was left half-written or damaged, not changed."""
+    checksum = 0
+    with path.open("rb") as file:
+        while data := file.read(1 << 20):
+            checksum = isal_zlib.crc32(data, checksum)
+    return f"{checksum:08x}"
 
 
 @dataclass(frozen=True)
@@ -81,22 +84,20 @@ class ResumePlan:
         try:
             record = json.loads(path.read_bytes())
             files: dict[str, str] = record["files"]
-            if all(file_sha256(self / file) == digest for file, digest in files.items()):
+            if all(_checksum(self / file) == checksum for file, checksum in files.items()):
                 result: dict[str, Any] = record["result"]
                 return result
         except (OSError, ValueError, KeyError, TypeError):
             pass
         return None
 
-    def record(self, name: str, result: Mapping[str, Any], written: Digests) -> None:
+    def record(self, name: str, result: Mapping[str, Any], written: Iterable[Path]) -> None:
         """Record that a task is done."""
-        digests = {
-            file.relative_to(self.folder).as_posix(): digest for file, digest in written.items()
-        }
+        files = {file.relative_to(self.folder).as_posix(): _checksum(file) for file in written}
         path = self._record(name)
         # Two workers may do the same task when one of them was thought dead: both write the same.
         partial = path.with_name(f".{path.name}.{os.getpid()}")
-        partial.write_bytes(json_bytes({"files": digests, "result": dict(result)}))
+        partial.write_bytes(json_bytes({"files": files, "result": dict(result)}))
         partial.replace(path)
 
     def _record(self, name: str) -> Path:
@@ -112,7 +113,7 @@ class Task:
 
     plan: ResumePlan
     name: str  # unique in the run
-    function: Callable[..., tuple[dict[str, Any], Digests]]
+    function: Callable[..., tuple[dict[str, Any], list[Path]]]
     arguments: tuple[Any, ...]
     # whether an earlier result holds for the arguments; None where it always does
     is_valid: Callable[..., bool] | None = None

@@ -59,13 +59,13 @@ _PLACE = (
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
     """Read a star catalog from a store or from archive files; what is chosen is as for `ingest`."""
     here = brought(source_name, paths, **chosen)
-    is_ours = [open_store(path).is_ours for path in here if path.is_dir() and is_store(path)]
+    stores = [open_store(path) for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None
-    if not is_ours or (is_mapped and not any(is_ours)):
+    if not stores or (is_mapped and not any(store.is_ours for store in stores)):
         read = ingest(source_name, here, **chosen)
     else:
         _check_alone(source_name, paths)
-        read = _read_store(source_name, open_store(here[0]), **chosen)
+        read = _read_store(source_name, stores[0], **chosen)
     address = address_of(paths[0]) if paths else None
     return read if address is None else _named_by_address(read, here[0], address)
 

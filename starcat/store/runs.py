@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.stars import floats_of
+from starcat.catalog.stars import floats_of, nulls
 from starcat.storage.atomic import placed
 from starcat.storage.schema import product_schema
 from starcat.store.pixels import (
@@ -77,9 +77,8 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     pixels = healpix_29(floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg"))
     ascending = np.argsort(pixels, kind="stable")
     pixels = pixels[ascending]
-    stars = stars.combine_chunks()
     varying, constants = _without_constants(stars)
-    table = varying.take(pa.array(ascending))
+    table = varying.combine_chunks().take(pa.array(ascending))
     table = table.add_column(0, HEALPIX_COLUMN, pa.array(pixels))
     table = table.replace_schema_metadata({_CONSTANTS: json.dumps(constants).encode()})
     coarse, begins, rows = runs_of(pixels, order)
@@ -143,14 +142,15 @@ def read_shares(
     parts: list[pa.Table] = []
     told: list[dict[str, Any]] = []
     for share in shares:
-        for table, constants in _batches(share, wanted):
-            begin, stop = np.searchsorted(table[HEALPIX_COLUMN].to_numpy(), [first, end])
-            parts.append(table.slice(begin, stop - begin))
-            told.append(constants)
+        table, constants = _read_share(share, wanted)
+        begin, stop = np.searchsorted(table[HEALPIX_COLUMN].to_numpy(), [first, end])
+        parts.append(table.slice(begin, stop - begin))
+        told.append(constants)
     return _joined(parts, told, [schema.field(name) for name in wanted])
 
 
-def _batches(share: Share, names: Sequence[str]) -> Iterator[tuple[pa.Table, dict[str, Any]]]:
+def _read_share(share: Share, names: Sequence[str]) -> tuple[pa.Table, dict[str, Any]]:
+    """Return batches of a run as one table by pixel, and the columns of one value."""
     path, batches = share
     with pa.OSFile(str(path)) as source:
         schema = pa.ipc.open_file(source).schema
@@ -158,8 +158,7 @@ def _batches(share: Share, names: Sequence[str]) -> Iterator[tuple[pa.Table, dic
         options = pa.ipc.IpcReadOptions(included_fields=places)
         reader = pa.ipc.open_file(source, options=options)
         constants = json.loads(schema.metadata[_CONSTANTS])
-        for number in batches:
-            yield pa.Table.from_batches([reader.get_batch(number)]), constants
+        return pa.Table.from_batches([reader.get_batch(n) for n in batches]), constants
 
 
 def _joined(
@@ -167,7 +166,8 @@ def _joined(
 ) -> pa.Table:
     """Join batches; a column that has one value in all of them is left a constant."""
     common: dict[str, Any] = {}
-    columns = [pa.chunked_array([part[HEALPIX_COLUMN].chunk(0) for part in parts], pa.int64())]
+    pixels = [chunk for part in parts for chunk in part[HEALPIX_COLUMN].chunks]
+    columns = [pa.chunked_array(pixels, pa.int64())]
     kept = [pixel_field()]
     for field in fields:
         values = {constants.get(field.name, _VARIES) for constants in told}
@@ -199,7 +199,7 @@ def with_constants(stars: pa.Table, schema: pa.Schema) -> pa.Table:
 
 
 def _constant(value: Any, count: int, kind: pa.DataType) -> pa.Array:
-    return pa.nulls(count, kind) if value is None else pa.repeat(pa.scalar(value, kind), count)
+    return nulls(count, kind) if value is None else pa.repeat(pa.scalar(value, kind), count)
 
 
 @dataclass(frozen=True)

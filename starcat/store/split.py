@@ -20,7 +20,6 @@ from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
-from starcat.store.ledger import Digests, digests_of
 from starcat.store.pixels import runs_of
 from starcat.store.plan import StorePlan, rows_of_a_run
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
@@ -75,7 +74,7 @@ class _Written:
         self.files.append(path)
 
 
-def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any], Digests]:
+def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any], list[Path]]:
     """Split an input into runs, which have batches by pixels of an order."""
     written = _Written(plan, split_name(file.number), order)
     (plan.rejected / f"{written.name}.parquet").unlink(missing_ok=True)
@@ -97,7 +96,7 @@ def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any],
         "runs": len(written.runs),
     }
     written.index()
-    return result, digests_of(written.files)
+    return result, written.files
 
 
 def split_name(number: int) -> str:

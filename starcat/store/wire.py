@@ -35,7 +35,6 @@ from starcat.storage.atomic import placed, writing
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.download import (
     DownloadOptions,
-    NotFound,
     download,
     forget_part,
     is_address,
@@ -53,6 +52,7 @@ from starcat.store.layout import (
     REJECTED,
     REPEATED,
     groups_within,
+    parquet_file,
     pixels_of,
     primary_of,
     read_properties,
@@ -156,22 +156,37 @@ def _bring_listing(copy: _Copy) -> tuple[str, list[Pixel]]:
 
 def _without_margins(text: bytes) -> bytes:
     """Return a collection's properties without its margins, which a copy has not."""
-    return b"".join(line for line in text.splitlines(keepends=True) if b"margin" not in line)
+    margins = (b"default_margin", b"all_margins")
+    lines = text.splitlines(keepends=True)
+    return b"".join(line for line in lines if not line.lstrip().startswith(margins))
 
 
 def _bring_beside(copy: _Copy) -> None:
     """Bring the rejected and repeated records of a store that starcat made."""
-    manifest = json.loads((copy.folder / MANIFEST_NAME).read_bytes())
-    for facts in manifest["partitions"]:
-        name = f"{REPEATED}/{facts['order']}-{facts['pixel']}.parquet"
-        if facts["repeated"] and not copy.whole(name):
+    try:
+        manifest = json.loads((copy.folder / MANIFEST_NAME).read_bytes())
+        # Numbers, as nothing else that a server says may become a path.
+        partitions = [(int(one["order"]), int(one["pixel"])) for one in manifest["partitions"]]
+        repeated = [int(one["repeated"]) for one in manifest["partitions"]]
+        counts = {str(name): int(count) for name, count in manifest["rejected"].items()}
+        files = len(manifest["files"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ProductError(
+            f"{copy.url}/{MANIFEST_NAME}: cannot be read ({error!r}); expected the account of a "
+            "store. Make the store again with 'starcat ingest SOURCE --to hats'"
+        ) from error
+    for (order, pixel), count in zip(partitions, repeated, strict=True):
+        name = f"{REPEATED}/{order}-{pixel}.parquet"
+        if count and not copy.whole(name):
             raise ProductError(f"{copy.url}/{name}: is missing; the store is not whole")
-    counts = dict(manifest["rejected"])
     for reason in (Reason.beyond_read_limit, Reason.duplicate_record):
         counts.pop(reason.name, None)
-    names = [f"{REJECTED}/{split_name(n)}.parquet" for n in range(len(manifest["files"]))]
+    names = [f"{REJECTED}/{split_name(n)}.parquet" for n in range(files)]
     there = [copy.folder / name for name in (names if counts else ()) if copy.whole(name)]
-    rows = sum(pq.read_metadata(path).num_rows for path in there)
+    rows = 0
+    for path in there:
+        with parquet_file(path, ProductError, f"{copy.url}/{REJECTED} is damaged") as file:
+            rows += file.metadata.num_rows
     if rows != sum(counts.values()):
         raise ProductError(
             f"{copy.url}/{REJECTED}: {rows} rejected records are there; the store has "
@@ -222,9 +237,10 @@ class _Copy:
         forget_part(path)
         try:
             download(self._url(name), path, self.how)
-        except NotFound:
-            return False
         except DownloadError as error:
+            # Object stores answer 403 for what is not there.
+            if getattr(error.__cause__, "status", None) in (403, 404, 410):
+                return False
             error.args = (f"{self.url}/{name}: {error}",)
             raise
         part = part_of(path)
@@ -268,6 +284,8 @@ class _Part:
         if self.note.exists():
             state = _State.model_validate_json(self.note.read_bytes())
             self.state = state if path.stat().st_size == state.version.size else None
+        if self.state is None:
+            file.truncate(0)  # what is there is of no version that is known
 
     def fill(self, choose: Choose) -> None:
         """Bring what is chosen and not there."""
@@ -278,7 +296,8 @@ class _Part:
         if self.file.read(4) != _MAGIC or length > size:
             raise ProductError(f"{self.url}: is no Parquet file; expected a partition of a catalog")
         self._need([(0, min(size, 4)), (size - length, size - FOOTER_BYTES)])
-        footer = pq.read_metadata(self.path)
+        with parquet_file(self.path, ProductError, f"{self.url} is damaged") as opened:
+            footer = opened.metadata
         groups, names = choose(self.path, footer)
         self._need(chunks_of(footer, groups, names))
 
@@ -287,7 +306,8 @@ class _Part:
             if first < end and self.state and (first, end) not in self.state.there:
                 state = self._get(first, end)
                 state.there.append((first, end))
-                self.note.write_text(state.model_dump_json() + "\n", encoding="utf-8")
+                with placed(self.note) as whole:
+                    whole.write_text(state.model_dump_json() + "\n", encoding="utf-8")
 
     def _get(self, first: int, end: int) -> _State:
         def write(place: int, block: bytes) -> None:

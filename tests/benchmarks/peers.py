@@ -40,6 +40,7 @@ PRIOR_DEG = 0.5
 
 REQUIREMENTS = {
     "cedar-solve": ("cedar-solve==0.5.1",),
+    "hats-import": ("hats-import==0.11.1",),
     "tetra3rs": ("tetra3rs==0.14.0",),
     # It imports typing_extensions without saying so.
     "ruststartracker": ("ruststartracker==0.2.10", "typing_extensions"),

@@ -4,8 +4,9 @@ The parts are those of `twomass_parts`: made here, or given as a folder. Each ca
 its own; its memory is the sum over its processes, sampled every 50 ms, its CPU time that of all of
 them. The bare parse is zlib and pyarrow's CSV reader with the used columns typed, a process for
 each worker. Wall times mean something on a quiet machine only; CPU times of the same run can be
-compared on any. It fails where a case does not end well, or where the build from the store has
-other guide stars than that from the parts.
+compared on any. hats-import, in an environment of its own, is a case that is asked for by name. It
+fails where a case does not end well, or where the build from the store has other guide stars than
+that from the parts.
 
     python tests/benchmarks/scale.py --rows 5000000
     python tests/benchmarks/scale.py --parts FOLDER --cases bare build
@@ -27,6 +28,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
+import peers
 import pyarrow as pa
 from pyarrow import csv
 from rows import Options, Rows, ended, need
@@ -154,10 +156,25 @@ def commands(given: Given) -> dict[str, list[str]]:
         "store": [*ingest, "--input", str(given.parts), "-o", str(given.store), *workers],
         "build": [*build, f"2mass={given.parts}"],
         "from-store": [*build, f"2mass={given.store}"],
+        "hats-import": hats_import(given),
     }
 
 
-CASES = ("bare", "store", "build", "from-store")
+def hats_import(given: Given) -> list[str]:
+    """Return the command of hats-import, in an environment of its own, for the same columns."""
+    from starcat.catalog.archives.twomass import COLUMNS
+    from starcat.catalog.source import data_source
+
+    [layout] = data_source("2mass").files
+    used = {n: "str" if layout.column(n).is_text else "float64" for n in COLUMNS["psc"]}
+    columns = json.dumps([[column.name for column in layout.columns], used])
+    python = peers.HOME / "hats-import" / "bin" / "python"
+    peer = Path(__file__).with_name("hats_peer.py")
+    folder = given.scratch / "hats-import"
+    return [*map(str, (python, peer, given.parts, folder, given.workers)), columns]
+
+
+CASES = ("bare", "store", "build", "from-store", "hats-import")
 
 
 def guide_stars_of(folder: Path) -> str:
@@ -172,7 +189,7 @@ def main(rows: Rows) -> None:
     options.size("--rows", 5_000_000, 200_000, "of the parts, given or made")
     options.add_argument("--parts", type=Path, help="a folder of parts that are there already")
     options.add_argument("--store", type=Path, help="where the store is, or is made and left")
-    options.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    options.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES[:-1]))
     options.add_argument("--workers", type=int, default=2)
     options.add_argument("--runs", type=int, default=1)
     options.add_argument("--bare", action="store_true", help=argparse.SUPPRESS)
@@ -192,6 +209,8 @@ def main(rows: Rows) -> None:
         made: set[str] = set()
         for name in asked.cases * asked.runs:
             with rows.row(name):
+                if name == "hats-import":
+                    peers.environment(name)
                 took = measure(commands(given)[name])
                 first = first or took
                 print_times(name, took, first, given)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import re
 import threading
 import time
 from dataclasses import dataclass, field
+from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -155,3 +157,78 @@ class Archive(ThreadingHTTPServer):
 
     def handle_error(self, *_: object) -> None:
         """Say nothing: a client that was killed is part of the tests."""
+
+
+@dataclass
+class Fault:
+    """What happens once to a request whose method and path are found."""
+
+    where: str  # a regular expression of "METHOD path"
+    status: int = 0  # in place of the answer
+    cut: int | None = None  # bytes of the body that arrive
+    wait_s: float = 0.0
+    swap: tuple[bytes, bytes] = (b"", b"")  # in the answer's body, and in the request's
+    times: int = 1
+    is_packed: bool = False  # by gzip, though nobody asked for it
+
+
+class RelayHandler(BaseHTTPRequestHandler):
+    server: Relay
+
+    def _relay(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        what = f"{self.command} {self.path} {body.decode('latin-1')}"
+        self.server.seen.append(what)
+        fault = next((f for f in self.server.faults if f.times and re.search(f.where, what)), None)
+        if fault is not None:
+            fault.times -= 1
+            time.sleep(fault.wait_s)
+            if fault.status:
+                self.send_error(fault.status)
+                return
+            body = body.replace(*fault.swap) if fault.swap[0] else body
+        connection = HTTPConnection("127.0.0.1", self.server.target, timeout=30)
+        connection.request(self.command, self.path, body or None, dict(self.headers))
+        answer = connection.getresponse()
+        data = answer.read()
+        connection.close()
+        if fault is not None:
+            data = data.replace(*fault.swap) if fault.swap[0] else data
+            data = gzip.compress(data) if fault.is_packed else data
+        self.send_response(answer.status)
+        for key, value in answer.getheaders():
+            if key.lower() not in ("content-length", "transfer-encoding", "connection"):
+                self.send_header(key, value)
+        self.send_header("Content-Length", str(len(data)))
+        if fault is not None and fault.is_packed:
+            self.send_header("Content-Encoding", "gzip")
+        self.end_headers()
+        self.wfile.write(data if fault is None or fault.cut is None else data[: fault.cut])
+
+    def do_GET(self) -> None:
+        self._relay()
+
+    def do_POST(self) -> None:
+        self._relay()
+
+    def do_DELETE(self) -> None:
+        self._relay()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+class Relay(ThreadingHTTPServer):
+    """Passes requests on to a server of this machine, and does to some what networks do."""
+
+    def __init__(self, target: int) -> None:
+        super().__init__(("127.0.0.1", 0), RelayHandler)
+        self.target = target
+        self.faults: list[Fault] = []
+        self.seen: list[str] = []
+
+    def url(self, path: str) -> str:
+        return f"http://127.0.0.1:{self.server_port}{path}"
+
+    def handle_error(self, *_: object) -> None:
+        """Say nothing: a client that goes away is part of the tests."""

@@ -11,7 +11,7 @@ from every_command import every_command
 from typer.testing import CliRunner
 
 from starcat.catalog.source import data_source, source_names
-from starcat.catalog.table_map import UNITS, Flags, StarColumns, TableMap
+from starcat.catalog.table_map import UNITS, Flags, Remote, StarColumns, TableMap
 from starcat.catalog.verdict import Reason
 from starcat.cli.main import app
 from starcat.evaluation.report.files import reproduction_page
@@ -99,6 +99,10 @@ def sources_page() -> str:
         page.append(f"## {name}: {source.title}\n")
         page.append(f"{source.identifier}; {source.frame}{epoch}.\n")
         page.append(f"Cite: {source.citation}\n\nLicence: {source.licence}\n")
+        if source.table is not None and (remote := source.table.remote):
+            ways = {"TAP": f"{remote.tap} {remote.table}", "HATS": remote.hats}
+            told = "; ".join(f"{kind} `{way}`" for kind, way in ways.items() if way.strip())
+            page.append(f"Served as {told} ({remote.checked}).\n")
         for file in source.files:
             rows = f"{file.rows:,} records" if file.rows else "records"
             size = f" of {file.record_bytes} bytes" if file.record_bytes else ""
@@ -114,7 +118,12 @@ def map_keys() -> list[str]:
         "## Maps of tables\n",
         "How to write one: [howto-own-catalog.md](howto-own-catalog.md).\n",
     ]
-    for title, model in (("", TableMap), ("columns", StarColumns), ("flags", Flags)):
+    for title, model in (
+        ("", TableMap),
+        ("columns", StarColumns),
+        ("flags", Flags),
+        ("remote", Remote),
+    ):
         page.append(f"### {f'[{title}]' if title else 'At the top, and sections'}\n")
         page.append("| key | needed | becomes | meaning |\n|---|---|---|---|")
         for name, field in model.model_fields.items():

@@ -7,6 +7,8 @@ one character a band, in the order J, H, Ks. Stars brighter than about 4 mag are
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
@@ -57,7 +59,7 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
         "dec_error_mas": error_mas,
         "ra_central_jyear": epoch_jyear,
         "dec_central_jyear": epoch_jyear,
-        "mag": magnitudes(records, band),
+        "mag": _blend(mags, weights),
         "mag_error": np.sqrt(
             sum((weight * known(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
         ),
@@ -84,7 +86,11 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
 def magnitudes(records: Records, band: str) -> Array:
     """Return the magnitudes of 2MASS records."""
     weights = blend_weights(band)
-    return np.asarray(np.sum([weight * _measured(records, n) for n, weight in weights.items()], 0))
+    return _blend({name: _measured(records, name) for name in weights}, weights)
+
+
+def _blend(mags: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
+    return np.asarray(np.sum([weight * mags[name] for name, weight in weights.items()], 0))
 
 
 def _measured(records: Records, band: str) -> Array:

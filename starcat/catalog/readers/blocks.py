@@ -77,23 +77,20 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
 def read_blocks(file: InputFile, on_end: Callable[[DigestReader], None]) -> Iterator[Block]:
     """Read a file in blocks of whole lines or whole binary records, one at least."""
     raw, stream = open_input(file.path)
-    line, tail = 1, b""
+    line, is_binary, is_empty = 1, file.layout.layout == "binary", True
     try:
-        if file.layout.layout == "binary":
+        if is_binary:
             _check_magic(stream.read(file.layout.header_bytes), file)
         size = _read_size(file.layout)
-        while chunk := stream.read(size):
-            cut = _last_whole(tail, chunk, file.layout)
-            data, tail = (tail + chunk[:cut], chunk[cut:]) if cut else (b"", tail + chunk)
-            del chunk
-            if len(tail) > MAX_LINE_BYTES:
-                raise _endless_line(file, line)
-            if data:
-                yield Block(file, data, line, raw.bytes_read)
-                line += _count(data, file.layout)
-        if tail:
-            yield Block(file, tail, line, raw.bytes_read)
-        elif line == 1:
+        while data := stream.read(size):
+            if not is_binary and not data.endswith(b"\n"):
+                data += (rest := stream.readline(MAX_LINE_BYTES))
+                if len(rest) == MAX_LINE_BYTES and not rest.endswith(b"\n"):
+                    raise _endless_line(file, line + data.count(b"\n"))
+            yield Block(file, data, line, raw.bytes_read)
+            line += _count(data, file.layout)
+            is_empty = False
+        if is_empty:
             raise file.error(f"the file is empty; expected records of {file.source}")
         on_end(raw)
     except (EOFError, gzip.BadGzipFile, _Damage) as error:
@@ -131,13 +128,6 @@ def _read_size(layout: RecordFile) -> int:
     """Return the bytes of a whole number of records, so that blocks end where records end."""
     record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
     return max(1, BLOCK_BYTES // record) * record
-
-
-def _last_whole(tail: bytes, chunk: bytes, layout: RecordFile) -> int:
-    """Return how much of a chunk belongs to records that are whole with what was left before."""
-    if layout.layout == "binary":
-        return max(0, len(chunk) - (len(tail) + len(chunk)) % (layout.record_bytes or 1))
-    return chunk.rfind(b"\n") + 1
 
 
 def _count(data: bytes, layout: RecordFile) -> int:

@@ -26,6 +26,9 @@ from starcat.catalog.readers.records import (
 )
 from starcat.catalog.source import Column, RecordFile
 
+_CACHED_BYTES = 1 << 20
+"""Text that is split at once, and is then still in the processor's cache for its numbers."""
+
 
 def parse_delimited(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
@@ -47,7 +50,7 @@ def _parse_regular(
     if not data or has_comment or b"\r" in data:
         return None
     try:
-        table = _read_csv(data, layout, chosen, as_text=False)
+        table = _read_csv(data, layout, chosen, block_bytes=_CACHED_BYTES)
         if len(table) != line_ends(data) + (not data.endswith(b"\n")):
             return None  # pyarrow passes over empty lines
         columns = {column.name: _array(table[column.name], column) for column in chosen}
@@ -84,7 +87,7 @@ def _parse_lines(
     clean = b"\n".join(kept)
     bad = np.zeros(len(line), dtype=bool)
     try:
-        table = _read_csv(clean, layout, chosen, as_text=False)
+        table = _read_csv(clean, layout, chosen)
         columns = {column.name: _array(table[column.name], column) for column in chosen}
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         table = _read_csv(clean, layout, chosen, as_text=True)
@@ -93,7 +96,12 @@ def _parse_lines(
 
 
 def _read_csv(
-    data: bytes, layout: RecordFile, chosen: Sequence[Column], *, as_text: bool
+    data: bytes,
+    layout: RecordFile,
+    chosen: Sequence[Column],
+    *,
+    as_text: bool = False,
+    block_bytes: int = 1 << 30,
 ) -> pa.Table:
     nulls = sorted({"", *(text for column in chosen for text in column.null)})
     kinds = {c.name: pa.binary() if as_text or c.is_text else pa.float64() for c in chosen}
@@ -102,7 +110,7 @@ def _read_csv(
         read_options=csv.ReadOptions(
             column_names=[column.name for column in layout.columns],
             use_threads=False,
-            block_size=max(len(data) + 1, 1 << 16),
+            block_size=block_bytes,
         ),
         parse_options=csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
         convert_options=csv.ConvertOptions(

@@ -1,0 +1,443 @@
+"""Get a table from a TAP service into a folder of Parquet files, strip by strip of declination.
+
+The service counts the rows of every strip before it is asked for them; a strip that comes with
+others is an error, one that the service cuts short is halved. Rows are sorted by all their values,
+so that the same rows give the same files. The folder gets its name when all strips are there and
+add up; until then it is hidden beside it, with an account from which a later run goes on.
+
+pyvo speaks with the service. Which table, columns and rows are asked for is in `Asked`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+from xml.parsers.expat import ExpatError
+
+import pyarrow as pa
+import requests
+from pydantic import BaseModel, ConfigDict, ValidationError
+from requests.adapters import HTTPAdapter
+from urllib3.util import Retry
+
+from starcat.catalog.archives.mapped import understand
+from starcat.catalog.readers.tables import ANY, OpenTable, open_table
+from starcat.catalog.source import RecordFile
+from starcat.catalog.source_files import InputFile
+from starcat.catalog.table_map import TableMap
+from starcat.errors import ConfigError, DownloadError, OutputError, ParseError
+from starcat.progress import Progress, no_progress
+from starcat.storage.atomic import whole_file, writing
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.download import DownloadOptions, download, forget_part, part_of
+from starcat.storage.locks import locked
+from starcat.storage.parquet import write_table
+
+ACCOUNT_NAME = "fetched.json"
+STRIP_ROWS = 500_000
+"""Rows that a strip may have; of a service that gives fewer at a time, so many."""
+
+MIN_WIDTH_DEG = 1e-4
+LONGEST_JOB_S = 4 * 3600.0
+_POLL_S = (0.1, 10.0)  # between two questions for the state of a job: first and longest
+_REGULAR = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_WORDS = (
+    *("date", "day", "first", "hour", "key", "last", "level", "max", "min", "minute", "month"),
+    *("order", "point", "position", "section", "size", "second", "time", "timestamp", "user"),
+    *("value", "year", "zone"),
+)
+_STATUS = re.compile(rb"<INFO\b[^>]*QUERY_STATUS[^>]*value=.(ERROR|OVERFLOW)[^>]*>([^<]{0,500})")
+_STATUS_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a TAP service is asked for."""
+
+    service: str  # address
+    table: str = ""  # as it stands behind FROM
+    query: str = ""  # a whole query in place of a table
+    map: TableMap | None = None  # whose columns are asked for; None for all
+    limit_mag: float | None = None  # of the first band of the map
+    strip_by: str = "dec"  # column in degrees, -90 to 90; with a map that of the declination
+
+
+class Strip(BaseModel):
+    """Rows between two declinations."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    first_deg: float  # included
+    end_deg: float  # included only at the pole
+    rows: int = 0  # as the service counts them
+    file: str | None = None  # in the folder, once it is there
+    sha256: str | None = None
+
+
+class Account(BaseModel):
+    """What was asked for, and what has come."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    service: str
+    query: str  # without the strips
+    strip_by: str
+    rows: int = 0  # of all strips together
+    strips: list[Strip] = []
+
+
+@dataclass(frozen=True)
+class TapReport:
+    """What `fetch_table` did."""
+
+    folder: Path
+    status: Literal["fetched", "resumed", "present"]
+    account: Account
+
+
+def fetch_table(
+    asked: Asked,
+    folder: Path,
+    options: DownloadOptions | None = None,
+    progress: Progress = no_progress,
+) -> TapReport:
+    """Get the rows that are asked for into a folder, or go on with what an earlier run began."""
+    work = folder.absolute().parent / f".{folder.name}.fetch"
+    with writing(folder.parent, "what has come is kept: make room, and run the same again"):
+        work.mkdir(parents=True, exist_ok=True)
+        with locked(work):
+            fetch = _Fetch(asked, work, options or DownloadOptions(), progress)
+            try:
+                status = fetch.run(folder)
+            finally:
+                with suppress(OSError):  # nothing has come, or all of it is elsewhere
+                    work.rmdir()
+    return TapReport(folder, status, fetch.account)
+
+
+class _Truncated(Exception):  # noqa: N818 - the strip is halved
+    """The service says that it left rows out."""
+
+
+class _Fetch:
+    """A fetch into a hidden folder."""
+
+    account: Account
+
+    def __init__(
+        self, asked: Asked, work: Path, options: DownloadOptions, progress: Progress
+    ) -> None:
+        self.asked, self.work, self.options, self.progress = asked, work, options, progress
+        self.service = _service_at(asked.service, options)
+        self.most = min(STRIP_ROWS, _hard_limit(asked.service, self.service) or STRIP_ROWS)
+        query = asked.query.strip().rstrip(";")
+        self.table = f"({query}) AS asked" if query else asked.table
+        self.chosen, self.limit = "*", ""
+
+    def run(self, final: Path) -> Literal["fetched", "resumed", "present"]:
+        """Get what is missing, check that it adds up, and give the folder its name."""
+        wanted = self._understood()
+        if final.exists():
+            self.account = _account_in(final, wanted)
+            lost = [one.file for one in self.account.strips if not _is_there(one, final)]
+            if lost:
+                raise OutputError(f"{final}: {lost[0]} is damaged; remove the folder", path=final)
+            return "present"
+        is_begun = (self.work / ACCOUNT_NAME).is_file()
+        self.account = _account_in(self.work, wanted) if is_begun else wanted
+        if not is_begun:
+            self._plan()
+        had = any(strip.file and _is_there(strip, self.work) for strip in self.account.strips)
+        self._bring_all()
+        self._check_sum()
+        self.work.rename(final)
+        return "resumed" if had else "fetched"
+
+    def _understood(self) -> Account:
+        """Return the account of what is asked for, of which nothing is counted yet."""
+        asked, column = self.asked, self.asked.strip_by
+        opened = self._ask(f"SELECT TOP 1 * FROM {self.table}")
+        if asked.map is not None:
+            found = understand(asked.map, opened.columns, asked.table or "the answer")
+            dec = found["columns.dec"]
+            column = dec.columns[0] if dec.is_column and dec.unit == "deg" else ""
+            names = dict.fromkeys(name for one in found.values() for name in one.columns)
+            self.chosen = ", ".join(map(_quoted, names))
+            band = found[f"magnitudes.{asked.map.ordered_bands[0]}"]
+            if asked.limit_mag is not None:
+                if not band.is_column or band.unit != "mag":
+                    raise ConfigError(
+                        f"--limit-mag: {asked.map.ordered_bands[0]} of the map is not a column of "
+                        "magnitudes; write the limit into a --query",
+                        key="limit_mag",
+                    )
+                self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag:g}"
+        known = opened.columns.get(column)
+        if known is None or known.is_text:
+            raise ConfigError(
+                f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
+                f"has {', '.join(list(opened.columns)[:40])}. Name one with --strip-by",
+                key="strip_by",
+                value=column,
+            )
+        query = f"SELECT {self.chosen} FROM {self.table}{self.limit}"
+        return Account(service=asked.service, query=query, strip_by=_quoted(column))
+
+    def _plan(self) -> None:
+        """Count all rows, and those of strips of the same area."""
+        rows = self.account.rows = self._count()
+        if not rows:
+            raise DownloadError(
+                f"{self.asked.service}: no row for {self.account.query!r}; ask for more"
+            )
+        number = -(-rows // self.most)
+        edges = [math.degrees(math.asin(2 * k / number - 1)) for k in range(number + 1)]
+        for first, end in pairwise(round(edge, 6) for edge in edges):
+            self.account.strips += self._counted(first, end)
+        self._check_sum()
+        self._note()
+
+    def _counted(self, first: float, end: float) -> list[Strip]:
+        """Return a strip with its rows, or its halves where it has too many."""
+        strip = Strip(first_deg=first, end_deg=end)
+        strip.rows = self._count(strip)
+        return [strip] if strip.rows <= self.most else self._halves(strip)
+
+    def _halves(self, strip: Strip) -> list[Strip]:
+        middle = round((strip.first_deg + strip.end_deg) / 2, 6)
+        if strip.end_deg - strip.first_deg < MIN_WIDTH_DEG:
+            raise DownloadError(
+                f"{self.asked.service}: {strip.rows:,} rows lie between declinations "
+                f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time; "
+                "ask for fewer with --limit-mag or --query"
+            )
+        return self._counted(strip.first_deg, middle) + self._counted(middle, strip.end_deg)
+
+    def _count(self, strip: Strip | None = None) -> int:
+        opened = self._ask(f"SELECT COUNT(*) AS n_rows FROM {self.table}{self._where(strip)}")
+        rows = next(opened.rows(list(opened.columns)), None)
+        counted = rows.table.column(0)[0].as_py() if rows and len(rows.table) else None
+        if not isinstance(counted, int):
+            raise DownloadError(f"{self.asked.service}: COUNT(*) gives {counted!r}, no number")
+        return counted
+
+    def _where(self, strip: Strip | None) -> str:
+        if strip is None:
+            return self.limit
+        column, last = self.account.strip_by, "<=" if strip.end_deg >= 90.0 else "<"
+        word = "AND" if self.limit else "WHERE"
+        within = f"{column} >= {strip.first_deg:.6f} AND {column} {last} {strip.end_deg:.6f}"
+        return f"{self.limit} {word} {within}"
+
+    def _bring_all(self) -> None:
+        strips, name, place = self.account.strips, self.work.name[1:].removesuffix(".fetch"), 0
+        while place < len(strips):
+            try:
+                if not _is_there(strips[place], self.work):
+                    self._bring(strips[place])
+            except _Truncated:
+                strips[place : place + 1] = self._halves(strips[place])
+                self._check_sum()
+                self._note()
+                continue
+            place += 1
+            rows = sum(strip.rows for strip in strips[:place])
+            self.progress(f"rows {name}", rows, self.account.rows)
+
+    def _bring(self, strip: Strip) -> None:
+        query = f"SELECT {self.chosen} FROM {self.table}{self._where(strip)}"
+        table = _as_arrow(self._ask(query, strip.rows + 1))
+        if len(table) != strip.rows:
+            raise DownloadError(
+                f"{self.asked.service}: {strip.rows:,} rows are counted between declinations "
+                f"{strip.first_deg} and {strip.end_deg}, and {len(table):,} came; the table "
+                "changes, or the service leaves rows out. Run the same again; if it stays so, "
+                f"remove {self.work} and begin anew"
+            )
+        strip.file = f"strip{strip.first_deg:+011.6f}.parquet"
+        keys = [(name, "ascending") for name in table.column_names]
+        write_table(table.sort_by(keys), self.work / strip.file)
+        strip.sha256 = file_sha256(self.work / strip.file)
+        self._note()
+
+    def _check_sum(self) -> None:
+        rows = sum(strip.rows for strip in self.account.strips)
+        if rows != self.account.rows:
+            raise DownloadError(
+                f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
+                f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
+                f"table changes. Leave them out with a --query, or remove {self.work} and begin "
+                "anew"
+            )
+
+    def _note(self) -> None:
+        with whole_file(self.work / ACCOUNT_NAME) as partial:
+            partial.write_bytes(json_bytes(self.account.model_dump()))
+
+    def _ask(self, query: str, maxrec: int | None = None) -> OpenTable:
+        """Run a query as a job, and read the VOTable that it gives."""
+        path = self.work / "answer.vot.gz"  # whether it is packed is up to the service
+        try:
+            return self._answer(query, path, maxrec)
+        finally:
+            forget_part(path)
+
+    def _answer(self, query: str, path: Path, maxrec: int | None) -> OpenTable:
+        with _told(self.asked.service, query):
+            with self.service.submit_job(query, maxrec=maxrec) as job:
+                job.run()
+                _wait_for(job)
+                job.raise_if_error()
+                uri = str(job.result_uri)
+                if not uri.startswith(("http://", "https://")):
+                    raise DownloadError(f"the result is said to be at {uri[:200]!r}")
+                download(uri, path, self.options)
+            part = part_of(path)
+            _check_status(part)
+            layout = RecordFile(name="answer", file_names=(path.name,), layout="table", table=ANY)
+            opened = open_table(InputFile(part, layout, "tap"))
+            if opened.form != "VOTable":
+                raise DownloadError(f"the answer is {opened.form}, not a VOTable")
+        return opened
+
+
+def _is_there(strip: Strip, folder: Path) -> bool:
+    """Return whether a strip has come, and is as it came; one without rows has no file."""
+    path = folder / (strip.file or "")
+    return not strip.rows or (path.is_file() and file_sha256(path) == strip.sha256)
+
+
+def _account_in(folder: Path, wanted: Account) -> Account:
+    """Read the account of a fetch, which has to be of the same query."""
+    path = folder / ACCOUNT_NAME
+    try:
+        found = Account.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        raise OutputError(
+            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME}); choose another "
+            "--output",
+            path=folder,
+        ) from error
+    if (found.service, found.query, found.strip_by) != (
+        wanted.service, wanted.query, wanted.strip_by,
+    ):  # fmt: skip
+        raise OutputError(
+            f"{folder}: holds what another query gave ({found.query!r} of {found.service}); "
+            "choose another --output, or remove it",
+            path=folder,
+        )
+    return found
+
+
+def _as_arrow(opened: OpenTable) -> pa.Table:
+    """Return the rows of an answer, with the units, UCDs and descriptions of its columns."""
+    parts = [rows.table for rows in opened.rows(list(opened.columns))]
+    if not parts:
+        return pa.table({name: [] for name in opened.columns})
+    table = pa.concat_tables(parts)
+    fields = []
+    for field in table.schema:
+        column = opened.columns[field.name]
+        facts = {"unit": column.unit, "ucd": column.ucd, "description": column.description}
+        fields.append(field.with_metadata({key: text for key, text in facts.items() if text}))
+    return pa.Table.from_arrays(table.columns, schema=pa.schema(fields))
+
+
+def _quoted(name: str) -> str:
+    """Return a column as ADQL names it."""
+    is_plain = _REGULAR.fullmatch(name) and name.lower() not in _WORDS
+    return name if is_plain else '"' + name.replace('"', '""') + '"'
+
+
+def _check_status(path: Path) -> None:
+    """See whether a VOTable says that the query failed, or that rows were left out."""
+    with path.open("rb") as file:
+        head = file.read(_STATUS_BYTES)
+        file.seek(max(0, path.stat().st_size - _STATUS_BYTES))
+        status = dict(_STATUS.findall(head + file.read()))
+    if b"ERROR" in status:
+        raise DownloadError(f"the query failed: {status[b'ERROR'].decode(errors='replace')}")
+    if b"OVERFLOW" in status:
+        raise _Truncated
+
+
+def _wait_for(job: Any) -> None:
+    """Wait until a job has ended, well or not."""
+    pause_s, most_s = _POLL_S
+    end = time.monotonic() + LONGEST_JOB_S
+    while (phase := job.phase) not in ("COMPLETED", "ERROR", "ABORTED"):
+        if phase in ("HELD", "SUSPENDED", "ARCHIVED") or time.monotonic() > end:
+            raise DownloadError(f"the job is {phase} and does not end")
+        time.sleep(pause_s)
+        pause_s = min(1.5 * pause_s, most_s)
+
+
+class _Session(requests.Session):
+    """Requests that end, and are made again where the service is busy."""
+
+    def __init__(self, options: DownloadOptions) -> None:
+        super().__init__()
+        self.timeout_s = options.timeout_s
+        again = Retry(
+            total=options.retries, backoff_factor=options.backoff_s, allowed_methods=None,
+            status_forcelist=(408, 429, 500, 502, 503, 504), raise_on_status=False,
+        )  # fmt: skip
+        for scheme in ("http://", "https://"):
+            self.mount(scheme, HTTPAdapter(max_retries=again))
+
+    def request(self, *given: Any, **how: Any) -> requests.Response:
+        """Send a request."""
+        return super().request(*given, **{"timeout": self.timeout_s, **how})
+
+
+def _service_at(address: str, options: DownloadOptions) -> Any:
+    from pyvo.dal import TAPService
+
+    return TAPService(address, session=_Session(options))
+
+
+def _hard_limit(address: str, service: Any) -> int | None:
+    """Return how many rows a service gives at the most, where it says so."""
+    with _told(address, "its capabilities"):
+        limits = service.get_tap_capability().outputlimit
+    content = limits and limits.hard and limits.hard.content
+    return int(content) if content else None
+
+
+@contextmanager
+def _told(service: str, query: str) -> Iterator[None]:
+    """Say as starcat does what a service, or pyvo, says of a query."""
+    from pyvo.dal.exceptions import DALAccessError, DALQueryError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (_Truncated, OutputError):
+        raise
+    except DALQueryError as error:
+        text = " ".join(str(error).split())[:600]
+        raise DownloadError(f"{service}: refuses {query!r}: {text}") from error
+    except DownloadError as error:
+        raise DownloadError(f"{service}: {error} (asked for {query!r})") from error
+    except (*_NO_TAP, DALAccessError) as error:
+        text = " ".join(str(error).partition("This could mean")[0].split())[:300]
+        text = text or type(error).__name__
+        raise DownloadError(
+            f"{service}: does not answer as a TAP service does when asked for {query!r} "
+            f"({text}); give the address of the service, without /sync, or try again later"
+        ) from error
+
+
+_NO_TAP = (
+    *(requests.RequestException, ExpatError, ParseError, OSError, ValueError, TypeError),
+    *(AttributeError, IndexError, KeyError, EOFError),
+)

@@ -1,0 +1,144 @@
+"""The command that brings catalogs here: files of archives, and tables of TAP services."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcat.cli.console import print_things, progress_bars, say, show
+from starcat.cli.options import Json, to_folder
+
+if TYPE_CHECKING:
+    from starcat.catalog.tap import Asked
+
+app = typer.Typer()
+
+
+@app.command()
+def fetch(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE|tap:ADDRESS",
+            help="A source, as 'starcat sources' lists them, or a TAP service.",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        to_folder("Where the files go; default: the download cache, of TAP there is none."),
+    ] = None,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
+    ] = None,
+    query: Annotated[str | None, typer.Option(help="ADQL for the TAP service.")] = None,
+    table: Annotated[str | None, typer.Option(help="Table of the TAP service.")] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option("--source", metavar="MAP.toml", help="Map whose columns TAP is asked for."),
+    ] = None,
+    limit_mag: Annotated[
+        float | None, typer.Option(min=-30, max=40, help="No fainter, in the map's first band.")
+    ] = None,
+    strip_by: Annotated[
+        str, typer.Option(help="Column of declinations in degrees, without a map.")
+    ] = "dec",
+    retries: Annotated[int, typer.Option(min=0, help="Tries again per address.")] = 3,
+    json: Json = False,
+) -> None:
+    """Download a catalog, check it, and remember its digest.
+
+    From a TAP service: a table or a query, in strips of declination that are counted and resumed.
+
+    Example: starcat fetch tycho2
+    """
+    asked = _asked_of_tap(source, query, table, columns, limit_mag, strip_by)
+    if asked is not None:
+        _fetch_table(asked, output, retries, as_json=json)
+        return
+    from starcat.catalog.fetch import fetch_source
+    from starcat.catalog.source import source_given
+    from starcat.catalog.source_files import cache_folder
+
+    with progress_bars() as progress:
+        report = fetch_source(
+            source_given(source), output or cache_folder(), parts=tuple(part or ()),
+            retries=retries,
+            progress=lambda name, done, total: progress(f"fetch {name}", done, total),
+        )  # fmt: skip
+    rows = [
+        {name: getattr(file, name) for name in ("name", "status", "rows", "bytes", "sha256")}
+        | {"path": str(file.path)}
+        for file in report.files
+    ]
+    names = ("name", "status", "rows", "bytes")
+    cells = ("{0[name]}", "{0[status]}", "{0[rows]:,}", "{0[bytes]:,}")
+    told = dict(zip(("file", *names[1:]), cells, strict=True))
+    show(json, rows, print_things, report.source, rows, told, (2, 3))
+
+
+def _asked_of_tap(
+    source: str,
+    query: str | None,
+    table: str | None,
+    columns: str | None,
+    limit_mag: float | None,
+    strip_by: str,
+) -> Asked | None:
+    """Return what a TAP service is asked for; None where the source is an archive's files."""
+    from starcat.catalog.source import source_given
+    from starcat.catalog.tap import Asked
+    from starcat.errors import ConfigError
+    from starcat.storage.download import is_address
+
+    kind, _, address = source.partition(":")
+    if kind == "tap":
+        found = source_given(columns).table if columns else None
+    else:
+        found = source_given(source).table
+        remote = found.remote if found else None
+        if remote is None or not remote.tap:
+            for name, given in (("query", query), ("table", table), ("limit-mag", limit_mag)):
+                if given is not None:
+                    raise ConfigError(
+                        f"--{name} is for a TAP service; write 'starcat fetch tap:ADDRESS'"
+                    )
+            return None
+        address, table = remote.tap, table or remote.table
+        say(f"note: {source}: {remote.checked}")
+    if not is_address(address, "TAP service") or (query is None) == (table is None):
+        raise ConfigError(
+            "a TAP service is asked as 'starcat fetch tap:https://HOST/tap -o DIR' with one of "
+            "--query and --table, the latter best with --source MAP.toml and --limit-mag",
+            key="query",
+        )
+    if limit_mag is not None and (found is None or query is not None):
+        raise ConfigError(
+            "--limit-mag needs the map of a --table; write the limit into the --query, or give "
+            "--source MAP.toml and --table",
+            key="limit_mag",
+        )
+    return Asked(address.rstrip("/"), table or "", query or "", found, limit_mag, strip_by)
+
+
+def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bool) -> None:
+    from starcat.catalog.tap import fetch_table
+    from starcat.errors import ConfigError
+    from starcat.storage.download import DownloadOptions
+
+    if output is None:
+        raise ConfigError("name the folder for the table with --output", key="output")
+    with progress_bars() as progress:
+        found = fetch_table(asked, output, DownloadOptions(retries=retries), progress)
+    strips = [one.model_dump() for one in found.account.strips]
+    facts = {"folder": str(output), "status": found.status, **found.account.model_dump()}
+    cells = {
+        "from": "{0[first_deg]:+.6f}",
+        "to": "{0[end_deg]:+.6f}",
+        "rows": "{0[rows]:,}",
+        "file": "{0[file]}",
+    }
+    show(as_json, facts, print_things, asked.service, strips, cells, (0, 1, 2))
+    if not as_json:
+        say(f"{found.status}: {output}: {found.account.rows:,} rows")
