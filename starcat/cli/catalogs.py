@@ -92,9 +92,7 @@ def ingest(
     to: ToFormat = "parquet",
     merge: Annotated[
         list[str] | None,
-        typer.Option(
-            help="A catalog that adds the stars which those before lack (parquet). Repeatable."
-        ),
+        typer.Option(help="A catalog that adds the stars which others lack. Repeatable."),
     ] = None,
     epoch_jyear: EpochJyear = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
