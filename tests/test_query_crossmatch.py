@@ -47,7 +47,14 @@ def pairs(session: Session, radius_arcsec: float, more: str = "") -> dict[tuple[
     return found
 
 
-@pytest.mark.parametrize("radius_arcsec", [0.5, 60.0, 7200.0, 40 * 3600.0])
+@pytest.mark.parametrize(
+    "radius_arcsec",
+    [
+        60.0,
+        40 * 3600.0,
+        *(pytest.param(radius, marks=pytest.mark.slow) for radius in (0.5, 7200.0)),
+    ],
+)
 def test_no_pair_is_missed_and_none_is_made_up(tmp_path, radius_arcsec):
     ones, others = (scattered(seed, radius_arcsec / 3600.0) for seed in (5, 6))
     given = [written(tmp_path / "one.parquet", ones), written(tmp_path / "two.parquet", others)]

@@ -45,7 +45,7 @@ WRONG_TYPES = {
     "integer": ["six", True, 1.5],
     "boolean": ["yes", 1],
     "string": [5],
-    "array": ["hipparcos", ["no-such-source"]],
+    "array": ["hipparcos", ["no such source"]],
 }
 
 

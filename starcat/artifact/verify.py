@@ -224,6 +224,16 @@ def _hold(artifact: Artifact, product: str, stars: pa.Table | None) -> HeldProdu
     return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions, stars)
 
 
+def _rejected_of(
+    source: dict[str, Any], manifest: dict[str, Any], held: dict[str, HeldProduct]
+) -> pa.ChunkedArray:
+    """Return the reasons of the rejected records of a catalog, one of several or the only one."""
+    table = held["rejected"].table
+    if [other["role"] for other in manifest["sources"]].count("stars") > 1:
+        table = table.filter(pc.equal(table["catalog"], source["source"]))
+    return table["reason"]
+
+
 def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> Iterator[str]:
     """Yield where the counts of sources, products and spec do not add up."""
     spec, products = manifest["spec"], manifest["products"]
@@ -233,6 +243,11 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
             yield f"{key} is {manifest[key]!r}; its spec says {said!r}"
     if [source["role"] for source in manifest["sources"]][:1] != ["stars"]:
         yield "sources: no star catalog"
+    stars = [source for source in manifest["sources"] if source["role"] == "stars"]
+    all_kept = sum(source["kept"] for source in stars)
+    if stars and all_kept != products["stars"]["rows"]:
+        names = " and ".join(source["source"] for source in stars)
+        yield f"{names}: {all_kept} kept, but {products['stars']['rows']} stars"
     for source in manifest["sources"]:
         read, kept = source["rows_read"], source["kept"]
         rejected = sum(source["rejected"].values())
@@ -242,10 +257,8 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                 f"{source['source']}: {read} rows read, {in_files} in its files, {kept} kept and "
                 f"{rejected} rejected"
             )
-        if source["role"] == "stars" and kept != products["stars"]["rows"]:
-            yield f"{source['source']}: {kept} kept, but {products['stars']['rows']} stars"
         if source["role"] == "stars" and "rejected" in held:
-            counts = pc.value_counts(held["rejected"].table["reason"]).to_pylist()
+            counts = pc.value_counts(_rejected_of(source, manifest, held)).to_pylist()
             held_rows = {entry["values"]: entry["counts"] for entry in counts}
             listed = dict(source["rejected"])
             # Records beyond a read limit are counted and not listed; no other spec counts any.

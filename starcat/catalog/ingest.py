@@ -31,6 +31,20 @@ _PART_ROWS = 8192
 
 
 @dataclass(frozen=True)
+class CatalogPart:
+    """What was read of one of several catalogs that are merged into one."""
+
+    source: str
+    files: tuple[FileFacts, ...]
+    beyond_read_limit: int
+
+    @classmethod
+    def of(cls, read: Ingested) -> CatalogPart:
+        """Return what was read of a catalog."""
+        return cls(read.source, read.files, read.beyond_read_limit)
+
+
+@dataclass(frozen=True)
 class Ingested:
     """A catalog as a star table."""
 
@@ -42,6 +56,7 @@ class Ingested:
     problems: tuple[str, ...]  # the first malformed records, each with file, line and bytes
     notes: tuple[str, ...] = ()  # what a user should know of the inputs
     beyond_read_limit: int = 0  # records that are in neither table
+    parts: tuple[CatalogPart, ...] = ()  # the catalogs that it was merged from
 
     def __repr__(self) -> str:
         """Return source and counts in one line."""

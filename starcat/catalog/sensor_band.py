@@ -120,8 +120,8 @@ def _predicted(
         predicted.take(found, f"{band}, spectral type", found.has_colour)
     if predicted.is_open.all():
         raise ConfigError(
-            f"camera.response: no star of {source} has a colour or a spectral type, so nothing "
-            "tells what a sensor sees of them; choose a catalog with colours: gaia, hipparcos, "
+            f"{response.name}: no star of {source} has a colour or a spectral type, so nothing "
+            "tells its magnitude in that band; choose a catalog with colours: gaia, hipparcos, "
             "tycho2 or 2mass",
             key="camera.response",
             value=source,

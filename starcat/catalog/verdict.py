@@ -25,6 +25,10 @@ class Reason(Enum):
     no_position = "the archive has no position, or none with an epoch"
     impossible_value = "a position, epoch, motion or magnitude that no star can have"
     duplicate_record = "another record has the same star_id, or the archive prefers another"
+    counterpart = "another record of a star that an earlier one of merged catalogs has"
+    ambiguous_counterpart = (
+        "the likeliest of several records that may be a star of an earlier one of merged catalogs"
+    )
     minor_planet = "the archive flags a minor planet"
     extended = "the archive flags an extended or non-stellar source"
     artifact = "the archive doubts that there is a star"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -90,6 +90,10 @@ def ingest(
         ),
     ] = None,
     to: ToFormat = "parquet",
+    merge: Annotated[
+        list[str] | None,
+        typer.Option(help="A catalog that adds the stars which others lack. Repeatable."),
+    ] = None,
     epoch_jyear: EpochJyear = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
     read_limit_mag: ReadLimitMag = None,
@@ -108,19 +112,16 @@ def ingest(
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
     from starcat.store.plan import StoreOptions
-    from starcat.store.reading import brought, read_catalog
+    from starcat.store.reading import brought
 
-    if to not in ("parquet", "hats"):
-        raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
+    if to not in ("parquet", "hats") or (merge and to != "parquet"):
+        told = "several catalogs become one Parquet file" if merge else "choose parquet or hats"
+        raise ConfigError(f"--to {to}: {told}", key="to", value=to)
     source = _one_source(source, sources)
-    paths = locate(source, inputs_by_source(inputs, source))
+    given = inputs_by_source(inputs, None if merge else source)
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
-        from starcat.catalog.ingest import write_star_tables
-
-        with progress_bars() as progress:
-            read = read_catalog(source, paths, **how, workers=workers, progress=progress)
-            write_star_tables(read, output)
+        read = _read_to_file([source, *(merge or [])], given, output, workers=workers, **how)
         print_ingested(read, output, as_json=json)
         return
     from starcat.store.ingest import ingest_to_store
@@ -130,9 +131,25 @@ def ingest(
         workers=workers, scheduler=scheduler, resume=resume, replace=replace,
     )  # fmt: skip
     with progress_bars() as progress:
-        paths = brought(source, paths, **how, progress=progress)
+        paths = brought(source, locate(source, given), **how, progress=progress)
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
     print_stored(stored, as_json=json)
+
+
+def _read_to_file(
+    names: Sequence[str], given: Mapping[str, Sequence[Path]], output: Path, **how: Any
+) -> Ingested:
+    """Read catalogs, merged where there are several, into a Parquet file."""
+    from starcat.catalog.ingest import write_star_tables
+    from starcat.catalog.source_files import locate
+    from starcat.pipeline.merged import read_merged
+    from starcat.specs.product_sections import Crossmatch
+
+    paths = {name: locate(name, given) for name in names}
+    with progress_bars() as progress:
+        read = read_merged(names, paths, Crossmatch(), **how, progress=progress)
+        write_star_tables(read, output)
+    return read
 
 
 def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:

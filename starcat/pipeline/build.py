@@ -33,6 +33,7 @@ from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
 from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
+from starcat.pipeline.merged import read_merged
 from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
 from starcat.pipeline.recipes import (
     RECIPES,
@@ -58,7 +59,6 @@ from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder
 from starcat.storage.schema import product_schema
-from starcat.store.reading import read_catalog
 
 Inputs = Mapping[str, Sequence[Path]]
 
@@ -198,9 +198,10 @@ def read_sources(
     check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
     paths = {name: locate(name, inputs) for name in spec.sources}
-    catalog = read_catalog(
-        spec.catalog.source,
-        paths[spec.catalog.source],
+    catalog = read_merged(
+        spec.catalog.catalogs,
+        paths,
+        spec.products.crossmatch,
         band=spec.catalog.band,
         epoch_jyear=spec.middle_jyear,
         read_limit_mag=spec.catalog.read_limit_mag,

@@ -102,7 +102,7 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         wanted["observed"] = content["selection"]["observed"]
     if spec.camera.response.name is not None:
         wanted["response"] = content["camera"]["response"]
-    if spec.catalog.motions or spec.camera.response.photometry:
+    if spec.catalog.motions or spec.catalog.merged or spec.camera.response.photometry:
         model = content["products"]["crossmatch"]
         wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
     return wanted

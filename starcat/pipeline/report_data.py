@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 
 from starcat.arrays import Directions
 from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.doubles import PairTable
-from starcat.catalog.ingest import Ingested, count_by_reason
+from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
 from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
+from starcat.catalog.source import map_of
 from starcat.catalog.span import Validity
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
 from starcat.catalog.verdict import Reason
-from starcat.pipeline.counterparts import source_facts
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
@@ -85,13 +86,8 @@ def all_source_facts(
     joined: Mapping[str, int],
 ) -> list[SourceFacts]:
     """Return what went into a build as the manifest has it."""
-    own = source_facts(catalog, "stars")
-    # In the order in which reasons came up.
-    rejected = dict(own.rejected)
-    for reason, count in count_by_reason(selected.rejected).items():
-        rejected[reason] = rejected.get(reason, 0) + count
     return [
-        replace(own, kept=len(selected.guide_stars), rejected=rejected),
+        *_star_facts(catalog, selected),
         *(
             SourceFacts(
                 table.source,
@@ -105,6 +101,25 @@ def all_source_facts(
             for table in joins
         ),
     ]
+
+
+def _star_facts(catalog: Ingested, selected: Selected) -> list[SourceFacts]:
+    """Return what the manifest says of the catalogs that the stars are from."""
+    facts = []
+    for part in catalog.parts or (CatalogPart.of(catalog),):
+        tables = [catalog.rejected, selected.rejected, selected.guide_stars]
+        if catalog.parts:
+            tables = [t.filter(pc.equal(t["catalog"], part.source)) for t in tables]
+        # In the order in which reasons came up.
+        rejected = count_by_reason(tables[0], part.beyond_read_limit)
+        for reason, count in count_by_reason(tables[1]).items():
+            rejected[reason] = rejected.get(reason, 0) + count
+        rows = sum(file.rows for file in part.files)
+        known = map_of(part.source)
+        facts.append(
+            SourceFacts(part.source, "stars", part.files, rows, len(tables[2]), rejected, map=known)
+        )
+    return facts
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,7 @@ def _check_size(spec: BuildSpec) -> None:
 
 def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
     """Return the sources that an estimate reads: counterparts are none of them."""
-    names = (spec.catalog.source, *spec.catalog.motions, *spec.joins)
+    names = (*spec.catalog.catalogs, *spec.catalog.motions, *spec.joins)
     return tuple(dict.fromkeys(names))
 
 

@@ -37,6 +37,7 @@ MOST_BINS = 10_000_000
 
 LATER_KEYS = (
     *("products.levels", "catalog.motions", "selection.neighbours"),
+    "catalog.merged",
     *("selection.thinning", "selection.observed", "selection.doubles.join"),
     *("camera.response", "camera.exposure", "selection.max_drift_arcsec"),
 )
@@ -64,6 +65,14 @@ class Catalog(Section):
     read_limit_mag: Mag | None = Field(
         None, description="fainter records, and those without magnitude, are counted and left out"
     )
+    merged: tuple[Annotated[str, StringConstraints(pattern=SOURCE_NAME)], ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=8,
+        description="catalogs that add the stars which the source, and those named before, lack; "
+        "their magnitudes become those of the source's band, found as [products.crossmatch] says",
+        examples=[["tycho2", "gaia"]],
+    )
     motions: tuple[Literal["hipparcos", "hipparcos2", "tycho2"], ...] = Field(
         (),
         strict=False,  # a list in TOML
@@ -71,6 +80,17 @@ class Catalog(Section):
         "as [products.crossmatch] says",
         examples=[["tycho2"]],
     )
+
+    @property
+    def catalogs(self) -> tuple[str, ...]:
+        """Names of the catalogs that the stars are from, the first one's first."""
+        return self.source, *self.merged
+
+    @model_validator(mode="after")
+    def _merged_catalogs_differ(self) -> Catalog:
+        if len(set(self.catalogs)) != len(self.catalogs):
+            raise ValueError(f"merged: a catalog is named twice: {', '.join(self.catalogs)}")
+        return self
 
     @model_validator(mode="after")
     def _motions_of_other_catalogs(self) -> Catalog:
@@ -367,6 +387,16 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
+    def _one_band_of_merged_catalogs(self) -> BuildSpec:
+        if self.catalog.merged and self.camera.response.name is not None:
+            raise ValueError(
+                "catalog.merged: the stars have colours of several catalogs, which give no "
+                "magnitudes in a sensor's band; leave [camera.response] out, or build from one "
+                "catalog"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _levels_are_wider(self) -> BuildSpec:
         wanted, own_deg = self.products.levels, self.camera.camera().fov_x_deg
         if not wanted.enabled:
@@ -443,7 +473,7 @@ class BuildSpec(Section):
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.catalog.motions, *self.joins]
+        names = [*self.catalog.catalogs, *self.catalog.motions, *self.joins]
         names += self.camera.response.photometry
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 

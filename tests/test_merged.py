@@ -1,0 +1,178 @@
+"""Several catalogs as one: a row a star, a reason for every other record, all of it traced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from starcat.artifact.verify import check_artifact
+from starcat.catalog.ingest import Ingested
+from starcat.catalog.source import give_map
+from starcat.errors import ConfigError
+from starcat.pipeline.build import build
+from starcat.pipeline.merged import read_merged
+from starcat.pipeline.rebuild import rebuild
+from starcat.specs.product_sections import Crossmatch
+from starcat.specs.reading import spec_from_dict
+
+STARS = 4000
+BRIGHT = 600
+AMONG = 0.5 / 3600.0
+"""How far, in degrees, the two components of a double are apart."""
+
+_MAP = """name = "{name}"
+frame = "ICRS"
+epoch = {epoch}
+{more}
+[columns]
+star_id = "number"
+ra = {{ value = "ra", unit = "deg" }}
+dec = {{ value = "dec", unit = "deg" }}
+pm_ra_cosdec = {{ value = "pm_ra", unit = "mas/yr" }}
+pm_dec = {{ value = "pm_dec", unit = "mas/yr" }}
+[magnitudes]
+{magnitudes}
+"""
+
+
+@pytest.fixture(scope="module")
+def sky(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Write a bright catalog of 1991.25 in V, and a deep one of 2016 in G with colours.
+
+    Star k is number k of one, and number 10,000 + k of the other; the deep one has every star,
+    and each tenth of the bright ones is double in it.
+    """
+    folder = tmp_path_factory.mktemp("sky")
+    generator = np.random.default_rng(8)
+    unit = generator.normal(size=(STARS, 3))
+    dec = np.degrees(np.arcsin(unit[:, 2] / np.linalg.norm(unit, axis=1)))
+    ra = np.degrees(np.arctan2(unit[:, 1], unit[:, 0])) % 360.0
+    pm_dec = generator.normal(scale=200.0, size=STARS)
+    mag = np.sort(generator.uniform(2.0, 7.0, STARS))
+    years = 2016.0 - 1991.25
+    own = {"ra": ra, "dec": dec, "pm_ra": np.zeros(STARS), "pm_dec": pm_dec}
+    bright = {name: column[:BRIGHT] for name, column in own.items()}
+    bright |= {"number": np.arange(BRIGHT) + 1, "v": mag[:BRIGHT] + 0.25}
+    colour = np.full(STARS, 0.82)
+    deep = {**own, "number": np.arange(STARS) + 10_001, "g": mag,
+            "bp": mag + 0.33, "rp": mag + 0.33 - colour}  # fmt: skip
+    deep["dec"] = np.clip(dec + years * pm_dec / 3600e3, -90.0, 90.0)
+    second = {name: column[:BRIGHT:10].copy() for name, column in deep.items()}
+    second["number"] += 100_000
+    second["dec"] += AMONG * np.where(second["dec"] > 0.0, -1.0, 1.0)
+    second["g"] += 1.0
+    deep = {name: np.concatenate([deep[name], second[name]]) for name in deep}
+    magnitudes = {"bright": 'V = "v"', "deep": 'G = "g"\nBP = "bp"\nRP = "rp"'}
+    for name, columns in (("bright", bright), ("deep", deep)):
+        pq.write_table(pa.table(columns), folder / f"{name}.parquet")
+        epoch = 1991.25 if name == "bright" else 2016.0
+        content = _MAP.format(name=name, epoch=epoch, magnitudes=magnitudes[name],
+                               more='colour = "BP-RP"' if name == "deep" else "")  # fmt: skip
+        (folder / f"{name}.toml").write_text(content)
+        give_map(folder / f"{name}.toml")
+    return {name: folder / f"{name}.parquet" for name in ("bright", "deep")}
+
+
+@pytest.fixture(scope="module")
+def merged(sky: dict[str, Path]) -> Ingested:
+    paths = {name: [path] for name, path in sky.items()}
+    return read_merged(("bright", "deep"), paths, Crossmatch(), epoch_jyear=2026.0)
+
+
+def test_there_is_one_row_a_star_and_a_reason_for_every_other_record(merged):
+    reasons = merged.rejected_by_reason
+    assert merged.rows_read == len(merged.stars) + sum(reasons.values())
+    assert sum(reasons.values()) == BRIGHT, "each star of the bright catalog takes one record"
+    number = merged.stars["star_id"].to_numpy()
+    assert (number[:BRIGHT] == np.arange(BRIGHT) + 1).all()
+    is_single = (merged.rejected["star_id"].to_numpy() - 10_001) % 10 != 0
+    own = merged.rejected.filter(pa.array(is_single))
+    assert set(own["reason"].to_pylist()) == {"counterpart"}
+    named = [int(text.split(",")[0].split()[-1]) for text in own["detail"].to_pylist()]
+    assert named == (own["star_id"].to_numpy() - 10_000).tolist()
+    # Of a double the other component stays, so that the selection knows it as one.
+    near = np.flatnonzero(merged.stars["nearest_separation_arcsec"].to_numpy() < 1.0)
+    assert len(near) == 2 * (BRIGHT // 10)
+
+
+def test_magnitudes_are_in_the_band_of_the_first_catalog(merged):
+    assert merged.stars["band"].unique().to_pylist() == ["V"]
+    added = merged.stars.filter(pc.equal(merged.stars["catalog"], "deep"))
+    assert added["mag_source"].unique().to_pylist() == ["deep G, BP-RP"]
+    assert added["catalog_band"].unique().to_pylist() == ["G"]
+    step = added["mag"].to_numpy() - added["catalog_mag"].to_numpy()
+    # V - G of a star of BP - RP 0.82 is 0.14 by the relation of Gaia's documentation (EDR3 5.5.1).
+    assert np.abs(step - 0.16).max() < 0.08
+    assert (added["mag_error"].to_numpy() > 0.0).all()
+    own = merged.stars.filter(pc.equal(merged.stars["catalog"], "bright"))
+    assert own["mag_source"].null_count == len(own)
+
+
+def spec_of(catalog: dict[str, object]) -> object:
+    return spec_from_dict(
+        {
+            "name": "merged",
+            "version": "1.0.0",
+            "epoch_jyear": 2026.0,
+            "catalog": catalog,
+            "selection": {"faint_limit_mag": 7.0},
+            "camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 15.0},
+            "boresights": {"count": 400},
+            "self_test": {"frames": 5, "min_identified": 0.0},
+        },
+        "merged",
+    )
+
+
+@pytest.mark.slow
+def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
+    spec = spec_of({"source": "bright", "merged": ["deep"]})
+    inputs = {name: [path] for name, path in sky.items()}
+    built = build(spec, inputs, tmp_path)
+    check_artifact(built.folder)
+    facts = {one["source"]: one for one in built.manifest["sources"]}
+    assert [one["role"] for one in facts.values()] == ["stars", "stars"]
+    assert facts["deep"]["rows_read"] == STARS + BRIGHT // 10
+    duplicates = facts["deep"]["rejected"]
+    found = duplicates["counterpart"] + duplicates.get("ambiguous_counterpart", 0)
+    assert found == BRIGHT
+    assert min(one["kept"] for one in facts.values()) > 0
+    assert rebuild(built.folder, inputs).is_identical
+
+
+@pytest.mark.parametrize(
+    ("catalog", "camera", "words"),
+    [
+        ({"source": "gaia", "merged": ["gaia"]}, {}, "named twice"),
+        ({"source": "gaia", "merged": ["a/b"]}, {}, "merged"),
+        (
+            {"source": "gaia", "merged": ["hipparcos"]},
+            {"response": {"name": "silicon"}},
+            "response",
+        ),
+    ],
+)
+def test_what_cannot_be_merged_is_refused(catalog, camera, words):
+    content = spec_of({"source": "gaia"}).recorded() | {"catalog": catalog}
+    content["camera"] |= camera
+    with pytest.raises(ConfigError, match=words):
+        spec_from_dict(content, "merged")
+
+
+def test_catalogs_that_number_stars_alike_are_refused(sky):
+    paths = {name: [path] for name, path in sky.items()}
+    give_map(sky["bright"].with_suffix(".toml"))
+    twin = sky["bright"].with_name("twin.toml")
+    twin.write_text(sky["bright"].with_suffix(".toml").read_text().replace('"bright"', '"twin"'))
+    give_map(twin)
+    shifted = pq.read_table(sky["bright"])
+    shifted = shifted.set_column(0, "ra", pc.add(shifted["ra"], 0.2))
+    pq.write_table(shifted, sky["bright"].with_name("twin.parquet"))
+    paths["twin"] = [sky["bright"].with_name("twin.parquet")]
+    with pytest.raises(ConfigError, match="number stars alike"):
+        read_merged(("bright", "twin"), paths, Crossmatch())
