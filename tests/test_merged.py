@@ -176,3 +176,27 @@ def test_catalogs_that_number_stars_alike_are_refused(sky):
     paths["twin"] = [sky["bright"].with_name("twin.parquet")]
     with pytest.raises(ConfigError, match="number stars alike"):
         read_merged(("bright", "twin"), paths, Crossmatch())
+
+
+@pytest.mark.slow
+def test_hipparcos_stars_are_found_in_tycho_2_by_their_own_numbers(starcat, excerpts, tmp_path):
+    """Through the command: Tycho-2 names the HIP number of most of its bright stars itself."""
+    output = tmp_path / "both.parquet"
+    run = starcat(["ingest", "hipparcos", "--merge", "tycho2", "--band", "V",
+                   "--read-limit-mag", "6.5", "--epoch-jyear", "2016", "-o", output,
+                   "--input", f"hipparcos={excerpts / 'hip_main.dat.gz'}",
+                   "--input", f"tycho2={excerpts / 'tyc2.dat.gz'}"])  # fmt: skip
+    assert run.code == 0, run.err
+    rejected = pq.read_table(tmp_path / "both.rejected.parquet")
+    found = rejected.filter(pc.equal(rejected["reason"], "counterpart"))
+    known = found.filter(pc.is_valid(found["hip_number"]))
+    named = [text.split(",")[0] for text in known["detail"].to_pylist()]
+    assert len(known) > 8000
+    assert named == [f"HIP {number}" for number in known["hip_number"].to_pylist()]
+
+
+def test_several_catalogs_become_no_store(starcat, tmp_path):
+    run = starcat(["ingest", "hipparcos", "--merge", "tycho2", "--to", "hats",
+                   "-o", tmp_path / "x"])  # fmt: skip
+    assert run.code == 2
+    assert "several catalogs become one Parquet file" in run.err
