@@ -7,14 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from archive_server import Archive
+from served import in_background
 
 from starcat.pipeline.match_stores import match_stores
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import read_parquet
+from starcat.store import wire
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
 from starcat.store.plan import StoreOptions
+from starcat.store.reading import read_catalog
+from starcat.store.wire import input_path
 
 lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 
@@ -126,3 +132,43 @@ def _places(store: Path) -> dict[int, int]:
             ids, places = table["star_id"].to_pylist(), table["_healpix_29"].to_pylist()
             found.update(zip(ids, places, strict=True))
     return found
+
+
+def gaia_columns(count: int) -> pd.DataFrame:
+    """Columns of gaia_source that the map ``gaia_dr3_hats`` names, and one that it does not."""
+    generator = np.random.default_rng(31)
+    numbers = "ra_error dec_error pmra pmdec pmra_error pmdec_error parallax parallax_error"
+    fluxes = (f"phot_{band}_mean_flux_over_error" for band in ("g", "bp", "rp"))
+    names = [*numbers.split(), "radial_velocity", "ruwe", *fluxes, "not_in_the_map"]
+    mag = generator.uniform(3.0, 15.0, count)
+    columns = {
+        "source_id": np.arange(1, count + 1),
+        "ra": generator.uniform(0.0, 360.0, count),
+        "dec": np.degrees(np.arcsin(generator.uniform(-1.0, 1.0, count))),
+        **{f"phot_{band}_mean_mag": mag for band in ("g", "bp", "rp")},
+        **{name: generator.uniform(0.1, 1.0, count) for name in names},
+        "non_single_star": np.zeros(count, dtype=np.int16),
+        "phot_variable_flag": ["NOT_AVAILABLE"] * count,
+    }
+    return pd.DataFrame(columns)
+
+
+@pytest.mark.slow
+def test_a_catalog_that_lsdb_wrote_is_read_at_an_address(tmp_path, monkeypatch):
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(wire, "GAP_BYTES", 0)
+    monkeypatch.setattr(wire, "FOOTER_BYTES", 1024)
+    made = lsdb.from_dataframe(gaia_columns(20_000), catalog_name="gaia", margin_threshold=10.0)
+    made.write_catalog(tmp_path / "gaia_dr3", catalog_name="gaia")
+    with Archive() as server, in_background(server):
+        address = server.serve_folder("/gaia_dr3", tmp_path / "gaia_dr3")
+        limit = {"read_limit_mag": 9.0}
+        far = read_catalog("gaia_dr3_hats", [input_path(address)], **limit)
+        sent = sum(one.sent for one in server.requests if "Npix" in one.path)
+    near = read_catalog("gaia_dr3_hats", [tmp_path / "gaia_dr3"], **limit)
+    assert len(far.stars) > 5000
+    assert far.stars.equals(near.stars)
+    assert far.rejected_by_reason == near.rejected_by_reason
+    files = list((tmp_path / "gaia_dr3" / "gaia").rglob("Npix*.parquet"))
+    assert sent < sum(path.stat().st_size for path in files)

@@ -214,6 +214,12 @@ def table_parts(folder: Path) -> list[Path]:
 
     What else a HATS catalog holds, such as margins and statistics, is no star.
     """
+    collection = folder / "collection.properties"
+    if collection.is_file():  # its margins may have any name
+        told = re.search(
+            r"^hats_primary_table_url\s*=\s*(\w[\w.-]*)", collection.read_text("utf-8"), re.M
+        )
+        folder = folder / told[1] if told else folder
     inside = sorted(folder.rglob("dataset/Norder=*/**/*.parquet"))
     inside = [path for path in inside if "_margin" not in path.relative_to(folder).parts[0]]
     return inside or sorted(folder.glob("*.parquet"))

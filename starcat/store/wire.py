@@ -295,14 +295,15 @@ class _Part:
         length = int.from_bytes(self.file.read(4), "little") + 8
         if self.file.read(4) != _MAGIC or length > size:
             raise ProductError(f"{self.url}: is no Parquet file; expected a partition of a catalog")
-        self._need([(0, min(size, 4)), (size - length, size - FOOTER_BYTES)])
+        self._need([(0, 4), (size - length, size)])
         with parquet_file(self.path, ProductError, f"{self.url} is damaged") as opened:
             footer = opened.metadata
         groups, names = choose(self.path, footer)
         self._need(chunks_of(footer, groups, names))
 
     def _need(self, ranges: Ranges) -> None:
-        for first, end in ranges:
+        size = self.state.version.size if self.state else 0
+        for first, end in ((first, min(end, size - FOOTER_BYTES)) for first, end in ranges):
             if first < end and self.state and (first, end) not in self.state.there:
                 state = self._get(first, end)
                 state.there.append((first, end))
