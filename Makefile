@@ -93,7 +93,7 @@ serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded s
 nights: $(READY) ## identify the photographs of ../shared/nights, or of $$STARCAT_NIGHTS
 	$(BIN)/python -m pytest -q tests/test_nights.py
 
-BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql votable
+BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql crossmatch_sql votable
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
 	@failed=; for name in $(BENCHMARKS); do \
 		$(BIN)/python tests/benchmarks/$$name.py || failed="$$failed $$name"; done; \

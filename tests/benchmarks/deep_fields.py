@@ -42,10 +42,10 @@ G = "g"
 def main(rows: Rows) -> None:
     """Print a row for each of the two builds."""
     options = Options(__doc__)
-    options.size("--fov", 1.0, 1.0, "field of view, degrees")
-    options.size("--boresights", 100_000, 10_000, "fields of the tiling")
-    options.size("--frames", 1000, 50, "frames of the self-test")
-    options.size("--deeper", 1.5, 1.0, "magnitudes that the simulated catalog is deeper")
+    options.size("--fov", 1.0, 4.0, "field of view, degrees")
+    options.size("--boresights", 100_000, 2_000, "fields of the tiling")
+    options.size("--frames", 1000, 10, "frames of the self-test")
+    options.size("--deeper", 1.5, 0.1, "magnitudes that the simulated catalog is deeper")
     asked = options.asked()
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
