@@ -317,6 +317,22 @@ CATALOG_FILES: Cases = {
     "no input named and none found": run("ingest sao -o {out}/stars.parquet"),
     "source unknown": run("ingest soa -o {out}/stars.parquet"),
     "source unknown, like no other": run("build --preset sao-12deg --input xyzzy=a.dat -o {out}"),
+    "address with a password": run(
+        "build --preset sao-12deg --input sao=https://me:secret@a.example/hats -o {out}"
+    ),
+    "address of no kind that is known": run(
+        "build --preset sao-12deg --input sao=s3://a.example/hats -o {out}"
+    ),
+    "address of a source that is no catalog of stars": run(
+        "build --preset sao-12deg --input vsx=http://127.0.0.1:9/vsx -o {out}"
+    ),
+    "TAP service asked for nothing": run("fetch tap:http://127.0.0.1:9/tap"),
+    "TAP service asked for a limit without a map": run(
+        "fetch tap:http://127.0.0.1:9/tap --table t --limit-mag 8 -o {out}"
+    ),
+    "TAP service that is not there": run(
+        "fetch tap:http://127.0.0.1:9/tap --table t --retries 0 -o {out}/t"
+    ),
     "map with an unknown key": own_table("epoch", "epoc"),
     "map without a unit that is needed": own_table(', unit = "mas/yr"', ""),
     "map that names no column of the table": own_table('ra = "ra"', 'ra = "alpha"'),

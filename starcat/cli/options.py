@@ -227,7 +227,8 @@ def inputs_by_source(
 ) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
     from starcat.catalog.source import give_map, source_given
-    from starcat.store.wire import address_of, input_path
+    from starcat.storage.download import is_address
+    from starcat.store.wire import input_path
 
     for own in maps or []:
         give_map(own)
@@ -238,13 +239,13 @@ def inputs_by_source(
             name, separator, path = only, "=", text
         if not separator or not path:
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
-        source, place = source_given(name), input_path(path)
-        if source.kind != "stars" and address_of(place):
+        source = source_given(name)
+        if source.kind != "stars" and is_address(path, "input"):
             raise ConfigError(
                 f"--input {text!r}: {source.name} is read from a file; bring it here with 'starcat "
                 f"fetch {source.name}'. At an address HATS catalogs of stars are read"
             )
-        inputs.setdefault(source.name, []).append(place)
+        inputs.setdefault(source.name, []).append(input_path(path))
     return inputs
 
 
