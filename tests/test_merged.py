@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.source import give_map
+from starcat.catalog.source import give_map, known_maps
 from starcat.errors import ConfigError
 from starcat.pipeline.build import build
 from starcat.pipeline.merged import read_merged
@@ -41,7 +42,7 @@ pm_dec = {{ value = "pm_dec", unit = "mas/yr" }}
 
 
 @pytest.fixture(scope="module")
-def sky(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def sky(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
     """Write a bright catalog of 1991.25 in V, and a deep one of 2016 in G with colours.
 
     Star k is number k of one, and number 10,000 + k of the other; the deep one has every star,
@@ -74,8 +75,10 @@ def sky(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         content = _MAP.format(name=name, epoch=epoch, magnitudes=magnitudes[name],
                                more='colour = "BP-RP"' if name == "deep" else "")  # fmt: skip
         (folder / f"{name}.toml").write_text(content)
-        give_map(folder / f"{name}.toml")
-    return {name: folder / f"{name}.parquet" for name in ("bright", "deep")}
+    with known_maps(()):
+        for name in ("bright", "deep"):
+            give_map(folder / f"{name}.toml")
+        yield {name: folder / f"{name}.parquet" for name in ("bright", "deep")}
 
 
 @pytest.fixture(scope="module")
