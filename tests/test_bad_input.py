@@ -1265,6 +1265,12 @@ CASES = {kind: call for group in GROUPS for kind, call in group.items()}
 NO_JSON = ["answer in a format unknown", *(kind for kind in CASES if kind.startswith("disk full"))]
 IN_JSON = [kind for kind in list(CASES)[::6] if kind not in NO_JSON]
 """A sixth of the kinds, from all groups, shows what --json prints; the slow test has the rest."""
+LONG = (
+    *("doubles that are no doubles", "disk full while writing the database"),
+    *("build from a store with a brighter limit", "build from a store of another catalog"),
+    *("database that cannot identify", "query that takes too long", "disk full while ingesting"),
+)
+"""Kinds that take a second and more, each beside another like it."""
 
 
 @pytest.fixture
@@ -1312,7 +1318,9 @@ def run_call(place: Place, call: Call, starcat: Any) -> tuple[int, str]:
     return ran.code, ran.err + (ran.out if ran.code == 0 else "")
 
 
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in LONG), id=k) for k in CASES]
+)
 def test_bad_input(kind, place, starcat):
     call, (pattern, expected_code) = CASES[kind](place), page_rows()[kind]
     before = bytes_of(place.folder)

@@ -115,6 +115,7 @@ def told(items: list[BatchItem]) -> list[object]:
     ]
 
 
+@pytest.mark.slow
 def test_processes_change_no_answer(night, small_artifact):
     matcher, paths = Matcher.open(small_artifact), files_of([str(night)])[2:]
     alone, several = (list(identify_files(paths, matcher, workers=n)) for n in (0, 2))

@@ -338,6 +338,7 @@ def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
     assert report["warnings"] == [warning]
 
 
+@pytest.mark.slow
 def test_a_build_without_holes_is_silent(make, caplog):
     made = make()
     assert made.warnings == ()

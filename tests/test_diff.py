@@ -113,7 +113,8 @@ def test_every_star_is_accounted_for(small_artifact, make, sao_lines):
     assert not any(p.is_same for p in found.products if p.product != "report")
 
 
-@pytest.mark.parametrize("is_repeated_first", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_repeated_first", [False, True])
 def test_a_repeated_record_does_not_hide_the_reason(
     small_artifact, make, sao_lines, is_repeated_first
 ):

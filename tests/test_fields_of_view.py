@@ -89,6 +89,7 @@ def test_a_camera_of_50_deg_identifies_its_frames(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("fov_deg", [1.0, 2.0, 5.0, 8.0, 12.0, 20.0, 35.0, 90.0])
 def test_every_camera_identifies_its_frames(fov_deg, tmp_path):
     check_fields(fov_deg, tmp_path)

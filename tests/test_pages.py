@@ -202,6 +202,7 @@ def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
         assert "shows nothing without a token" in page.text
 
 
+@pytest.mark.slow
 def test_who_may_only_read_sees_what_a_build_needs(client, root):
     jobs = client.app.state.service.jobs.count()
     with client_of(root, anonymous="reader") as reader:

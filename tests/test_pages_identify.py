@@ -69,6 +69,7 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert f'name="seed" value="{SEED + 1}"' in answer.text
 
 
+@pytest.mark.slow
 def test_the_simulated_frame_can_be_had_and_sent_back(client, simulated):
     frame = client.get(f"/identify/frame/{DATABASE}?seed={SEED}")
     assert frame.headers["content-type"] == "image/png"
@@ -182,6 +183,7 @@ def test_an_answer_is_saved_as_json_csv_and_wcs(client, simulated):
     assert (header["IMAGEW"], header["IMAGEH"]) == (512, 512)
 
 
+@pytest.mark.slow
 def test_a_link_keeps_an_answer(client, simulated):
     frame = client.get(f"/identify/frame/{DATABASE}?seed={SEED}").content
     page = asked(client, {"file": ("frame.png", frame)}, tolerance_px="3").text

@@ -103,6 +103,7 @@ def test_the_command_keeps_answers_in_files(remote, starcat, small_artifact, tmp
         assert there.read_bytes() == here.read_bytes()
 
 
+@pytest.mark.slow
 def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact, tmp_path):
     frame, picture = tmp_path / "frame.csv", tmp_path / "frame.svg"
     starcat(["simulate", small_artifact, "-o", frame, "--seed", 3, "--noise-px", 0.2])

@@ -1,5 +1,5 @@
 -- Stars of the first target with those of the second near them, and the magnitude differences.
--- Stars with a proper motion are compared at one epoch. 'starcat crossmatch' weighs ambiguous ones.
+-- Stars with a proper motion are compared at one epoch; a crossmatch of catalogs weighs ambiguous ones.
 -- Targets: 2
 -- radius_arcsec = 5.0: greatest separation, seconds of arc
 -- epoch_jyear = 2000.0: Julian year at which positions are compared
