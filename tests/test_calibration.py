@@ -193,7 +193,7 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
     [
         (Distortion(), (0.0, 0.0), FOCAL),
         (Distortion(k1=-0.1), (0.0, 0.0), (*FOCAL, "k1")),
-        (LENS, (0.0, 0.0), (*FOCAL, "k1", "k2")),
+        pytest.param(LENS, (0.0, 0.0), (*FOCAL, "k1", "k2"), marks=pytest.mark.slow),
         (LENS, (30.0, -20.0), (*FOCAL, "k1", "k2", *CENTRE)),
         (Distortion(k1=-0.1, p1=2e-3, p2=1e-3), (0.0, 0.0), (*FOCAL, "k1", "p1", "p2")),
     ],

@@ -449,6 +449,7 @@ def accepted(matcher: Matcher, frames: list[Frame]) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(narrow_sky):
     # One of six is 12 px out of its place, whatever the noise: five of nine have to do.
     frames = withheld(narrow_sky, 15, 0.5, 12.0, 1e-8)

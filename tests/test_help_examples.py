@@ -95,7 +95,14 @@ def run_example(name: str, starcat: Run) -> Any:
     return starcat(words[1:])
 
 
-@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in (*SLOW, *NETWORK, *LASTING)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=[pytest.mark.slow] * (n in ("estimate", "evaluate")), id=n)
+        for n in COMMANDS
+        if n not in (*SLOW, *NETWORK, *LASTING)
+    ],
+)
 def test_an_example_runs_as_printed(name, starcat, here):
     if name == "crossmatch":
         table = ["ingest", "gaia", "-o", "gaia.parquet", "--read-limit-mag", "5"]

@@ -105,6 +105,7 @@ def test_an_address_of_no_design_is_told(client):
     assert "of no design" in answer.text
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_design_of_its_address_and_gives_it_back(client):
     text = client.get("/new?preset=sao-12deg&camera.fov_x_deg=16").text
     assert "fov_x_deg = 16" in text
