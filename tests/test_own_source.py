@@ -219,9 +219,8 @@ EDITS_OF_TABLE = (
 def read_own(folder: Path, table_map: str = MAP, table: str = TABLE) -> Ingested:
     (folder / "mine.toml").write_text(table_map)
     (folder / "t.csv").write_bytes(table.encode("utf-8", "surrogateescape"))
-    with known_maps([]):
-        name = give_map(folder / "mine.toml").name
-        return read_catalog(name, [folder / "t.csv"], neighbours=False)
+    name = give_map(folder / "mine.toml").name
+    return read_catalog(name, [folder / "t.csv"], neighbours=False)
 
 
 @pytest.mark.parametrize(("old", "new", "told"), EDITS_OF_MAP)
@@ -269,14 +268,13 @@ def test_the_size_of_blocks_leaves_no_trace(
     case: Case, sky: Sky, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     table, name = case.make(sky, tmp_path), "gaia_dr3_hats"
-    with known_maps([]):
-        if case.toml:
-            (tmp_path / "map.toml").write_text(case.toml)
-            name = give_map(tmp_path / "map.toml").name
-        whole = read_catalog(name, [table], neighbours=False)
-        monkeypatch.setattr(tables, "BLOCK_ROWS", 7)
-        monkeypatch.setattr(tables, "BLOCK_BYTES", 2000)
-        parts = read_catalog(name, [table], neighbours=False)
+    if case.toml:
+        (tmp_path / "map.toml").write_text(case.toml)
+        name = give_map(tmp_path / "map.toml").name
+    whole = read_catalog(name, [table], neighbours=False)
+    monkeypatch.setattr(tables, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(tables, "BLOCK_BYTES", 2000)
+    parts = read_catalog(name, [table], neighbours=False)
     assert parts.stars.equals(whole.stars)
     assert parts.rejected.equals(whole.rejected)
 
@@ -320,8 +318,7 @@ class TestNames:
 def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "t.csv").write_text(TABLE.replace("30,30.5,", "30,,"))
-    with known_maps([]):
-        found = check_map(give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
+    found = check_map(give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
     values = {one["key"]: one for one in found["values"]}
     assert (values["columns.ra"]["least"], values["columns.ra"]["missing"]) == (1.5, 1)
     assert values["columns.pm_dec"]["unit"] == "mas/yr"
@@ -347,11 +344,10 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(
     )
     changes = {"selection.faint_limit_mag": "5.5", "catalog.source": "bright", "name": "own"}
     spec = preset("gaia-12deg", changes)
-    with known_maps([]):
-        give_map(Path("bright.toml"))
-        built = build(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
-        ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
-        again = build(spec, {"bright": [Path("store")]}, Path("again"))
+    give_map(Path("bright.toml"))
+    built = build(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
+    ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
+    again = build(spec, {"bright": [Path("store")]}, Path("again"))
     assert built.manifest["manifest_version"] == "1.5.0"
     schema = json.loads((resource_folder("schemas") / "manifest-1.5.0.json").read_text())
     jsonschema.validate(built.manifest, schema)

@@ -156,7 +156,6 @@ def commands(given: Given) -> dict[str, list[str]]:
         "store": [*ingest, "--input", str(given.parts), "-o", str(given.store), *workers],
         "build": [*build, f"2mass={given.parts}"],
         "from-store": [*build, f"2mass={given.store}"],
-        "hats-import": hats_import(given),
     }
 
 
@@ -168,10 +167,9 @@ def hats_import(given: Given) -> list[str]:
     [layout] = data_source("2mass").files
     used = {n: "str" if layout.column(n).is_text else "float64" for n in COLUMNS["psc"]}
     columns = json.dumps([[column.name for column in layout.columns], used])
-    python = peers.HOME / "hats-import" / "bin" / "python"
-    peer = Path(__file__).with_name("hats_peer.py")
+    python, peer = peers.environment("hats-import"), Path(__file__).with_name("hats_peer.py")
     folder = given.scratch / "hats-import"
-    return [*map(str, (python, peer, given.parts, folder, given.workers)), columns]
+    return [python, *map(str, (peer, given.parts, folder, given.workers)), columns]
 
 
 CASES = ("bare", "store", "build", "from-store", "hats-import")
@@ -209,9 +207,8 @@ def main(rows: Rows) -> None:
         made: set[str] = set()
         for name in asked.cases * asked.runs:
             with rows.row(name):
-                if name == "hats-import":
-                    peers.environment(name)
-                took = measure(commands(given)[name])
+                is_peer = name == "hats-import"
+                took = measure(hats_import(given) if is_peer else commands(given)[name])
                 first = first or took
                 print_times(name, took, first, given)
                 if name == "bare" and asked.parts is None and int(took.out) != asked.rows:
