@@ -68,7 +68,7 @@ def nearest_chords(
 def _nearest_of_pairs(
     tree: scipy.spatial.cKDTree, stars: Directions, rank: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the nearest other star of most stars, in half of the time that each alone takes.
+    """Return the nearest other star of most stars, which takes less time than one by one.
 
     All pairs within a radius are looked at, in which nine of ten have another star. Where
     that are too many, as in clusters, and for the tenth, chords are infinite.
