@@ -444,18 +444,12 @@ def publish(
     -------
     Published
         What became of it.
-
-    Raises
-    ------
-    ConfigError, ProductError, OutputError
-        As the command line says them.
     """
-    from starcat.progress import no_progress
     from starcat.releases.metadata import read_signing
     from starcat.releases.publishing import publish_artifact
 
     signing = read_signing(_paths(sign), threshold)
-    return publish_artifact(Path(database), os.fspath(registry), no_progress, signing)
+    return publish_artifact(Path(database), os.fspath(registry), signing=signing)
 
 
 def pull(
@@ -473,8 +467,7 @@ def pull(
         Folder that the folder ``<name>-<version>`` is put into; the version is pinned in
         ``starcat.lock`` there.
     trust : str or path-like, optional
-        A public key, or the ``root.json`` of the registry, that has to have signed it. It is
-        remembered: further pulls from this registry are checked without it.
+        A public key, or a root.json, that has to have signed it; remembered for further pulls.
 
     Returns
     -------
@@ -488,10 +481,8 @@ def pull(
     """
     from starcat.releases.lockfile import pull_wanted
 
-    place = Path(output)
-    key = None if trust is None else Path(trust)
-    lock = place / "starcat.lock"
-    return pull_wanted(wanted, os.fspath(registry), place, lock, trust=key)
+    place, key = Path(output), None if trust is None else Path(trust)
+    return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock", trust=key)
 
 
 def _inputs(given: PathLike | Sequence[PathLike]) -> list[Path]:

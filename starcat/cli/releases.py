@@ -22,10 +22,10 @@ Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an ad
 
 
 SIGNED = {
-    "checked": "signed by keys that you trust",
-    "unchecked": "signed, but not checked: name a key that you trust with --trust",
-    "unsigned": "nothing is signed in this registry",
-    "pinned": "the same as in the lock file; signatures were not looked at",
+    "checked": "; signed by keys that you trust",
+    "unchecked": "; signed, but not checked: name a key that you trust with --trust",
+    "unsigned": "; nothing is signed in this registry",
+    "pinned": "",
 }
 """What is said of the signatures of what was pulled."""
 
@@ -155,7 +155,7 @@ def print_pulled(pulled: Sequence[Pulled]) -> None:
     }
     print_things("", pulled, columns)
     for one in pulled:
-        say(f"{one.outcome}: {one.folder}; {SIGNED[one.signed]}")
+        say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
 
 
 def print_releases(listed: Sequence[dict[str, Any]]) -> None:
