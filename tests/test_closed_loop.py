@@ -29,7 +29,7 @@ def fly(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     folder = tmp_path_factory.mktemp("loop")
     built = starcat.build(starcat.preset("gaia-12deg"), output=folder)
     image = folder / "sky.img"
-    starcat.export(built.path, "onboard", image)
+    starcat.export(built.folder, "onboard", image)
 
     def flown(name: str, *options: str) -> Path:
         command = [python, "-m", "starcat_basilisk", image, "--output", folder / name, *options]
