@@ -114,11 +114,11 @@ starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended) {
   for (uint32_t n = 0; n < image.blocks; n++) {
     const uint32_t block = (n + image.data) % image.blocks; /* check blocks first */
     if (!is_sound(&image, block)) {
-      if (would_be_sound(&image, block)) {
+      if (!would_be_sound(&image, block)) {
+        left++;
+      } else {
         write_block(&image, block);
         *n_mended += 1u;
-      } else {
-        left++;
       }
     }
   }
@@ -158,9 +158,6 @@ static starcat_status use_place(const starcat_places *places, uint32_t place,
   }
   if (status == STARCAT_IDENTIFIED) {
     status = starcat_open(image, places->bytes[place], places->size[place], STARCAT_SKIP_CRC);
-  }
-  if ((status == STARCAT_IDENTIFIED) && (image->total_bytes != places->size[place])) {
-    status = STARCAT_E_LAYOUT;
   }
   return status;
 }
@@ -269,7 +266,11 @@ typedef struct {
   uint32_t n_runs;
 } patching;
 
-enum { LITERAL, COPY, RENUMBER_16, RENUMBER_32, ADD_16, ADD_32, ZEROS };
+/* Kinds of steps; 2 to 5 are numbers of two bytes, of four, of two, of four. */
+#define LITERAL 0u
+#define COPY 1u
+#define ADD_16 4u
+#define ZEROS 6u
 
 /* The next number, seven bits a byte, the lowest first; 0 beyond the end of the patch. */
 static uint32_t next_number(patching *patch) {
@@ -368,7 +369,7 @@ static int apply_step(patching *patch) {
     }
     if (kind == COPY) {
       copy(patch, patch->old + patch->old_at, bytes);
-    } else if (kind < (uint32_t)ADD_16) {
+    } else if (kind < ADD_16) {
       renumber(patch, count, width);
     } else {
       add(patch, count, width);

@@ -72,13 +72,22 @@ def export(
     max_bytes: Annotated[
         int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
     ] = None,
+    patch_from: Annotated[
+        Path | None,
+        typer.Option(help="onboard: image in flight; a patch from it is written beside the image."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Write tables for other tools, an image for flight software, or other solvers' databases.
 
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
-    of_images: dict[str, Any] = {"method": method, "endian": endian, "max_bytes": max_bytes}
+    of_images: dict[str, Any] = {
+        "method": method,
+        "endian": endian,
+        "max_bytes": max_bytes,
+        "patch_from": patch_from,
+    }
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
@@ -191,10 +200,19 @@ def print_exported_image(exported: ExportedImage) -> None:
         ("method, byte order", f"{method}, {exported.byte_order}-endian"),
         ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
-        ("image", f"{len(exported.made.data):,} bytes"),
+        ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
+        *_patch_rows(exported),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
+    size = exported.patch_bytes
+    if size is None:
+        return []
+    share = 100.0 * size / len(exported.made.data)
+    return [("patch", f"{size:,} bytes, {share:.1f} % of the image")]
 
 
 def print_image(image: OnboardImage) -> None:
@@ -211,7 +229,7 @@ def print_image(image: OnboardImage) -> None:
         _features(image.method): f"{header['n_features']:,}",
         "quantum": f"{arcsec:.2g} arcsec, 0.001 mag",
         "manifest": f"sha256 {image.manifest_sha256}",
-        "image": f"{len(image.data):,} bytes",
+        "image": f"{len(image.data):,} bytes, CRC-32 0x{image.crc:08x}",
     }
     print_facts(image.name, facts)
     sections = [

@@ -20,8 +20,9 @@ from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
-from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder
-from starcat.onboard.reading import bytes_of_file, read_image
+from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder, crc_of
+from starcat.onboard.patching import apply_patch, make_patch
+from starcat.onboard.reading import OnboardImage, bytes_of_file, read_image
 from starcat.onboard.shrink import Shrunk, shrink
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars
@@ -37,7 +38,9 @@ class ExportedImage:
     fitted: Shrunk  # what is in it, and what was left out
     file_format: str
     byte_order: str
-    files: tuple[Path, ...]  # the image, or source and header
+    files: tuple[Path, ...]  # the image, or source and header; then the patch
+    crc: int  # CRC-32 of all data, which flight software is told of a new image
+    patch_bytes: int | None = None  # of the patch, if one was asked for
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -49,6 +52,8 @@ class ExportedImage:
             "endian": self.byte_order,
             "files": [str(path) for path in self.files],
             "image_bytes": len(self.made.data),
+            "crc": self.crc,
+            "patch_bytes": self.patch_bytes,
             "stars": fitted.stars,
             "stars_in_artifact": fitted.stars_before,
             "stars_per_field": fitted.stars_per_field,
@@ -66,9 +71,10 @@ def export_image(
     method: str = "triangle",
     endian: str = "little",
     max_bytes: int | None = None,
+    patch_from: Path | None = None,
     replace: bool = False,
 ) -> ExportedImage:
-    """Write the onboard image of a database."""
+    """Write the onboard image of a database, and the patch that makes it of an older image."""
     check_method(method)
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
@@ -80,6 +86,9 @@ def export_image(
     target = output or Path(f"{_name(opened)}{suffix}")
     if file_format == "c" and target.suffix != ".c":
         raise ConfigError(f"--output {target}: C source has a name that ends with .c", key="output")
+    if file_format == "c" and patch_from is not None:
+        raise ConfigError("--patch-from means nothing with --to c; leave it out", key="patch_from")
+    old = None if patch_from is None else read_image(Path(patch_from))
     if target.is_dir():
         raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
     _check_product(opened, method)
@@ -89,8 +98,20 @@ def export_image(
     files = {target: made.data}
     if file_format == "c":
         files = _c_files(made, fitted.contents.name, target, order)
+    patch = None if old is None else _checked_patch(old, read_image(made.data))
+    if patch is not None:
+        files[target.with_suffix(".patch")] = patch
     _write(files, replace=replace)
-    return ExportedImage(made, fitted, file_format, order, tuple(files))
+    crc = crc_of(made.data, order)
+    size = None if patch is None else len(patch)
+    return ExportedImage(made, fitted, file_format, order, tuple(files), crc, size)
+
+
+def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:
+    patch = make_patch(old, new)
+    if apply_patch(old.data, patch) != new.data:
+        raise OnboardImageError(f"the patch from {old.name} does not make {new.name}: report this")
+    return patch
 
 
 def contents_of(artifact: Artifact, method: str) -> Contents:
