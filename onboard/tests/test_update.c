@@ -66,7 +66,7 @@ static void test_pieces(void) {
     n = block;
   }
   CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_IDENTIFIED);
-  CHECK_IS(block, n_blocks - 1u);
+  CHECK_IS(block, n_blocks);
   CHECK_IS(starcat_switch(&places, NULL), STARCAT_E_NULL);
   CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
   CHECK_IS(places.active, 1);
