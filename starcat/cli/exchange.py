@@ -48,6 +48,22 @@ OutputPath = Annotated[
 MaxPartitionRows = Annotated[
     int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
 ]
+Method = Annotated[
+    str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+]
+Endian = Annotated[
+    str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
+]
+MaxBytes = Annotated[
+    int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
+]
+Sign = Annotated[
+    list[Path] | None, typer.Option(help="onboard, c: key to sign the image with. Repeatable.")
+]
+PatchFrom = Annotated[
+    Path | None,
+    typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
+]
 
 
 @app.command()
@@ -63,19 +79,11 @@ def export(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
     max_partition_rows: MaxPartitionRows = None,
-    method: Annotated[
-        str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
-    ] = None,
-    endian: Annotated[
-        str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
-    ] = None,
-    max_bytes: Annotated[
-        int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
-    ] = None,
-    patch_from: Annotated[
-        Path | None,
-        typer.Option(help="onboard: image in flight; a patch from it is written beside the image."),
-    ] = None,
+    method: Method = None,
+    endian: Endian = None,
+    max_bytes: MaxBytes = None,
+    patch_from: PatchFrom = None,
+    sign: Sign = None,
     json: Json = False,
 ) -> None:
     """Write tables for other tools, an image for flight software, or other solvers' databases.
@@ -87,6 +95,7 @@ def export(
         "endian": endian,
         "max_bytes": max_bytes,
         "patch_from": patch_from,
+        "sign": sign,
     }
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
@@ -202,6 +211,7 @@ def print_exported_image(exported: ExportedImage) -> None:
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
         ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
         *_patch_rows(exported),
+        *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
@@ -218,6 +228,7 @@ def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
 def print_image(image: OnboardImage) -> None:
     """Print what an image holds."""
     from starcat.onboard.layout import DIRECTION_SCALE
+    from starcat.onboard.signature import image_signatures
 
     header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
     facts = {
@@ -231,6 +242,9 @@ def print_image(image: OnboardImage) -> None:
         "manifest": f"sha256 {image.manifest_sha256}",
         "image": f"{len(image.data):,} bytes, CRC-32 0x{image.crc:08x}",
     }
+    signers = image_signatures(image.data, image.byte_order)
+    if signers:
+        facts["signed by"] = ", ".join(one.public_key.hex() for one in signers)
     print_facts(image.name, facts)
     sections = [
         (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()
