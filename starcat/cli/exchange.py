@@ -100,13 +100,8 @@ def export(
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
-        from starcat.exchange.onboard import export_image
-
         _refuse(form, of_tables | of_hats)
-        given = {name: value for name, value in of_images.items() if value is not None}
-        image = export_image(_named(source), form, output, replace=replace, **given)
-        _say_left_out(image)
-        show(json, image.as_dict(), print_exported_image, image)
+        _for_flight(_named(source), form, output, {**of_images, "replace": replace}, json)
         return
     if form in SOLVER_FORMATS:
         _refuse(form, of_tables | of_hats | of_images)
@@ -128,6 +123,17 @@ def export(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _for_flight(
+    database: Path, form: str, output: Path | None, options: Mapping[str, Any], json: bool
+) -> None:
+    from starcat.exchange.onboard import export_image
+
+    given = {name: value for name, value in options.items() if value is not None}
+    image = export_image(database, form, output, **given)
+    _say_left_out(image)
+    show(json, image.as_dict(), print_exported_image, image)
 
 
 def _for_solver(
