@@ -62,7 +62,7 @@ echo "  warnings of the build         $(printf %6d "$warnings")"
 echo "  exit code of core-cpu1        $(printf %6d "$ended")"
 icd=0
 if command -v "$PYTHON" >/dev/null; then
-  (cd "$out/cfs" && CC="$CC" INCLUDES="$host" $PYTHON "$here/test/icd.py" --check "$here/starcat.xml" \
+  (cd "$out/cfs" && CC="$CC" INCLUDES="$host" "$PYTHON" "$here/test/icd.py" --check "$here/starcat.xml" \
     --recording "$cf/run.ccsds" --build "$out") || icd=$?
 fi
 [ "$ended" = 0 ] && [ "$checked" = 0 ] && [ "$warnings" = 0 ] && [ "$icd" = 0 ] &&
