@@ -60,6 +60,10 @@ MaxBytes = Annotated[
 Sign = Annotated[
     list[Path] | None, typer.Option(help="onboard, c: key to sign the image with. Repeatable.")
 ]
+PatchFrom = Annotated[
+    Path | None,
+    typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
+]
 
 
 @app.command()
@@ -78,6 +82,7 @@ def export(
     method: Method = None,
     endian: Endian = None,
     max_bytes: MaxBytes = None,
+    patch_from: PatchFrom = None,
     sign: Sign = None,
     json: Json = False,
 ) -> None:
@@ -89,18 +94,14 @@ def export(
         "method": method,
         "endian": endian,
         "max_bytes": max_bytes,
+        "patch_from": patch_from,
         "sign": sign,
     }
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
-        from starcat.exchange.onboard import export_image
-
         _refuse(form, of_tables | of_hats)
-        given = {name: value for name, value in of_images.items() if value is not None}
-        image = export_image(_named(source), form, output, replace=replace, **given)
-        _say_left_out(image)
-        show(json, image.as_dict(), print_exported_image, image)
+        _for_flight(_named(source), form, output, {**of_images, "replace": replace}, json)
         return
     if form in SOLVER_FORMATS:
         _refuse(form, of_tables | of_hats | of_images)
@@ -122,6 +123,17 @@ def export(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _for_flight(
+    database: Path, form: str, output: Path | None, options: Mapping[str, Any], json: bool
+) -> None:
+    from starcat.exchange.onboard import export_image
+
+    given = {name: value for name, value in options.items() if value is not None}
+    image = export_image(database, form, output, **given)
+    _say_left_out(image)
+    show(json, image.as_dict(), print_exported_image, image)
 
 
 def _for_solver(
@@ -203,11 +215,20 @@ def print_exported_image(exported: ExportedImage) -> None:
         ("method, byte order", f"{method}, {exported.byte_order}-endian"),
         ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
-        ("image", f"{len(exported.made.data):,} bytes"),
+        ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
+        *_patch_rows(exported),
         *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
+    size = exported.patch_bytes
+    if size is None:
+        return []
+    share = 100.0 * size / len(exported.made.data)
+    return [("patch", f"{size:,} bytes, {share:.1f} % of the image")]
 
 
 def print_image(image: OnboardImage) -> None:
@@ -225,7 +246,7 @@ def print_image(image: OnboardImage) -> None:
         _features(image.method): f"{header['n_features']:,}",
         "quantum": f"{arcsec:.2g} arcsec, 0.001 mag",
         "manifest": f"sha256 {image.manifest_sha256}",
-        "image": f"{len(image.data):,} bytes",
+        "image": f"{len(image.data):,} bytes, CRC-32 0x{image.crc:08x}",
     }
     signers = image_signatures(image.data, image.byte_order)
     if signers:
