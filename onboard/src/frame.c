@@ -118,7 +118,7 @@ static void drop_repeats(starcat_workspace *w, starcat_result *result) {
   uint32_t kept = 0;
   for (uint32_t i = 0; i < w->count; i++) {
     uint32_t k = 0;
-    while ((k < kept) && !((w->x[k] == w->x[i]) && (w->y[k] == w->y[i]))) {
+    while ((k < kept) && ((w->x[k] != w->x[i]) || (w->y[k] != w->y[i]))) {
       k++;
     }
     if (k < kept) {

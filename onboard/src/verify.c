@@ -302,7 +302,7 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
   if (found->log_bound < R(0.0)) {
     starcat_weigh(call, m, factor * call->tolerance_rad, found);
     if ((found->share < STARCAT_MIN_SHARE) &&
-        !((found->is_firm != 0u) && (found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
+        ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
     } else if (starcat_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
       withhold(found, STARCAT_REASON_SCALE);
