@@ -17,7 +17,16 @@ from pathlib import Path
 import pages
 import sbom
 
-TOOLS = ("gcc", "clang", "clang-19", "frama-c", "cppcheck", "lcov", "arm-linux-gnueabihf-gcc", "python3")
+TOOLS = (
+    "gcc",
+    "clang",
+    "clang-19",
+    "frama-c",
+    "cppcheck",
+    "lcov",
+    "arm-linux-gnueabihf-gcc",
+    "python3",
+)
 PAGES = {
     "matrix": ["matrix.html", "matrix.csv"],
     "unit": ["unit.html"],
@@ -57,7 +66,8 @@ def main(folder: Path) -> int:
     pages.write(
         folder / "index.html",
         f"Evidence of starcat onboard {sbom.version()}",
-        f"<p>Commit {commit or 'unknown'}{dirty}, {when}. {link('MANUAL.md')} says what the library promises and what its user has to do.</p>",
+        f"<p>Commit {commit or 'unknown'}{dirty}, {when}. {link('MANUAL.md')} says what the "
+        "library promises and what its user has to do.</p>",
         pages.table(["what", "result", "figure", "command", "pages"], rows),
         "<h2>Tools</h2>",
         pages.table(["tool", "version"], [[tool, version_of(tool)] for tool in TOOLS]),

@@ -24,7 +24,11 @@ FUNCTION = re.compile(r"^(?:static )?void ((?:test|check)_\w+)\(", re.MULTILINE)
 def functions_of(file: Path) -> set[str]:
     """Return the test functions of a file."""
     text = file.read_text(encoding="utf-8")
-    found = FUNCTION.findall(text) if file.suffix == ".c" else re.findall(r"^def (test_\w+)", text, re.M)
+    found = (
+        FUNCTION.findall(text)
+        if file.suffix == ".c"
+        else re.findall(r"^def (test_\w+)", text, re.M)
+    )
     return set(found)
 
 
@@ -61,22 +65,34 @@ def check(requirements: list[dict], targets: set[str]) -> list[str]:
 
 
 def main(folder: Path) -> int:
-    requirements = tomllib.loads((HERE / "requirements.toml").read_text(encoding="utf-8"))["requirement"]
+    requirements = tomllib.loads((HERE / "requirements.toml").read_text(encoding="utf-8"))[
+        "requirement"
+    ]
     makefile = (ONBOARD / "Makefile").read_text(encoding="utf-8")
-    targets = {name for line in re.findall(r"^([a-z -]+):", makefile, re.M) for name in line.split()}
+    targets = {
+        name for line in re.findall(r"^([a-z -]+):", makefile, re.M) for name in line.split()
+    }
     wrong = check(requirements, targets)
     folder.mkdir(parents=True, exist_ok=True)
     head = ["requirement", "text", "from", "verified by", "tests"]
     rows = [[r["id"], r["text"], r["from"], r["by"], "\n".join(r["tests"])] for r in requirements]
     with (folder / "matrix.csv").open("w", encoding="utf-8", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([head, *([*row[:4], row[4].replace("\n", "; ")] for row in rows)])
+        csv.writer(file, lineterminator="\n").writerows(
+            [head, *([*row[:4], row[4].replace("\n", "; ")] for row in rows)]
+        )
     functions = sum(len(functions_of(file)) for file in (ONBOARD / "tests").glob("test_*.c"))
     figure = (
         f"{len(requirements)} requirements, {sum(len(r['tests']) for r in requirements)} links, "
         f"{functions} functions of the unit test, {len(wrong)} missing"
     )
     faults = pages.table(["fail"], [[f"fail: {line}"] for line in wrong]) if wrong else ""
-    pages.write(folder / "matrix.html", "Requirements and tests", f"<p>{figure}</p>", faults, pages.table(head, rows))
+    pages.write(
+        folder / "matrix.html",
+        "Requirements and tests",
+        f"<p>{figure}</p>",
+        faults,
+        pages.table(head, rows),
+    )
     print(f"matrix: {figure}", *wrong, sep="\n  ")
     return 1 if wrong else 0
 

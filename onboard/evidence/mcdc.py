@@ -20,26 +20,38 @@ import pages
 HERE = Path(__file__).resolve().parent
 ONBOARD = HERE.parent
 LEAST_PERCENT = 98.0
-FLAGS = ["-O1", "-fprofile-instr-generate", "-fcoverage-mapping", "-fcoverage-mcdc", "-DSTARCAT_GROUND"]
+FLAGS = [
+    "-O1",
+    "-fprofile-instr-generate",
+    "-fcoverage-mapping",
+    "-fcoverage-mcdc",
+    "-DSTARCAT_GROUND",
+]
 
 
 def run(*command: object) -> subprocess.CompletedProcess[str]:
     """Run a command; stop where it fails."""
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, check=False
+    )
     if done.returncode != 0:
         sys.exit(f"mcdc: {command[0]} failed:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
     return done
 
 
 def measure(folder: Path, suffix: str, flags: list[str]) -> tuple[dict, set[tuple[str, int]]]:
-    """Run the unit test of one precision; return the files of llvm-cov's export, and decisions that
-    clang did not follow."""
+    """Run the unit test of one precision.
+
+    Returns the files of llvm-cov's export, and the decisions that clang did not follow.
+    """
     sources = sorted((ONBOARD / "src").glob("*.c"))
     tests = [ONBOARD / "tests" / "unit.c", ONBOARD / "tests" / "random_sky.c"]
     tests += sorted((ONBOARD / "tests").glob("test_*.c"))
     includes = [f"-I{ONBOARD / name}" for name in ("include", "src")]
     program, raw, data = folder / "unit", folder / "unit.profraw", folder / "unit.profdata"
-    said = run(f"clang{suffix}", *flags, *FLAGS, *includes, *sources, *tests, "-lm", "-o", program).stderr
+    said = run(
+        f"clang{suffix}", *flags, *FLAGS, *includes, *sources, *tests, "-lm", "-o", program
+    ).stderr
     run("env", f"LLVM_PROFILE_FILE={raw}", program)
     run(f"llvm-profdata{suffix}", "merge", raw, "-o", data)
     export = run(f"llvm-cov{suffix}", "export", program, f"-instr-profile={data}", ONBOARD / "src")
@@ -61,7 +73,7 @@ def merged(exports: list[dict]) -> dict[tuple[str, int, int], list[bool]]:
 
 
 def excused() -> dict[tuple[str, int, str], str]:
-    """Return the conditions that mcdc.txt names, by file, number and source line, and their reasons."""
+    """Return what mcdc.txt names, by file, number and source line, and the reasons."""
     named = {}
     for line in (HERE / "mcdc.txt").read_text(encoding="utf-8").splitlines():
         if line and not line.startswith("#"):
@@ -79,7 +91,10 @@ def main(folder: Path, suffix: str, flags: list[str]) -> int:
         exports.append(export)
         unsupported |= unknown
     decisions = merged(exports)
-    lines = {file.name: file.read_text(encoding="utf-8").splitlines() for file in (ONBOARD / "src").iterdir()}
+    lines = {
+        file.name: file.read_text(encoding="utf-8").splitlines()
+        for file in (ONBOARD / "src").iterdir()
+    }
     missing = {
         (name, number, lines[name][line - 1].strip())
         for (name, line, _), conditions in decisions.items()
@@ -87,24 +102,38 @@ def main(folder: Path, suffix: str, flags: list[str]) -> int:
         if not covered
     } | {(name, 0, lines[name][line - 1].strip()) for name, line in unsupported}
     named = excused()
-    wrong = [f"{name}, condition {n} of `{text}`: not covered, and not in mcdc.txt" for name, n, text in sorted(missing - set(named))]
-    wrong += [f"{name}, condition {n} of `{text}`: in mcdc.txt, but covered" for name, n, text in sorted(set(named) - missing)]
+    wrong = [
+        f"{name}, condition {n} of `{text}`: not covered, and not in mcdc.txt"
+        for name, n, text in sorted(missing - set(named))
+    ]
+    wrong += [
+        f"{name}, condition {n} of `{text}`: in mcdc.txt, but covered"
+        for name, n, text in sorted(set(named) - missing)
+    ]
     rows = []
     for name in sorted({name for name, _, _ in decisions}):
         own = [conditions for (file, _, _), conditions in decisions.items() if file == name]
         count, covered = sum(map(len, own)), sum(map(sum, own))
-        rows.append([name, str(len(own)), str(count), str(covered), f"{100.0 * covered / count:.2f} %"])
+        rows.append(
+            [name, str(len(own)), str(count), str(covered), f"{100.0 * covered / count:.2f} %"]
+        )
     count, covered = sum(map(len, decisions.values())), sum(map(sum, decisions.values()))
     percent = 100.0 * covered / count
     wrong += [f"{percent:.2f} % is below {LEAST_PERCENT} %"] if percent < LEAST_PERCENT else []
-    figure = f"{covered} of {count} conditions of {len(decisions)} decisions ({percent:.2f} %), {len(named)} explained"
+    figure = (
+        f"{covered} of {count} conditions of {len(decisions)} decisions ({percent:.2f} %), "
+        f"{len(named)} explained"
+    )
     reasons = [[name, str(n), text, reason] for (name, n, text), reason in named.items()]
     pages.write(
         folder / "mcdc.html",
         "MC/DC of the unit test",
-        f"<p>{figure}. Decisions of two conditions or more; those of one are branches, all of which are taken (make coverage).</p>",
+        f"<p>{figure}. Decisions of two conditions or more; those of one are branches, all of "
+        "which are taken (make coverage).</p>",
         pages.table(["file", "decisions", "conditions", "covered", "share"], rows),
-        pages.table(["file", "condition", "decision", "why it is not covered"], reasons) if reasons else "",
+        pages.table(["file", "condition", "decision", "why it is not covered"], reasons)
+        if reasons
+        else "",
         pages.table(["fail"], [[f"fail: {line}"] for line in wrong]) if wrong else "",
     )
     print(*wrong, f"mcdc: {figure}", sep="\n")

@@ -16,7 +16,13 @@ from pathlib import Path
 import pages
 
 ONBOARD = Path(__file__).resolve().parent.parent
-FLAGS = ["--std=c99", "--enable=warning,style,performance,portability", "--addon=misra", "-DSTARCAT_GROUND", "-USTARCAT_MATH_HEADER"]
+FLAGS = [
+    "--std=c99",
+    "--enable=warning,style,performance,portability",
+    "--addon=misra",
+    "-DSTARCAT_GROUND",
+    "-USTARCAT_MATH_HEADER",
+]
 
 
 def explained() -> dict[str, tuple[str, str]]:
@@ -32,7 +38,15 @@ def findings() -> dict[str, set[tuple[str, str]]]:
     sources = sorted(str(path.relative_to(ONBOARD)) for path in (ONBOARD / "src").glob("*.c"))
     found: dict[str, set[tuple[str, str]]] = {}
     for single in ("-DSTARCAT_SINGLE", "-USTARCAT_SINGLE"):
-        command = ["cppcheck", "--quiet", *FLAGS, single, "--template={id},{file},{line}", "-Iinclude", *sources]
+        command = [
+            "cppcheck",
+            "--quiet",
+            *FLAGS,
+            single,
+            "--template={id},{file},{line}",
+            "-Iinclude",
+            *sources,
+        ]
         done = subprocess.run(command, cwd=ONBOARD, capture_output=True, text=True, check=False)
         for rule, file, line in re.findall(r"^([\w.-]+),(.+),(\d+)$", done.stderr, re.MULTILINE):
             found.setdefault(rule.removeprefix("misra-c2012-"), set()).add((file, line))
@@ -46,13 +60,23 @@ def main(folder: Path) -> int:
     rows = []
     for rule, (_, why) in reasons.items():
         by_file = Counter(Path(file).name for file, _ in found.get(rule, set()))
-        rows.append([rule, str(sum(by_file.values())), ", ".join(f"{name} {n}" for name, n in sorted(by_file.items())), why])
+        rows.append(
+            [
+                rule,
+                str(sum(by_file.values())),
+                ", ".join(f"{name} {n}" for name, n in sorted(by_file.items())),
+                why,
+            ]
+        )
     count = sum(len(places) for places in found.values())
-    figure = f"{count} places of {len(found)} rules, {len(set(found) & set(reasons))} of them explained"
+    figure = (
+        f"{count} places of {len(found)} rules, {len(set(found) & set(reasons))} of them explained"
+    )
     pages.write(
         folder / "misra.html",
         "MISRA C:2012",
-        f"<p>{figure}. Found by cppcheck's addon in src/ and include/, in both precisions; rules that are not listed are kept, as far as the addon checks them.</p>",
+        f"<p>{figure}. Found by cppcheck's addon in src/ and include/, in both precisions; rules "
+        "that are not listed are kept, as far as the addon checks them.</p>",
         pages.table(["rule", "places", "where", "why"], rows),
         pages.table(["fail"], [[f"fail: {line}"] for line in wrong]) if wrong else "",
     )

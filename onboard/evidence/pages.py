@@ -19,9 +19,17 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     for row in rows:
         cells = []
         for text in row:
-            kind = " class=good" if text.endswith("pass") else " class=bad" if text.startswith("fail") else ""
+            kind = (
+                " class=good"
+                if text.endswith("pass")
+                else " class=bad"
+                if text.startswith("fail")
+                else ""
+            )
             link = text.startswith("<a ")
-            cells.append(f"<td{kind}>{text if link else escape(text).replace(chr(10), '<br>')}</td>")
+            cells.append(
+                f"<td{kind}>{text if link else escape(text).replace(chr(10), '<br>')}</td>"
+            )
         lines.append("<tr>" + "".join(cells) + "</tr>")
     return "\n".join([*lines, "</table>"])
 

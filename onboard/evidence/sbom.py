@@ -24,7 +24,9 @@ NOT_OURS = {"build", "target", "__pycache__"}
 def git(*words: str) -> str:
     """Return what git says; nothing where the folder is in no repository."""
     try:
-        done = subprocess.run(["git", "-C", str(ONBOARD), *words], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            ["git", "-C", str(ONBOARD), *words], capture_output=True, text=True, check=False
+        )
     except FileNotFoundError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
@@ -60,7 +62,7 @@ def describe() -> dict[str, object]:
     files, sha1s = [], []
     for name in sorted(name for name in names if not NOT_OURS & set(name.split("/"))):
         data = names[name].read_bytes()
-        sha1s.append(hashlib.sha1(data).hexdigest())  # noqa: S324 - SPDX wants it
+        sha1s.append(hashlib.sha1(data).hexdigest())
         sums = [("SHA1", sha1s[-1]), ("SHA256", hashlib.sha256(data).hexdigest())]
         files.append(
             {
@@ -71,7 +73,7 @@ def describe() -> dict[str, object]:
                 "copyrightText": "NOASSERTION",
             }
         )
-    code = hashlib.sha1("".join(sorted(sha1s)).encode()).hexdigest()  # noqa: S324
+    code = hashlib.sha1("".join(sorted(sha1s)).encode()).hexdigest()
     own = package(
         "starcat-onboard",
         versionInfo=version(),
@@ -81,7 +83,9 @@ def describe() -> dict[str, object]:
         packageVerificationCode={"packageVerificationCodeValue": code},
         hasFiles=[file["SPDXID"] for file in files],
     )
-    libm = package("libm", filesAnalyzed=False, comment="sqrt, sin, cos, atan2 and log, or what replaces them")
+    libm = package(
+        "libm", filesAnalyzed=False, comment="sqrt, sin, cos, atan2 and log, or what replaces them"
+    )
     relations = [
         ("SPDXRef-DOCUMENT", "DESCRIBES", own["SPDXID"]),
         (own["SPDXID"], "DEPENDS_ON", libm["SPDXID"]),
@@ -100,7 +104,8 @@ def describe() -> dict[str, object]:
         "packages": [own, libm],
         "files": files,
         "relationships": [
-            {"spdxElementId": a, "relationshipType": kind, "relatedSpdxElement": b} for a, kind, b in relations
+            {"spdxElementId": a, "relationshipType": kind, "relatedSpdxElement": b}
+            for a, kind, b in relations
         ],
     }
 

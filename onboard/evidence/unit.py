@@ -20,14 +20,21 @@ ONBOARD = Path(__file__).resolve().parent.parent
 
 def main(folder: Path, compilers: list[str], flags: list[str]) -> int:
     tests = ONBOARD / "tests"
-    sources = [*sorted((ONBOARD / "src").glob("*.c")), tests / "unit.c", tests / "random_sky.c", *sorted(tests.glob("test_*.c"))]
+    sources = [
+        *sorted((ONBOARD / "src").glob("*.c")),
+        tests / "unit.c",
+        tests / "random_sky.c",
+        *sorted(tests.glob("test_*.c")),
+    ]
     includes = [f"-I{ONBOARD / name}" for name in ("include", "src")]
     program = folder.resolve() / "unit"
     heads, results, details, total, failed = [], {}, [], 0, 0
     for compiler in filter(shutil.which, compilers):
         for single in ([], ["-DSTARCAT_SINGLE"]):
             heads.append(f"{compiler}, {'single' if single else 'double'}")
-            subprocess.run([compiler, *flags, *single, *includes, *sources, "-lm", "-o", program], check=True)
+            subprocess.run(
+                [compiler, *flags, *single, *includes, *sources, "-lm", "-o", program], check=True
+            )
             done = subprocess.run([program, "each"], capture_output=True, text=True, check=False)
             rows = re.findall(r"^(\w+): (\d+) checks, (\d+) failed$", done.stdout, re.MULTILINE)
             for name, checks, failures in rows:
@@ -44,7 +51,13 @@ def main(folder: Path, compilers: list[str], flags: list[str]) -> int:
         folder / "unit.html",
         "Unit test",
         f"<p>{figure}. Floating-point traps are on.</p>",
-        pages.table(["part", *heads], [[f"test_{name}", *(of.get(head, "fail: not run") for head in heads)] for name, of in results.items()]),
+        pages.table(
+            ["part", *heads],
+            [
+                [f"test_{name}", *(of.get(head, "fail: not run") for head in heads)]
+                for name, of in results.items()
+            ],
+        ),
         *(f"<pre>{pages.escape(text)}</pre>" for text in details),
     )
     print(f"unit: {figure}")
