@@ -112,7 +112,7 @@ void STARCAT_APP_DisableTrackingCmd(const STARCAT_APP_DisableTrackingCmd_t *Msg)
 void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
   starcat_options Options = STARCAT_APP_Data.Options;
   Options.max_steps = Msg->Payload.MaxSteps;
-  const starcat_status Status = STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &Options);
+  const starcat_status Status = STARCAT_APP_CheckSettings(NULL, &Options);
   if (Status != STARCAT_IDENTIFIED) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_BUDGET_ERR_EID, CFE_EVS_EventType_ERROR,

@@ -21,6 +21,7 @@
 #define N_EVENT_IDS 32
 #define MOST_TICKS  2000
 #define BLOCK_BYTES 4096u
+#define BURST       4 /* as many messages of an identifier as wait in a pipe by default */
 
 typedef STARCAT_APP_HkTlm_Payload_t hk;
 
@@ -162,31 +163,44 @@ static uint32 Since_us(OS_time_t Before) {
   return (uint32)OS_TimeGetTotalMicroseconds(OS_TimeSubtract(After, Before));
 }
 
-/* Send the frame that lies ready, at its time, and take its attitude. */
-static void SendFrame(void) {
-  OS_time_t Before;
+/* Send the frame that lies ready, at its time. */
+static void PostFrame(void) {
   Frame.Payload.Seconds = FrameClock / 10;
   Frame.Payload.Subseconds = (uint32)(((uint64)(FrameClock % 10) << 32) / 10);
   FrameClock++;
-  OS_GetLocalTime(&Before);
   Send(CFE_MSG_PTR(Frame.TelemetryHeader), STARCAT_APP_FRAME_TLM_MID, 0, sizeof Frame);
+}
+
+/* Take the attitude of a frame. */
+static void TakeAttitude(uint32 Sequence) {
   CHECK(Await(STARCAT_APP_ATTITUDE_TLM_MID));
-  const uint32 Took_us = Since_us(Before);
-  Longest_us = Took_us > Longest_us ? Took_us : Longest_us;
-  CHECK(Attitude.Sequence == Frame.Payload.Sequence);
-  CHECK(Attitude.Seconds == Frame.Payload.Seconds);
-  CHECK(Attitude.Subseconds == Frame.Payload.Subseconds);
+  CHECK(Attitude.Sequence == Sequence);
   Seen++;
   Identified += (Attitude.Status == STARCAT_IDENTIFIED) && (Attitude.Mode == 1);
   Tracked += (Attitude.Status == STARCAT_IDENTIFIED) && (Attitude.Mode == 2);
   Errors += (Attitude.Status < 0) && (Attitude.Status != STARCAT_E_BUDGET) && (Attitude.Mode != 0);
 }
 
+static bool NextFrame(uint32 Source) {
+  return OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
+         (int32)sizeof Frame.Payload;
+}
+
+static void SendFrame(void) {
+  OS_time_t Before;
+  OS_GetLocalTime(&Before);
+  PostFrame();
+  TakeAttitude(Frame.Payload.Sequence);
+  const uint32 Took_us = Since_us(Before);
+  Longest_us = Took_us > Longest_us ? Took_us : Longest_us;
+  CHECK(Attitude.Seconds == Frame.Payload.Seconds);
+  CHECK(Attitude.Subseconds == Frame.Payload.Subseconds);
+}
+
 /* The next frames of a file: 0 sky A, 1 its slew, 2 sky B. Each is followed by a tick. */
 static void Fly(uint32 Source, uint32 Count) {
   for (uint32 n = 0; n < Count; n++) {
-    CHECK(OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
-          (int32)sizeof Frame.Payload);
+    CHECK(NextFrame(Source));
     SendFrame();
     CHECK(Attitude.Status == STARCAT_IDENTIFIED);
     Wakeup();
@@ -414,14 +428,20 @@ static void TestUpsets(void) {
   FlyUntilLoaded(2, STARCAT_APP_LOAD_READY);
 }
 
-/* All frames that are left, of the sky whose image is in use. */
+/* All frames that are left, of the sky whose image is in use, several at once. */
 static void FlyTheRest(void) {
   for (uint32 Source = 2; Source <= 2; Source -= 2) {
-    while (OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
-           (int32)sizeof Frame.Payload) {
-      SendFrame();
-      CHECK(Attitude.Status == STARCAT_IDENTIFIED);
+    uint32 Sequences[BURST], Posted = BURST;
+    while (Posted == BURST) {
+      for (Posted = 0; (Posted < BURST) && NextFrame(Source); Posted++) {
+        Sequences[Posted] = Frame.Payload.Sequence;
+        PostFrame();
+      }
       Wakeup();
+      for (uint32 n = 0; n < Posted; n++) {
+        TakeAttitude(Sequences[n]);
+        CHECK(Attitude.Status == STARCAT_IDENTIFIED);
+      }
     }
     AskHk();
     if (Source == 2) {
