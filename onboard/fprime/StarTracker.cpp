@@ -265,8 +265,8 @@ void StarTracker::endLoad(LoadState state) {
   m_load = state;
 }
 
-// Open the file of an image, and prepare the other place for it.
-bool StarTracker::beginLoad(const char* path, U32 crc) {
+// Open the file of an image, and prepare the other place for it, or the file of a patch.
+bool StarTracker::beginLoad(const char* path, U32 crc, bool isPatch) {
   FwSizeType size = 0;
   if (m_load == LoadState::READING) {
     this->endLoad(LoadState::FAILED);
@@ -274,7 +274,11 @@ bool StarTracker::beginLoad(const char* path, U32 crc) {
   starcat_status status = STARCAT_E_SHORT;
   if ((m_file.open(path, Os::File::OPEN_READ) == Os::File::OP_OK) &&
       (m_file.size(size) == Os::File::OP_OK)) {
-    status = starcat_receive(&m_places, static_cast<size_t>(size), crc);
+    if (!isPatch) {
+      status = starcat_receive(&m_places, static_cast<size_t>(size), crc);
+    } else if (size <= m_patchCapacity) {
+      status = STARCAT_IDENTIFIED;
+    }
   }
   if (status != STARCAT_IDENTIFIED) {
     this->endLoad(LoadState::FAILED);
@@ -282,6 +286,7 @@ bool StarTracker::beginLoad(const char* path, U32 crc) {
     return false;
   }
   m_load = LoadState::READING;
+  m_isPatch = isPatch;
   m_loadBytes = 0;
   m_loadSize = static_cast<U32>(size);
   m_checkBlock = 0;
@@ -292,7 +297,14 @@ bool StarTracker::beginLoad(const char* path, U32 crc) {
 void StarTracker::readPiece() {
   FwSizeType count = sizeof m_piece;
   starcat_status status = STARCAT_E_SHORT;
-  if ((m_file.read(m_piece, count) == Os::File::OP_OK) && (count > 0)) {
+  if ((m_file.read(m_piece, count) != Os::File::OP_OK) || (count == 0)) {
+    status = STARCAT_E_SHORT;
+  } else if (m_isPatch) {
+    if (count <= m_patchCapacity - m_loadBytes) {
+      std::memcpy(m_patch + m_loadBytes, m_piece, static_cast<size_t>(count));
+      status = STARCAT_IDENTIFIED;
+    }
+  } else {
     status = starcat_put(&m_places, m_loadBytes, m_piece, static_cast<size_t>(count));
   }
   if (status != STARCAT_IDENTIFIED) {
@@ -306,14 +318,16 @@ void StarTracker::readPiece() {
   }
 }
 
-// Check some blocks of the new image: those of checks first, as they tell of the others.
+// Check some blocks of the new image: those of checks first, as they tell of the others. A patch is
+// applied instead, which makes and checks the new image in one go.
 void StarTracker::checkLoaded() {
   Fw::ParamValid valid;
-  const U32 blocks = m_loadSize / BLOCK_BYTES;
+  const U32 blocks = m_isPatch ? 0 : m_loadSize / BLOCK_BYTES;
   const U32 some = this->paramGet_SCRUB_BLOCKS(valid) + (this->paramGet_SCRUB_BLOCKS(valid) == 0);
   U32 bad = 0;
-  starcat_status status = starcat_missing(&m_places, blocks, &bad);
-  if (status == STARCAT_IDENTIFIED) {
+  starcat_status status = m_isPatch ? starcat_patch(&m_places, m_patch, m_loadSize)
+                                    : starcat_missing(&m_places, blocks, &bad);
+  if ((status == STARCAT_IDENTIFIED) && !m_isPatch) {
     status = starcat_scrub(m_places.bytes[1 - m_places.active], m_loadSize, m_checkBlock, some,
                            &bad);
   }
@@ -390,18 +404,23 @@ void StarTracker::schedIn_handler(FwIndexType portNum, U32 context) {
 // Read a file whole into the place that is not `active` then.
 void StarTracker::readWhole(const char* path, U32 active) {
   m_places.active = active;
-  if (this->beginLoad(path, 0)) {
+  if (this->beginLoad(path, 0, false)) {
     while (m_load == LoadState::READING) {
       this->readPiece();
     }
   }
 }
 
-void StarTracker::configure(U8* first, U8* second, FwSizeType capacity, const char* path,
-                            const char* otherPath) {
+void StarTracker::configure(U8* first, U8* second, FwSizeType capacity, U8* patch,
+                            FwSizeType patchCapacity) {
   m_places.bytes[0] = first;
   m_places.bytes[1] = second;
   m_places.capacity = static_cast<size_t>(capacity);
+  m_patch = patch;
+  m_patchCapacity = patchCapacity;
+}
+
+void StarTracker::openImages(const char* path, const char* otherPath) {
   this->readWhole(path, 1);
   if (otherPath != nullptr) {
     this->readWhole(otherPath, 0);
@@ -425,7 +444,14 @@ void StarTracker::configure(U8* first, U8* second, FwSizeType capacity, const ch
 
 void StarTracker::LOAD_IMAGE_cmdHandler(FwOpcodeType opCode, U32 cmdSeq,
                                         const Fw::CmdStringArg& path, U32 crc) {
-  const bool isBegun = this->beginLoad(path.toChar(), crc);
+  const bool isBegun = this->beginLoad(path.toChar(), crc, false);
+  this->cmdResponse_out(opCode, cmdSeq,
+                        isBegun ? Fw::CmdResponse::OK : Fw::CmdResponse::EXECUTION_ERROR);
+}
+
+void StarTracker::LOAD_PATCH_cmdHandler(FwOpcodeType opCode, U32 cmdSeq,
+                                        const Fw::CmdStringArg& path) {
+  const bool isBegun = this->beginLoad(path.toChar(), 0, true);
   this->cmdResponse_out(opCode, cmdSeq,
                         isBegun ? Fw::CmdResponse::OK : Fw::CmdResponse::EXECUTION_ERROR);
 }

@@ -151,6 +151,9 @@ module Starcat {
     @ Counters become 0
     async command CLEAR_COUNTERS opcode 2
 
+    @ Read a patch, and make the next image of the one in use
+    async command LOAD_PATCH(path: string size 80) opcode 3
+
     @ Whether the camera is that of the image, or that of CAMERA
     param CAMERA_OF_IMAGE: bool default true id 0
 

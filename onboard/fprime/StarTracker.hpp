@@ -18,15 +18,19 @@ class StarTracker final : public StarTrackerComponentBase {
   explicit StarTracker(const char* compName);
 
   //! Give two places for images and their parity, each of `capacity` bytes at a multiple of 8, and
-  //! read the images of the start. The second path may be null. Called once, before the task starts.
-  void configure(U8* first, U8* second, FwSizeType capacity, const char* path,
-                 const char* otherPath);
+  //! room for a patch at a multiple of 4, which may be null. Called once, first.
+  void configure(U8* first, U8* second, FwSizeType capacity, U8* patch, FwSizeType patchCapacity);
+
+  //! Read the images of the start; the second path may be null. Called once, before the task starts.
+  void openImages(const char* path, const char* otherPath);
 
  private:
   void framesIn_handler(FwIndexType portNum, Starcat::Centroids& centroids) override;
   void schedIn_handler(FwIndexType portNum, U32 context) override;
   void LOAD_IMAGE_cmdHandler(FwOpcodeType opCode, U32 cmdSeq, const Fw::CmdStringArg& path,
                              U32 crc) override;
+  void LOAD_PATCH_cmdHandler(FwOpcodeType opCode, U32 cmdSeq,
+                             const Fw::CmdStringArg& path) override;
   void SWITCH_IMAGE_cmdHandler(FwOpcodeType opCode, U32 cmdSeq) override;
   void CLEAR_COUNTERS_cmdHandler(FwOpcodeType opCode, U32 cmdSeq) override;
   void parameterUpdated(FwPrmIdType id) override;
@@ -45,7 +49,7 @@ class StarTracker final : public StarTrackerComponentBase {
   void report() const;
 
   // Images
-  bool beginLoad(const char* path, U32 crc);
+  bool beginLoad(const char* path, U32 crc, bool isPatch);
   void readPiece();
   void checkLoaded();
   void scrub();
@@ -62,6 +66,9 @@ class StarTracker final : public StarTrackerComponentBase {
   starcat_result m_result;
   starcat_real m_numbers[4][STARCAT_MAX_CENTROIDS];
   U8 m_piece[4096];
+  U8* m_patch = nullptr;
+  FwSizeType m_patchCapacity = 0;
+  bool m_isPatch = false;
   Os::File m_file;
 
   std::atomic<bool> m_isNew{false};  // settings, to be taken over

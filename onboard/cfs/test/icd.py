@@ -40,6 +40,7 @@ COMMANDS = {
     "ENABLE_TRACKING": None,
     "DISABLE_TRACKING": None,
     "SET_BUDGET": "SetBudget",
+    "LOAD_PATCH": "LoadPatch",
 }
 ENUMERATED = {
     "Status": "status",

@@ -53,6 +53,7 @@ Fw::ActiveComponentBase::MsgDispatchStatus Base::doDispatch() { return MSG_DISPA
 void Base::framesIn_preMsgHook(FwIndexType, Centroids&) {}
 void Base::schedIn_preMsgHook(FwIndexType, U32) {}
 void Base::LOAD_IMAGE_preMsgHook(FwOpcodeType, U32) {}
+void Base::LOAD_PATCH_preMsgHook(FwOpcodeType, U32) {}
 void Base::SWITCH_IMAGE_preMsgHook(FwOpcodeType, U32) {}
 void Base::CLEAR_COUNTERS_preMsgHook(FwOpcodeType, U32) {}
 void Base::parameterUpdated(FwPrmIdType) {}
@@ -121,6 +122,7 @@ static uint64_t words[2][SKY_MOST_BYTES / 8u];
 static size_t sizes[2];
 static starcat_image images[2];
 static U64 places[2][SKY_MOST_BYTES / 8u];
+static U32 patch_memory[4096];
 static starcat_workspace work;
 static starcat_result direct;
 static std::string folder;
@@ -137,6 +139,40 @@ static void write_image(const char* name, uint32_t sky, size_t damaged, size_t c
   std::fclose(file);
 }
 
+static void put_number(std::vector<uint8_t>& patch, uint32_t number) {
+  for (; number >= 0x80u; number >>= 7) {
+    patch.push_back(static_cast<uint8_t>(number | 0x80u));
+  }
+  patch.push_back(static_cast<uint8_t>(number));
+}
+
+// The patch that gives the first image another name, by docs/onboard-format.md: its first block and
+// the last one, that of checks, are given, the others copied.
+static void write_patch() {
+  const size_t size = sizes[0], check = size - 4096u;
+  std::vector<uint64_t> renamed(words[0], words[0] + size / 8u);
+  uint8_t* bytes = reinterpret_cast<uint8_t*>(renamed.data());
+  std::memcpy(bytes + 160, "sky-a-1.0.1", 12);
+  sky_seal(bytes);
+  uint32_t header[10] = {0, 0, 0x01020304u, 1u, static_cast<uint32_t>(size), 0u,
+                         static_cast<uint32_t>(size), 0u, 0u, 0u};
+  std::memcpy(header, "STARPAT", 8);
+  std::memcpy(header + 5, reinterpret_cast<uint8_t*>(words[0]) + size - 8u, 4);
+  std::memcpy(header + 7, bytes + size - 8u, 4);
+  std::vector<uint8_t> patch(sizeof header);
+  put_number(patch, 4096u * 8u);
+  patch.insert(patch.end(), bytes, bytes + 4096u);
+  put_number(patch, static_cast<uint32_t>(check - 4096u) * 8u + 1u);
+  put_number(patch, 2u * 4096u);
+  put_number(patch, 4096u * 8u);
+  patch.insert(patch.end(), bytes + check, bytes + size);
+  header[9] = static_cast<uint32_t>(patch.size());
+  std::memcpy(patch.data(), header, sizeof header);
+  std::FILE* file = std::fopen((folder + "/a.patch").c_str(), "wb");
+  std::fwrite(patch.data(), 1, patch.size(), file);
+  std::fclose(file);
+}
+
 static void make_images() {
   for (uint32_t n = 0; n < 2u; n++) {
     const sky_recipe recipe = {1, 2, SKY_STARS, 0.42, 8u + n};
@@ -150,6 +186,7 @@ static void make_images() {
   write_image("b.img", 1, 0, SIZE_MAX);
   write_image("damaged.img", 1, 20000, SIZE_MAX);
   write_image("odd.img", 1, 0, 5000);
+  write_patch();
 }
 
 namespace Starcat {
@@ -166,6 +203,9 @@ class StarTrackerTester {
   }
   void load(const char* name) {
     m_base.LOAD_IMAGE_cmdHandler(0, 0, Fw::CmdStringArg((folder + "/" + name).c_str()), 0);
+  }
+  void patch(const char* name) {
+    m_base.LOAD_PATCH_cmdHandler(3, 0, Fw::CmdStringArg((folder + "/" + name).c_str()));
   }
   bool takeOver() {
     m_base.SWITCH_IMAGE_cmdHandler(1, 0);
@@ -273,6 +313,22 @@ static void test_images(Starcat::StarTrackerTester& tester) {
   fly(tester, 0, 40);
 }
 
+static void test_patches(Starcat::StarTrackerTester& tester) {
+  tester.patch("a.img");  // too large
+  CHECK(response == Fw::CmdResponse::EXECUTION_ERROR);
+  tester.patch("a.patch");
+  CHECK(response == Fw::CmdResponse::OK);
+  tester.ticks(4);
+  CHECK((events["LoadReady"] == 2) && tester.takeOver() && (image_name == "sky-a-1.0.1"));
+  fly(tester, 0, 20);
+  tester.patch("a.patch");  // for the other image
+  tester.ticks(4);
+  CHECK((events["LoadRefused"] == 2) && tester.takeOver() && (image_name == "sky-a-1.0.0"));
+  tester.load("b.img");  // to fall back on
+  tester.ticks(60);
+  CHECK(events["LoadReady"] == 3);
+}
+
 static void test_upsets(Starcat::StarTrackerTester& tester) {
   uint8_t* bytes = reinterpret_cast<uint8_t*>(places[channels["ActivePlace"]]);
   bytes[2u * 4096u + 77u] ^= 1u;
@@ -333,10 +389,12 @@ int main(int argc, char** argv) {
   static Starcat::StarTracker tracker("starTracker");
   Starcat::StarTrackerTester tester(tracker);
   tracker.configure(reinterpret_cast<U8*>(places[0]), reinterpret_cast<U8*>(places[1]),
-                    sizeof places[0], (folder + "/a.img").c_str(), nullptr);
+                    sizeof places[0], reinterpret_cast<U8*>(patch_memory), sizeof patch_memory);
+  tracker.openImages((folder + "/a.img").c_str(), nullptr);
   CHECK((events["Started"] == 1) && (image_name == "sky-a-1.0.0"));
-  fly(tester, 0, 480);
+  fly(tester, 0, 460);
   test_images(tester);
+  test_patches(tester);
   test_upsets(tester);
   test_settings(tester);
   tracking = true;

@@ -18,6 +18,7 @@
 
 #define TIMEOUT_MS  5000
 #define SETTLE_MS   150 /* for tasks of table services */
+#define QUIET_MS    2000 /* event services hold back who sends more than 15 events a second */
 #define N_EVENT_IDS 32
 #define MOST_TICKS  2000
 #define BLOCK_BYTES 4096u
@@ -140,6 +141,13 @@ static void LoadImage(const char *Path, uint32 Crc, bool IsRight) {
   strncpy(Payload.Path, Path, sizeof Payload.Path - 1);
   Payload.Crc = Crc;
   Command(STARCAT_APP_LOAD_IMAGE_CC, &Payload, sizeof Payload, IsRight);
+}
+
+static void LoadPatch(const char *Path, bool IsRight) {
+  STARCAT_APP_LoadPatch_Payload_t Payload;
+  memset(&Payload, 0, sizeof Payload);
+  strncpy(Payload.Path, Path, sizeof Payload.Path - 1);
+  Command(STARCAT_APP_LOAD_PATCH_CC, &Payload, sizeof Payload, IsRight);
 }
 
 static void SetCamera(double FocalLength_px, bool IsRight) {
@@ -424,6 +432,10 @@ static void TestUpsets(void) {
   CHECK(Events[STARCAT_APP_FALLBACK_ERR_EID] == 1);
   CHECK(strcmp(Hk.ImageName, TEST_IMAGE_B) == 0);
   Fly(2, 10);
+  LoadPatch("/cf/big.img", false);
+  LoadPatch("/cf/a.patch", true); /* for the other image */
+  FlyUntilLoaded(2, STARCAT_APP_LOAD_FAILED);
+  CHECK(Events[STARCAT_APP_REFUSED_ERR_EID] == 5);
   LoadImage("/cf/starcat.img", 0, true);
   FlyUntilLoaded(2, STARCAT_APP_LOAD_READY);
 }
@@ -446,6 +458,9 @@ static void FlyTheRest(void) {
     AskHk();
     if (Source == 2) {
       Switch(TEST_IMAGE_A, true);
+      LoadPatch("/cf/a.patch", true);
+      FlyUntilLoaded(0, STARCAT_APP_LOAD_READY);
+      Switch(TEST_PATCHED, true);
     }
   }
 }
@@ -469,11 +484,15 @@ static void Fly1000(void) {
   TestTable();
   TestReload();
   TestSettings();
+  OS_TaskDelay(QUIET_MS);
   TestDamagedFiles();
+  OS_TaskDelay(QUIET_MS);
   TestUpsets();
+  OS_TaskDelay(QUIET_MS);
   FlyTheRest();
   CHECK(Hk.FramesIdentified + Hk.FramesTracked == TEST_FRAMES);
   CHECK(Hk.ScrubPasses > 0);
+  CHECK(Events[STARCAT_APP_SWITCH_INF_EID] == 6);
   OS_printf("starcat_test: longest switch %lu us, longest tick with damage %lu us\n",
             (unsigned long)LongestSwitch_us, (unsigned long)LongestMend_us);
 }
