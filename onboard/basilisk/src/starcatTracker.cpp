@@ -49,7 +49,7 @@ struct StarcatTracker::Parts {
   std::unique_ptr<starcat::matcher> matcher;
   star_camera::Lens lens{};
   std::vector<star_camera::Star> sky;
-  star_camera::Random random{0};
+  star_camera::Random random{0}, drops{0};  // the same frames are dropped whatever is in them
   std::vector<Centroid> last;
 };
 
@@ -132,6 +132,7 @@ void StarcatTracker::Reset(uint64_t) {
     bskLogger.bskError("starcatTracker: call loadImage and setSky before the simulation starts");
   }
   parts->random = star_camera::Random(RNGSeed);
+  parts->drops = star_camera::Random(~static_cast<std::uint64_t>(RNGSeed));
 }
 
 void StarcatTracker::UpdateState(uint64_t now) {
@@ -147,7 +148,7 @@ void StarcatTracker::UpdateState(uint64_t now) {
 }
 
 bool StarcatTracker::isDropped(double time_s) {
-  bool dropped = parts->random.uniform() < droppedShare;
+  bool dropped = parts->drops.uniform() < droppedShare;
   for (std::size_t n = 0; n + 1 < outages.size(); n += 2) {
     dropped = dropped || (time_s >= outages[n] && time_s < outages[n + 1]);
   }
