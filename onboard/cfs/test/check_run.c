@@ -42,7 +42,7 @@ static int has_prior;
 static double prior_s;
 
 static unsigned answers, right, wrong, unanswered, extras, packets, hks, differences;
-static unsigned seen, identified, tracked, not_identified[6], errors;
+static unsigned seen, identified, tracked, not_identified[6], without_image, errors;
 static double worst_deg, worst_sigmas;
 
 static void differ(const char *what, unsigned long sequence) {
@@ -139,6 +139,13 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
                                (last_frame.Flags & 1) != 0 ? numbers[2] : NULL,
                                (last_frame.Flags & 2) != 0 ? numbers[3] : NULL};
   *steps = 0;
+  if (hk.ImageName[0] == '\0') {
+    *mode = STARCAT_APP_MODE_NONE;
+    result.n_matched = 0;
+    result.n_usable = 0;
+    result.reason = STARCAT_REASON_NONE;
+    return STARCAT_E_CRC;
+  }
   if ((hk.Tracking == 1) && has_prior && (fabs(now_s - prior_s) < age_s - 1e-6)) {
     const starcat_status status = starcat_track(image, &camera, &options, &frame, prior, prior_rad,
                                                 &work, &result);
@@ -173,7 +180,9 @@ static void compare_numbers(const attitude_out *out) {
 
 static void count(starcat_status status, uint8_t mode) {
   seen++;
-  if (status == STARCAT_IDENTIFIED) {
+  if (mode == STARCAT_APP_MODE_NONE) {
+    without_image++;
+  } else if (status == STARCAT_IDENTIFIED) {
     identified += mode == STARCAT_APP_MODE_IDENTIFY;
     tracked += mode == STARCAT_APP_MODE_TRACK;
   } else if ((status > 0) || (status == STARCAT_E_BUDGET)) {
@@ -229,7 +238,7 @@ static void take_hk(const uint8_t *payload) {
   hks++;
   if ((hk.FramesIn != seen) || (hk.FramesIdentified != identified) ||
       (hk.FramesTracked != tracked) || (hk.FrameErrors != errors) ||
-      (hk.FramesWithoutImage != 0u) ||
+      (hk.FramesWithoutImage != without_image) ||
       (memcmp(hk.FramesNotIdentified, not_identified, sizeof not_identified) != 0)) {
     differ("housekeeping", hk.FramesIn);
   }

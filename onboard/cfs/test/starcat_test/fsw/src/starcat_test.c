@@ -408,6 +408,27 @@ static void ScrubUntil(const uint32 *Counter, uint32 Wanted) {
   CHECK(*Counter == Wanted);
 }
 
+/* Neither image can be used: frames are answered with that, until one is loaded. */
+static void TestNoImage(STARCAT_APP_Data_t *App, size_t Blocks) {
+  for (size_t n = 0; n < Blocks; n++) {
+    Upset(App, n * BLOCK_BYTES + 600);
+  }
+  ScrubUntil(&Hk.DamageFound, 3);
+  CHECK(Events[STARCAT_APP_NO_IMAGE_ERR_EID] == 1);
+  CHECK(Hk.ImageStatus == STARCAT_E_CRC);
+  CHECK(Hk.ImageName[0] == 0);
+  FlyExtra(STARCAT_E_CRC);
+  CHECK(Attitude.Mode == STARCAT_APP_MODE_NONE);
+  CHECK(Hk.FramesWithoutImage == 1);
+  LoadImage("/cf/b.img", 0, true);
+  for (uint32 n = 0; (n < MOST_TICKS) && (Hk.LoadState != STARCAT_APP_LOAD_READY); n++) {
+    Wakeup();
+    AskHk();
+  }
+  Switch(TEST_IMAGE_B, true);
+  Fly(2, 5);
+}
+
 static void TestUpsets(void) {
   osal_id_t Module;
   cpuaddr Address = 0;
@@ -432,6 +453,7 @@ static void TestUpsets(void) {
   CHECK(Events[STARCAT_APP_FALLBACK_ERR_EID] == 1);
   CHECK(strcmp(Hk.ImageName, TEST_IMAGE_B) == 0);
   Fly(2, 10);
+  TestNoImage(App, Blocks);
   LoadPatch("/cf/big.img", false);
   LoadPatch("/cf/a.patch", true); /* for the other image */
   FlyUntilLoaded(2, STARCAT_APP_LOAD_FAILED);
@@ -492,7 +514,7 @@ static void Fly1000(void) {
   FlyTheRest();
   CHECK(Hk.FramesIdentified + Hk.FramesTracked == TEST_FRAMES);
   CHECK(Hk.ScrubPasses > 0);
-  CHECK(Events[STARCAT_APP_SWITCH_INF_EID] == 6);
+  CHECK(Events[STARCAT_APP_SWITCH_INF_EID] == 7);
   OS_printf("starcat_test: longest switch %lu us, longest tick with damage %lu us\n",
             (unsigned long)LongestSwitch_us, (unsigned long)LongestMend_us);
 }
