@@ -367,7 +367,7 @@ static void begin_at(starcat_call *call, const starcat_agreement *from, real m[9
 static void try_rivals(starcat_call *call) {
   starcat_workspace *w = call->work;
   find_rivals(call);
-  for (uint32_t n = 0; n < w->n_rivals; n++) {
+  for (uint32_t n = 0; (n < w->n_rivals) && (w->steps_left > 0u); n++) {
     real m[9];
     begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], w->rival_of[n], m);
