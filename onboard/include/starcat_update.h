@@ -1,12 +1,13 @@
 /* starcat onboard, beside the matcher: two places for images, one in use and one for its successor.
  *
- * An image comes in pieces of any size and order, is resumed after a break, and is used when it is
- * whole; the other one stays to fall back on. A damaged block is made anew from parity, which every
- * image of `starcat export` carries behind its last block: one block in 33. A patch makes the next
- * image of the one in use. docs/onboard-format.md describes every byte of both.
+ * An image comes in pieces of any size and order, goes on after a break, and is used when it is
+ * whole; the one before stays to fall back on. Behind an image that is whole its parity is written,
+ * one block for each 32, of which damaged blocks are made anew. A patch makes the next image of the
+ * one in use; docs/onboard-format.md describes every byte of it.
  *
- * Places are memory that can be written as memory is. Nothing here is called while a call of
- * starcat.h works in the place that it writes.
+ * Places are memory that can be written as memory is. No call of starcat.h may work in a place while
+ * one of these writes it: they write the place that is not in use, and starcat_start and
+ * starcat_mend damaged blocks of the one they are given.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -19,45 +20,57 @@
 extern "C" {
 #endif
 
-#define STARCAT_PIECE_BYTES 4096u /* of a block, the unit in which an image is checked */
+#define starcat_start STARCAT_SYMBOL(starcat_start)
+#define starcat_switch STARCAT_SYMBOL(starcat_switch)
 
-/* Two places. Set bytes and capacity, and the rest to 0 or to what was kept from before. */
+/* Two places. Set all of it before the first call: sizes and what is in use as they were kept, or
+ * 0. Calls change size, active and coming_crc, which are what to keep over a restart. */
 typedef struct {
   uint8_t *bytes[2];   /* each at a multiple of 8 */
-  size_t capacity;     /* bytes of a place */
-  size_t size[2];      /* bytes of the image in a place, with its parity; 0: none */
+  size_t capacity;     /* of a place: largest image and its parity */
+  size_t size[2];      /* of the image in a place, without its parity; 0: none */
   uint32_t active;     /* the place in use, 0 or 1 */
+  uint32_t coming_crc; /* of the image that is being received; 0: not stated, or none */
 } starcat_places;
 
-/* Open an image: the one of the active place, or, where that cannot be used and its parity does not
- * mend it, the other one, which then is the active one. The status of the active one is returned if
- * neither can be used. Called at the start, and after damage was found. */
+/* Bytes of the parity of an image of `size` bytes. */
+size_t starcat_parity_bytes(size_t size);
+
+/* Open the image of the active place, of the other one if the active one cannot be used; that one
+ * is the active one then. Damaged blocks are mended before. If neither can be used: the status of
+ * the one that was active. Called at the start, and after starcat_scrub found damage. */
 starcat_status starcat_start(starcat_places *places, starcat_image *image);
 
-/* Prepare the other place for an image of `size` bytes, parity included. What is there stays, so
- * that a transfer that was broken off goes on. STARCAT_E_SHORT: the place is too small. */
-starcat_status starcat_receive(starcat_places *places, size_t size);
+/* Prepare the other place for an image of `size` bytes. What is there stays, so that a transfer
+ * that was broken off goes on. `crc` is the number that is 8 bytes before the end of the image, the
+ * CRC-32 of all of its data, by which it is told from others; 0: not stated.
+ * STARCAT_E_SHORT: the place is too small. STARCAT_E_LAYOUT: no image has so many bytes. */
+starcat_status starcat_receive(starcat_places *places, size_t size, uint32_t crc);
 
-/* Write a piece at `offset` of the image that is received. */
+/* Write `count` bytes at `offset` of the image that is received. STARCAT_E_SHORT: beyond its end. */
 starcat_status starcat_put(starcat_places *places, size_t offset, const uint8_t *bytes,
                            size_t count);
 
-/* Find the next block, from `first` on, that has not been received whole: its number, or the number
- * of blocks if there is none. Blocks of checks come first, as they tell of the others. */
+/* Find a block of 4096 bytes that has not been received whole: one of the check blocks at the end
+ * of the image, by which the others are told, else the first from `first` on. STARCAT_E_CRC: there
+ * is one, its number in `block`. STARCAT_IDENTIFIED: there is none. */
 starcat_status starcat_missing(const starcat_places *places, uint32_t first, uint32_t *block);
 
 /* Open the image of the other place, every block checked, and make that place the active one. If it
- * cannot be used its status is returned and nothing changes. Called again, it falls back. */
+ * cannot be used nothing changes but `image`, which has to be opened again by starcat_start. Called
+ * once more it falls back. */
 starcat_status starcat_switch(starcat_places *places, starcat_image *image);
 
-/* Make damaged blocks of an image of exactly `size` bytes anew from its parity. `n_mended` counts
- * blocks that were written; STARCAT_E_CRC: some cannot be mended, and are as they were.
- * STARCAT_E_SHORT: the image has no parity. */
+/* Make damaged blocks of an image of exactly `size` bytes, behind which is room for its parity,
+ * anew from the parity; write the parity if no block is damaged then. `n_mended` counts blocks of
+ * the image that were written. STARCAT_E_CRC: some cannot be mended, and are as they were. */
 starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended);
 
-/* Make the next image, in the other place, of the active one and a patch of `starcat export
- * --patch-from`. STARCAT_E_VERSION: the patch is not for the active image. */
-starcat_status starcat_patch(starcat_places *places, const uint8_t *patch, size_t size);
+/* Make the next image in the other place, of the active one and a patch of `starcat export
+ * --patch-from`, which begins at a multiple of 4; starcat_switch takes it into use.
+ * STARCAT_E_VERSION: the patch is for another image, or another version of the format.
+ * STARCAT_E_LAYOUT, STARCAT_E_CRC: it is damaged, or the active image is. */
+starcat_status starcat_patch(starcat_places *places, const void *patch, size_t size);
 
 #ifdef __cplusplus
 }

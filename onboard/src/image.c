@@ -11,7 +11,6 @@
 #define SECTION_ALIGNMENT 64u
 #define MANIFEST_AT 128u
 #define NAME_AT 160u
-#define OWN_AT 4092u
 #define MOST_EXPONENT (1023u + 40u)
 #define OUT_OF_RANGE R(1e13)
 
@@ -38,7 +37,7 @@ static real f64_at(const uint8_t *bytes, size_t offset) {
 }
 
 /* CRC-32 of zlib, PNG and Ethernet, four bits at a time. */
-static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
+uint32_t starcat_crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
   static const uint32_t table[16] = {
       0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
       0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
@@ -90,22 +89,22 @@ static starcat_status check_start(const void *bytes, size_t size) {
 }
 
 /* A check block is damaged if the CRC of its own bytes is not its last four. */
-static int is_sound(const uint8_t *block) {
-  return crc32(0, block, OWN_AT) == u32_at(block, OWN_AT);
+int starcat_is_sound(const uint8_t *block) {
+  return starcat_crc32(0, block, STARCAT_OWN_AT) == u32_at(block, STARCAT_OWN_AT);
 }
 
-static int block_is_sound(const uint8_t *image, uint32_t data, uint32_t block) {
+int starcat_block_is_sound(const uint8_t *image, uint32_t data, uint32_t block) {
   const uint32_t blocks = data / STARCAT_BLOCK_BYTES;
   const uint8_t *at = image + (size_t)block * STARCAT_BLOCK_BYTES;
   if (block >= blocks) {
-    return is_sound(at);
+    return starcat_is_sound(at);
   }
   const uint8_t *check =
       image + data + (size_t)(block / STARCAT_CRCS_OF_BLOCK) * STARCAT_BLOCK_BYTES;
   /* Where the check block itself is damaged it is the one to be named, not this one. */
-  return (crc32(0, at, STARCAT_BLOCK_BYTES) ==
+  return (starcat_crc32(0, at, STARCAT_BLOCK_BYTES) ==
           u32_at(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK))) ||
-         !is_sound(check);
+         !starcat_is_sound(check);
 }
 
 starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count,
@@ -125,7 +124,7 @@ starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uin
                            ? blocks
                            : first + count;
   for (uint32_t block = first; block < end; block++) {
-    if (!block_is_sound(image, data, block)) {
+    if (!starcat_block_is_sound(image, data, block)) {
       *bad_block = block;
       return STARCAT_E_CRC;
     }

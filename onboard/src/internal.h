@@ -19,6 +19,8 @@
 #define STARCAT_HEADER_BYTES 512u
 #define STARCAT_BLOCK_BYTES 4096u
 #define STARCAT_CRCS_OF_BLOCK 1022u
+#define STARCAT_WHOLE_AT 4088u /* of a check block: the CRC of all data, and its own */
+#define STARCAT_OWN_AT 4092u
 #define STARCAT_TRIANGLE 1u
 #define STARCAT_PYRAMID 2u
 #define STARCAT_RADIUS_OVERFLOW 65535u
@@ -130,6 +132,11 @@ static inline void starcat_rows_of(const starcat_image *image, uint32_t feature,
     }
   }
 }
+
+/* image.c */
+uint32_t starcat_crc32(uint32_t crc, const uint8_t *bytes, size_t count);
+int starcat_is_sound(const uint8_t *check_block);
+int starcat_block_is_sound(const uint8_t *image, uint32_t data_bytes, uint32_t block);
 
 /* frame.c */
 int starcat_are_finite(const real *numbers, uint32_t count);

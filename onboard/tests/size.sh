@@ -8,12 +8,14 @@ rm -rf "${out:?}"/*
 for source in src/*.c; do
   $ARM-gcc $FLAGS -Os -fcallgraph-info=su -c "$source" -o "$out/$(basename "$source" .c).o"
 done
-code=$($ARM-size "$out"/*.o | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }')
+code_of() { $ARM-size "$@" | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }'; }
+update=$(code_of "$out/update.o")
+code=$(($(code_of "$out"/*.o) - update))
 echo "size: code and constants of the library for ARM, -Os: $code bytes (at most 28672)"
+echo "size: of images in flight, update.c, besides: $update bytes"
 sh amalgamate.sh "$out/one"
 $ARM-gcc $FLAGS -Os -c "$out/one/starcat.c" -o "$out/one.out"
-echo "size: the same of the two-file library: $($ARM-size "$out/one.out" |
-  awk 'NR > 1 { print $1 + $2 + $3 }') bytes"
+echo "size: both in the two-file library: $(code_of "$out/one.out") bytes"
 cat >"$out/sizes.c" <<'END'
 #include "starcat.h"
 char workspace[sizeof(starcat_workspace)];
