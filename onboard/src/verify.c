@@ -233,8 +233,11 @@ static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
     starcat_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
+    if (!starcat_spend(w, w->n_near + w->count * (w->n_within + 1u))) {
+      return 0;
+    }
     matched = match(call, factor * call->reach_px);
-    if (!starcat_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
+    if (!starcat_spend(w, STEPS_OF_MATCH * matched)) {
       return 0;
     }
     if ((matched < STARCAT_MIN_STARS) || (is_as_before(w) && is_final)) {
@@ -367,8 +370,11 @@ static void begin_at(starcat_call *call, const starcat_agreement *from, real m[9
 static void try_rivals(starcat_call *call) {
   starcat_workspace *w = call->work;
   find_rivals(call);
-  for (uint32_t n = 0; (n < w->n_rivals) && (w->steps_left > 0u); n++) {
+  for (uint32_t n = 0; n < w->n_rivals; n++) {
     real m[9];
+    if (!starcat_spend(w, STEPS_OF_MATCH * w->found.n_matched)) {
+      return;
+    }
     begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], w->rival_of[n], m);
     judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
@@ -444,7 +450,7 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
-  uint32_t nearer[3];
+  uint32_t nearer[3] = {0};
   real attitude[9];
   for (uint32_t k = 0; k < 9u; k++) {
     attitude[k] = m[k];
@@ -456,7 +462,9 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   starcat_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
-  count_nearer(call, nearer);
+  if (count >= STARCAT_MIN_STARS) {
+    count_nearer(call, nearer);
+  }
   if (found->log_chance < R(0.0)) {
     try_rivals(call);
   }

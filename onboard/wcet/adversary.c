@@ -7,18 +7,20 @@
 enum { SEED = 0, LENS = 4, FOCAL, TOLERANCE, NOISE, NOISE_MAG, FOV, CHANCE, STEPS, MAGNITUDES, COUNT,
        KIND, TRACK, PRIOR, SPACING, ORDER, FALSE_SPOTS };
 #define N_KINDS 9u
+#define DEFAULT_STEPS 255u /* a gene of ordinary frames alone, as it takes long */
 
 void adversary_draw(uint64_t *state, int is_ordinary, uint8_t genes[N_GENES]) {
   for (uint32_t n = 0; n < N_GENES; n++) {
     genes[n] = (uint8_t)(256.0 * sky_uniform(state));
   }
+  genes[STEPS] = (uint8_t)(genes[STEPS] % 8u);
   if (is_ordinary) {
     genes[LENS] = 1;
     genes[FOCAL] = 0;
     genes[TOLERANCE] = 107; /* 2 px */
     genes[FOV] = 0;
     genes[CHANCE] = 0;
-    genes[STEPS] = 7;
+    genes[STEPS] = DEFAULT_STEPS;
     genes[KIND] = 0;
     genes[PRIOR] = 2;
     genes[ORDER] = 0;
@@ -33,6 +35,7 @@ void adversary_mutate(uint64_t *state, uint8_t genes[N_GENES]) {
     const double step = sky_uniform(state) < 0.5 ? 256.0 : 6.0;
     genes[which] = (uint8_t)((double)genes[which] + 256.0 + step * (sky_uniform(state) - 0.5));
   }
+  genes[STEPS] = (uint8_t)(genes[STEPS] % 8u);
 }
 
 /* The camera and the options. */
@@ -62,7 +65,9 @@ static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state
   o->noise_mag = (starcat_real)noises_mag[g[NOISE_MAG] % 4u];
   o->fov_error = (starcat_real)fov_errors[g[FOV] % 8u];
   o->log_chance = (starcat_real)chances[g[CHANCE] % 4u];
-  o->max_steps = 250u << (g[STEPS] % 8u);
+  if (g[STEPS] != DEFAULT_STEPS) {
+    o->max_steps = 250u << (g[STEPS] % 8u);
+  }
   made->is_tracked = g[TRACK] % 4u == 0u;
   made->uncertainty_rad = (starcat_real)(0.0025 * exp2(g[PRIOR] % 8u));
   made->has_magnitudes = g[MAGNITUDES] % 4u != 0u;

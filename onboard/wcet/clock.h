@@ -12,7 +12,7 @@
 static inline void clock_start(void) {}
 static inline uint64_t clock_now(void) {
   uint64_t count;
-  __asm volatile("csrr %0, instret" : "=r"(count));
+  __asm__ volatile("csrr %0, instret" : "=r"(count));
   return count;
 }
 #elif defined(__arm__)

@@ -2,9 +2,10 @@
  * they took: ordinary frames, random adversarial ones, and a search for worse ones, which changes
  * the worst so far.
  *
- *   KIND ID instructions steps status flags genes
+ *   KIND NUMBER instructions steps status flags genes
  *
- * KIND is o, r or s; flags: 1 lens, 2 focal length sought, 4 crowded, 8 tracked, 16 pyramids.
+ * KIND is o, r or s; flags: 1 lens, 2 focal length sought, 4 crowded, 8 tracked, 16 pyramids, 32
+ * magnitudes.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -36,13 +37,15 @@ static uint32_t flags_of(void) {
   return (uint32_t)((made.camera.k1 != (starcat_real)0.0 ? 1 : 0) |
                     (made.options.fov_error > (starcat_real)0.0 ? 2 : 0) |
                     ((result.n_usable > 32u) && !work.has_magnitudes ? 4 : 0) |
-                    (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0));
+                    (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0) |
+                    (work.has_magnitudes ? 32 : 0));
 }
 
 /* Make a call and print it. Returns instructions for a step. */
 static double measure(char kind, unsigned id, const uint8_t *genes) {
   adversary_make(&image, genes, &made);
   memset(&result, 0, sizeof result);
+  work.has_magnitudes = 0;
   const uint64_t before = clock_now();
   const starcat_status status = adversary_call(&image, &made, &work, &result);
   const uint64_t took = clock_now() - before + CLOCK_STEP;
@@ -76,10 +79,28 @@ static int measure_open(void) {
   const uint64_t opened = clock_now();
   (void)starcat_scrub(image_begin, size, 1, 1, &bad);
   const uint64_t scrubbed = clock_now();
-  (void)printf("open %llu blocks %lu\nscrub %llu\n", (unsigned long long)(opened - start + CLOCK_STEP),
+  (void)printf("open %llu blocks: %lu\nscrub %llu\n", (unsigned long long)(opened - start + CLOCK_STEP),
                (unsigned long)(image.total_bytes / 4096u),
                (unsigned long long)(scrubbed - opened + CLOCK_STEP));
   return status == STARCAT_IDENTIFIED;
+}
+
+/* An attitude of pairs that are far apart and do not agree, so that it is refined to the end. */
+static void measure_attitude(void) {
+  static starcat_real body[STARCAT_MAX_CENTROIDS][3], icrs[STARCAT_MAX_CENTROIDS][3];
+  starcat_real q[4];
+  uint64_t state = SEED;
+  for (uint32_t n = 0; n < STARCAT_MAX_CENTROIDS; n++) {
+    for (uint32_t k = 0; k < 3u; k++) {
+      body[n][k] = (starcat_real)(2.0 * sky_uniform(&state) - 1.0);
+      icrs[n][k] = (starcat_real)(2.0 * sky_uniform(&state) - 1.0);
+    }
+  }
+  const uint64_t before = clock_now();
+  (void)starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs,
+                         STARCAT_MAX_CENTROIDS, q);
+  (void)printf("attitude %llu pairs: %u\n", (unsigned long long)(clock_now() - before + CLOCK_STEP),
+               STARCAT_MAX_CENTROIDS);
 }
 
 int main(void) {
@@ -89,6 +110,7 @@ int main(void) {
     (void)printf("the image is not opened\n");
     return 2;
   }
+  measure_attitude();
   for (unsigned n = 0; n < FRAMES / 10u; n++) {
     adversary_draw(&state, 1, genes);
     (void)measure('o', n, genes);
