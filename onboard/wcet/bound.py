@@ -73,7 +73,7 @@ class Case:
 def parse(counts: str) -> Form:
     """Events and expressions of a cell: "try 3; iteration 4*matched"."""
     parts = (part.strip().split(" ", 1) for part in counts.split(";"))
-    return Form({(event, expression): 1 for event, expression in parts})
+    return Form((event, expression) for event, expression in parts)
 
 
 class Counts:

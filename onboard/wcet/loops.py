@@ -13,7 +13,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 SOURCE = HERE.parent / "src"
 TABLE = HERE / "loops.md"
-FUNCTION = re.compile(r"^[A-Za-z_][\w\s*()]*?\b(\w+)\((?!.*;\s*$)")
+FUNCTION = re.compile(r"^[A-Za-z_][^;{}#=]*?\b(\w+)\([^;{}]*\)\s*\{", re.MULTILINE)
 LOOP = re.compile(r"\b(?:for|while) ?\(")
 
 
@@ -61,7 +61,7 @@ def end_of(text: str, at: int, opening: str, closing: str) -> int:
 
 def read_file(path: Path, source: Source) -> None:
     text = without_comments(path.read_text(encoding="utf-8"))
-    for head in re.finditer(r"^[A-Za-z_][^;{}#=]*?\b(\w+)\([^;{}]*\)\s*\{", text, re.MULTILINE):
+    for head in FUNCTION.finditer(text):
         start = text.index("{", head.start())
         stop = end_of(text, start, "{", "}")
         name = head[1]
@@ -75,9 +75,7 @@ def read_file(path: Path, source: Source) -> None:
             last = end_of(text, opening.end() - 1, "{", "}")
             numbers = [text.count("\n", 0, at) + 1 for at in (found.start(), close, last)]
             told = " ".join(text[found.start() : close].split())
-            source.loops.append(
-                Loop(path.name, name, told, numbers[0], numbers[1] + 1, numbers[2])
-            )
+            source.loops.append(Loop(path.name, name, told, numbers[0], numbers[1] + 1, numbers[2]))
 
 
 def read_source(folder: Path = SOURCE) -> Source:

@@ -57,7 +57,8 @@ def read_calls(path: Path) -> tuple[list[Call], dict[str, list[int]]]:
                 has_lens=bool(flags & 1),
                 has_magnitudes=bool(flags & 32),
             )
-            calls.append(Call(words[0], *map(int, words[1:5]), case, words[6]))
+            number, took, steps, status = map(int, words[1:5])
+            calls.append(Call(words[0], number, took, steps, status, case, words[6]))
         elif words:
             others[words[0]] = [int(word) for word in words[1:] if word.isdecimal()]
     if "done" not in others:
