@@ -53,7 +53,7 @@ starcat_status starcat_put(starcat_places *places, size_t offset, const uint8_t 
 
 /* Find a block of 4096 bytes that has not been received whole: one of the check blocks at the end
  * of the image, by which the others are told, else the first from `first` on. STARCAT_E_CRC: there
- * is one, its number in `block`. STARCAT_IDENTIFIED: there is none. */
+ * is one, its number in `block`. STARCAT_IDENTIFIED: there is none, and `block` is their number. */
 starcat_status starcat_missing(const starcat_places *places, uint32_t first, uint32_t *block);
 
 /* Open the image of the other place, every block checked, and make that place the active one. If it

@@ -71,16 +71,15 @@ static void part_of(const blocks_of_image *image, uint32_t block, uint32_t at,
 
 /* Whether a block would be sound as its group has it. */
 static int would_be_sound(const blocks_of_image *image, uint32_t block) {
-  const int is_check = block >= image->data;
+  const uint32_t last = block < image->data ? CHUNK : CHUNK - 4u; /* bytes that a CRC is of */
   uint64_t part[CHUNK / 8u];
   uint8_t *bytes = (uint8_t *)part;
   uint32_t crc = 0;
   for (uint32_t at = 0; at < STARCAT_BLOCK_BYTES; at += CHUNK) {
     part_of(image, block, at, bytes);
-    const int at_end = at == STARCAT_BLOCK_BYTES - CHUNK;
-    crc = starcat_crc32(crc, bytes, is_check && at_end ? CHUNK - 4u : CHUNK);
+    crc = starcat_crc32(crc, bytes, at < STARCAT_BLOCK_BYTES - CHUNK ? CHUNK : last);
   }
-  if (is_check) {
+  if (block >= image->data) {
     return crc == u32_of(bytes, CHUNK - 4u);
   }
   const uint8_t *check = block_at(image, image->data + block / STARCAT_CRCS_OF_BLOCK);
@@ -114,11 +113,11 @@ starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended) {
   for (uint32_t n = 0; n < image.blocks; n++) {
     const uint32_t block = (n + image.data) % image.blocks; /* check blocks first */
     if (!is_sound(&image, block)) {
-      if (would_be_sound(&image, block)) {
+      if (!would_be_sound(&image, block)) {
+        left++;
+      } else {
         write_block(&image, block);
         *n_mended += 1u;
-      } else {
-        left++;
       }
     }
   }
@@ -158,9 +157,6 @@ static starcat_status use_place(const starcat_places *places, uint32_t place,
   }
   if (status == STARCAT_IDENTIFIED) {
     status = starcat_open(image, places->bytes[place], places->size[place], STARCAT_SKIP_CRC);
-  }
-  if ((status == STARCAT_IDENTIFIED) && (image->total_bytes != places->size[place])) {
-    status = STARCAT_E_LAYOUT;
   }
   return status;
 }
@@ -228,18 +224,21 @@ starcat_status starcat_missing(const starcat_places *places, uint32_t first, uin
   if (!lay_out(places->bytes[other], places->size[other], &image)) {
     return STARCAT_E_LAYOUT;
   }
-  for (*block = image.data; *block < image.blocks; *block += 1u) {
-    const uint8_t *check = block_at(&image, *block);
+  for (uint32_t n = image.data; n < image.blocks; n++) {
+    const uint8_t *check = block_at(&image, n);
     if (!starcat_is_sound(check) || ((places->coming_crc != 0u) &&
                                      (u32_of(check, STARCAT_WHOLE_AT) != places->coming_crc))) {
+      *block = n;
       return STARCAT_E_CRC;
     }
   }
-  for (*block = first; *block < image.data; *block += 1u) {
-    if (!is_sound(&image, *block)) {
+  for (uint32_t n = first; n < image.data; n++) {
+    if (!is_sound(&image, n)) {
+      *block = n;
       return STARCAT_E_CRC;
     }
   }
+  *block = image.blocks;
   return STARCAT_IDENTIFIED;
 }
 
@@ -269,13 +268,18 @@ typedef struct {
   uint32_t n_runs;
 } patching;
 
-enum { LITERAL, COPY, RENUMBER_16, RENUMBER_32, ADD_16, ADD_32, ZEROS };
+/* Kinds of steps; 2 to 5 are numbers of two bytes, of four, of two, of four. */
+#define LITERAL 0u
+#define COPY 1u
+#define ADD_16 4u
+#define ZEROS 6u
 
 /* The next number, seven bits a byte, the lowest first; 0 beyond the end of the patch. */
 static uint32_t next_number(patching *patch) {
   uint32_t number = 0, bits = 0, byte = 0x80;
   while ((byte >= 0x80u) && (bits < 32u) && (patch->next < patch->end)) {
-    byte = *patch->next++;
+    byte = *patch->next;
+    patch->next += 1;
     number |= (byte & 0x7fu) << bits;
     bits += 7u;
   }
@@ -368,7 +372,7 @@ static int apply_step(patching *patch) {
     }
     if (kind == COPY) {
       copy(patch, patch->old + patch->old_at, bytes);
-    } else if (kind < (uint32_t)ADD_16) {
+    } else if (kind < ADD_16) {
       renumber(patch, count, width);
     } else {
       add(patch, count, width);

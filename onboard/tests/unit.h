@@ -57,5 +57,6 @@ void test_rare(void);
 void test_answer(void);
 void test_crowded(void);
 void test_scale(void);
+void test_update(void);
 
 #endif

@@ -86,6 +86,9 @@ def verify(
     against: Annotated[
         Path | None, typer.Option(help="The database that an onboard image should be of.")
     ] = None,
+    trust: Annotated[
+        Path | None, typer.Option(help="Public key that has to have signed an onboard image.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Check a database or an onboard image: digests, contents, orders, indices, references.
@@ -97,9 +100,10 @@ def verify(
     if artifact.is_file():
         from starcat.exchange.onboard import verify_image
 
-        found = verify_image(artifact, against)
-    elif against is not None:
-        raise ConfigError(f"--against is for an onboard image; {artifact} is none", key="against")
+        found = verify_image(artifact, against, trust)
+    elif against is not None or trust is not None:
+        name = "against" if against is not None else "trust"
+        raise ConfigError(f"--{name} is for an onboard image; {artifact} is none", key=name)
     else:
         from starcat.artifact.verify import verify_artifact
 

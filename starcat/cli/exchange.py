@@ -48,6 +48,22 @@ OutputPath = Annotated[
 MaxPartitionRows = Annotated[
     int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
 ]
+Method = Annotated[
+    str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+]
+Endian = Annotated[
+    str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
+]
+MaxBytes = Annotated[
+    int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
+]
+Sign = Annotated[
+    list[Path] | None, typer.Option(help="onboard, c: key to sign the image with. Repeatable.")
+]
+PatchFrom = Annotated[
+    Path | None,
+    typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
+]
 
 
 @app.command()
@@ -63,32 +79,29 @@ def export(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
     max_partition_rows: MaxPartitionRows = None,
-    method: Annotated[
-        str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
-    ] = None,
-    endian: Annotated[
-        str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
-    ] = None,
-    max_bytes: Annotated[
-        int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
-    ] = None,
+    method: Method = None,
+    endian: Endian = None,
+    max_bytes: MaxBytes = None,
+    patch_from: PatchFrom = None,
+    sign: Sign = None,
     json: Json = False,
 ) -> None:
     """Write tables for other tools, an image for flight software, or other solvers' databases.
 
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
-    of_images: dict[str, Any] = {"method": method, "endian": endian, "max_bytes": max_bytes}
+    of_images: dict[str, Any] = {
+        "method": method,
+        "endian": endian,
+        "max_bytes": max_bytes,
+        "patch_from": patch_from,
+        "sign": sign,
+    }
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
-        from starcat.exchange.onboard import export_image
-
         _refuse(form, of_tables | of_hats)
-        given = {name: value for name, value in of_images.items() if value is not None}
-        image = export_image(_named(source), form, output, replace=replace, **given)
-        _say_left_out(image)
-        show(json, image.as_dict(), print_exported_image, image)
+        _for_flight(_named(source), form, output, {**of_images, "replace": replace}, json)
         return
     if form in SOLVER_FORMATS:
         _refuse(form, of_tables | of_hats | of_images)
@@ -110,6 +123,17 @@ def export(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _for_flight(
+    database: Path, form: str, output: Path | None, options: Mapping[str, Any], json: bool
+) -> None:
+    from starcat.exchange.onboard import export_image
+
+    given = {name: value for name, value in options.items() if value is not None}
+    image = export_image(database, form, output, **given)
+    _say_left_out(image)
+    show(json, image.as_dict(), print_exported_image, image)
 
 
 def _for_solver(
@@ -191,15 +215,26 @@ def print_exported_image(exported: ExportedImage) -> None:
         ("method, byte order", f"{method}, {exported.byte_order}-endian"),
         ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
-        ("image", f"{len(exported.made.data):,} bytes"),
+        ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
+        *_patch_rows(exported),
+        *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
 
 
+def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
+    size = exported.patch_bytes
+    if size is None:
+        return []
+    share = 100.0 * size / len(exported.made.data)
+    return [("patch", f"{size:,} bytes, {share:.1f} % of the image")]
+
+
 def print_image(image: OnboardImage) -> None:
     """Print what an image holds."""
     from starcat.onboard.layout import DIRECTION_SCALE
+    from starcat.onboard.signature import image_signatures
 
     header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
     facts = {
@@ -211,8 +246,11 @@ def print_image(image: OnboardImage) -> None:
         _features(image.method): f"{header['n_features']:,}",
         "quantum": f"{arcsec:.2g} arcsec, 0.001 mag",
         "manifest": f"sha256 {image.manifest_sha256}",
-        "image": f"{len(image.data):,} bytes",
+        "image": f"{len(image.data):,} bytes, CRC-32 0x{image.crc:08x}",
     }
+    signers = image_signatures(image.data, image.byte_order)
+    if signers:
+        facts["signed by"] = ", ".join(one.public_key.hex() for one in signers)
     print_facts(image.name, facts)
     sections = [
         (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()

@@ -28,6 +28,7 @@ from starcat.cli import (
     exchange,
     fetching,
     interrupts,
+    keys,
     learning,
     matching,
     releases,
@@ -55,7 +56,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, fetching, bands, specs, builds, artifacts, sql, exchange),
-    *(releases, matching, learning, evaluation, serving),
+    *(releases, keys, matching, learning, evaluation, serving),
 ):
     app.add_typer(part.app)
 

@@ -11,7 +11,7 @@ PANELS = {
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
     "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),
-    "Ship it": ("export", "publish", "pull", "releases"),
+    "Ship it": ("export", "publish", "pull", "releases", "keys"),
     "Serve it": ("serve", "token"),
 }
 """The commands in the order of --help."""

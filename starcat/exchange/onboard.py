@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,21 @@ from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
-from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder
-from starcat.onboard.reading import bytes_of_file, read_image
+from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder, crc_of
+from starcat.onboard.patching import apply_patch, make_patch
+from starcat.onboard.reading import OnboardImage, bytes_of_file, read_image
 from starcat.onboard.shrink import Shrunk, shrink
+from starcat.onboard.signature import (
+    MAX_ADDED_BYTES,
+    image_signatures,
+    sign_image,
+    signature_problems,
+)
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import whole_file
+from starcat.storage.keys import raw_public, read_private, read_public
 
 
 @dataclass(frozen=True)
@@ -36,8 +45,15 @@ class ExportedImage:
     made: MadeImage
     fitted: Shrunk  # what is in it, and what was left out
     file_format: str
-    byte_order: str
-    files: tuple[Path, ...]  # the image, or source and header
+    byte_order: ByteOrder
+    files: tuple[Path, ...]  # the image, or source and header; then the patch
+    signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
+    patch_bytes: int | None = None  # of the patch, if one was asked for
+
+    @property
+    def crc(self) -> int:
+        """CRC-32 of all data, which flight software is told of a new image."""
+        return crc_of(self.made.data, self.byte_order)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -49,12 +65,15 @@ class ExportedImage:
             "endian": self.byte_order,
             "files": [str(path) for path in self.files],
             "image_bytes": len(self.made.data),
+            "crc": self.crc,
+            "patch_bytes": self.patch_bytes,
             "stars": fitted.stars,
             "stars_in_artifact": fitted.stars_before,
             "stars_per_field": fitted.stars_per_field,
             "features": fitted.features,
             "features_without_limit": fitted.features_before,
             "most_near": self.made.most_near,
+            "signed_by": list(self.signed_by),
         }
 
 
@@ -66,10 +85,16 @@ def export_image(
     method: str = "triangle",
     endian: str = "little",
     max_bytes: int | None = None,
+    patch_from: Path | None = None,
     replace: bool = False,
+    sign: Sequence[Path] = (),
 ) -> ExportedImage:
-    """Write the onboard image of a database."""
+    """Write the onboard image of a database, signed with the keys of some files.
+
+    With `patch_from`, an older image, the patch that makes the new one of it is beside it.
+    """
     check_method(method)
+    keys = [read_private(Path(path)) for path in sign]
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
         raise ConfigError(
@@ -80,17 +105,34 @@ def export_image(
     target = output or Path(f"{_name(opened)}{suffix}")
     if file_format == "c" and target.suffix != ".c":
         raise ConfigError(f"--output {target}: C source has a name that ends with .c", key="output")
+    if file_format == "c" and patch_from is not None:
+        raise ConfigError("--patch-from means nothing with --to c; leave it out", key="patch_from")
+    old = None if patch_from is None else read_image(Path(patch_from))
     if target.is_dir():
         raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
-    fitted = shrink(contents, _times_seen(opened, method), partial(_fields, opened), max_bytes)
+    room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
+    fitted = shrink(contents, _times_seen(opened, method), partial(_fields, opened), room)
     made = make_image(fitted.contents, order)
+    made = changed(made, data=sign_image(made.data, order, keys))
     files = {target: made.data}
     if file_format == "c":
         files = _c_files(made, fitted.contents.name, target, order)
+    patch = None if old is None else _checked_patch(old, read_image(made.data))
+    if patch is not None:
+        files[target.with_suffix(".patch")] = patch
     _write(files, replace=replace)
-    return ExportedImage(made, fitted, file_format, order, tuple(files))
+    signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
+    size = None if patch is None else len(patch)
+    return ExportedImage(made, fitted, file_format, order, tuple(files), signed_by, size)
+
+
+def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:
+    patch = make_patch(old, new)
+    if apply_patch(old.data, patch) != new.data:
+        raise OnboardImageError(f"the patch from {old.name} does not make {new.name}: report this")
+    return patch
 
 
 def contents_of(artifact: Artifact, method: str) -> Contents:
@@ -113,15 +155,19 @@ def contents_of(artifact: Artifact, method: str) -> Contents:
     )
 
 
-def verify_image(path: Path, against: Path | None = None) -> Verification:
-    """Check an onboard image: its blocks, its parts, and what its database says."""
+def verify_image(
+    path: Path, against: Path | None = None, trust: Path | None = None
+) -> Verification:
+    """Check an onboard image: its blocks, its parts, its signatures, what its database says."""
+    key = None if trust is None else raw_public(read_public(trust))
     artifact = None if against is None else check_artifact(against)
     data = bytes_of_file(path)
     checks, findings = 1, list(_damage(data, path.name))
     if not findings:
         image = read_image(data)
         problems = [*value_problems(image), *capacity_problems(image)]
-        checks += 5
+        problems += signature_problems(image, key)
+        checks += 5 + len(image_signatures(data, image.byte_order)) + (key is not None)
         if artifact is not None:
             problems += artifact_problems(image, contents_of(artifact, image.method))
             checks += 7

@@ -180,6 +180,12 @@ def data_blocks(size_bytes: int) -> int:
     return blocks - -(-blocks // (CRCS_PER_BLOCK + 1))
 
 
+def crc_of(image: bytes, byte_order: ByteOrder) -> int:
+    """Return the CRC-32 of all data of an image, by which it is told from others."""
+    at = len(image) - BLOCK_BYTES + _AT_WHOLE
+    return int.from_bytes(image[at : at + 4], byte_order)
+
+
 def has_check_blocks(image: bytes) -> bool:
     """Return whether bytes end with at least one check block that is whole."""
     return len(image) % BLOCK_BYTES == 0 and any(_sound_checks(image).values())

@@ -39,9 +39,15 @@ class OnboardImage:
     camera: Camera  # the camera that it was built for
     header: Mapping[str, int | float]  # the numbers of the header by name
     sections: Mapping[str, NDArray[Any]]  # the sections by name, in the byte order of the image
+    offsets: Mapping[str, int]  # where each section begins
 
     def __repr__(self) -> str:
         return f"<OnboardImage {self.name}: {self.method}, {len(self.data):,} bytes>"
+
+    @property
+    def crc(self) -> int:
+        """CRC-32 of all data, by which the onboard library tells images apart."""
+        return layout.crc_of(self.data, self.byte_order)
 
     @property
     def version(self) -> str:
@@ -77,6 +83,7 @@ class OnboardImage:
             "byte_order": self.byte_order,
             "method": self.method,
             "manifest_sha256": self.manifest_sha256,
+            "crc": self.crc,
             "header": {name: self.header[name] for name in self.header if name != "byte_order"},
             "sections": {
                 name: {"rows": len(part), "bytes": part.nbytes}
@@ -111,7 +118,9 @@ def read_image(source: bytes | Path) -> OnboardImage:
     sizes = sizes_of(header)
     for problem in section_problems(table, sizes, int(header["data_bytes"])):
         raise _damaged(where, problem, path)
-    sections = _sections(data, table, sizes, byte_order)
+    kinds = {kind: name for name, kind in layout.KINDS.items()}
+    offsets = {kinds[int(e["kind"])]: int(e["offset"]) for e in table if int(e["kind"]) in kinds}
+    sections = _sections(data, offsets, sizes, byte_order)
     for problem in content_problems(header, sections):
         raise _damaged(where, problem, path)
     raw = np.frombuffer(data, layout.HEADER, 1)[0]
@@ -125,6 +134,7 @@ def read_image(source: bytes | Path) -> OnboardImage:
         camera=Camera(*size_px, float(header["focal_length_px"])),
         header=header,
         sections=sections,
+        offsets=offsets,
     )
 
 
@@ -198,12 +208,11 @@ def _check_version(header: Mapping[str, int | float], where: str) -> None:
 
 
 def _sections(
-    data: bytes, table: NDArray[Any], sizes: Sizes, byte_order: ByteOrder
+    data: bytes, offsets: Mapping[str, int], sizes: Sizes, byte_order: ByteOrder
 ) -> dict[str, NDArray[Any]]:
-    offsets = {int(entry["kind"]): int(entry["offset"]) for entry in table}
     return {
         name: np.frombuffer(
-            data, in_order(dtype, byte_order), math.prod(shape), offsets[layout.KINDS[name]]
+            data, in_order(dtype, byte_order), math.prod(shape), offsets[name]
         ).reshape(shape)
         for name, dtype, shape in sizes.sections()
     }

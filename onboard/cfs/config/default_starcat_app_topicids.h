@@ -1,0 +1,15 @@
+/* Topics, of which a processor makes its message identifiers.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#ifndef STARCAT_APP_TOPICIDS_H
+#define STARCAT_APP_TOPICIDS_H
+
+#define CFE_MISSION_STARCAT_APP_CMD_TOPICID          0x94
+#define CFE_MISSION_STARCAT_APP_SEND_HK_TOPICID      0x95
+#define CFE_MISSION_STARCAT_APP_WAKEUP_TOPICID       0x96
+#define CFE_MISSION_STARCAT_APP_HK_TLM_TOPICID       0x94
+#define CFE_MISSION_STARCAT_APP_ATTITUDE_TLM_TOPICID 0x95
+#define CFE_MISSION_STARCAT_APP_FRAME_TLM_TOPICID    0x96
+
+#endif

@@ -1,0 +1,213 @@
+/* Images: read at the start, scrubbed and loaded in idle time, a few blocks a tick, so that no frame
+ * waits for long.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "starcat_app.h"
+
+#include <string.h>
+
+#define HK (STARCAT_APP_Data.HkTlm.Payload)
+#define STARCAT_PIECE_BYTES 4096u /* of a block of an image, the unit in which it is checked */
+
+/* The two places, as words: images begin at a multiple of 8. */
+static uint64 Memory[2][STARCAT_APP_PLACE_BYTES / sizeof(uint64)];
+
+/* After a start, a switch or damage: what is known of the image in use. */
+void STARCAT_APP_ImageInUse(starcat_status Status) {
+  STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
+  Data->HasImage = Status == STARCAT_IDENTIFIED;
+  Data->HasPrior = false;
+  HK.ImageStatus = (int16)Status;
+  HK.ActivePlace = (uint8)Data->Places.active;
+  HK.ScrubBlock = 0;
+  HK.ImageBytes = 0;
+  memset(HK.ImageName, 0, sizeof HK.ImageName);
+  memset(HK.ImageDigest, 0, sizeof HK.ImageDigest);
+  if (Data->HasImage) {
+    HK.ImageBytes = (uint32)Data->Places.size[Data->Places.active];
+    memcpy(HK.ImageName, Data->Image.name, sizeof HK.ImageName);
+    memcpy(HK.ImageDigest, Data->Image.manifest_sha256, sizeof HK.ImageDigest);
+    if (HK.CameraSource == STARCAT_APP_CAMERA_OF_IMAGE) {
+      starcat_camera_of(&Data->Image, &Data->Camera);
+    }
+  }
+}
+
+static void EndLoad(uint8 State) {
+  (void)OS_close(STARCAT_APP_Data.LoadFile);
+  HK.LoadState = State;
+}
+
+/* Open the file of an image and prepare the other place for it. */
+CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc) {
+  os_fstat_t Found;
+  memset(&Found, 0, sizeof Found);
+  if (HK.LoadState == STARCAT_APP_LOAD_READING) {
+    EndLoad(STARCAT_APP_LOAD_FAILED);
+  }
+  int32 Status = OS_stat(Path, &Found);
+  if (Status == OS_SUCCESS) {
+    Status = OS_OpenCreate(&STARCAT_APP_Data.LoadFile, Path, OS_FILE_FLAG_NONE, OS_READ_ONLY);
+  }
+  if (Status != OS_SUCCESS) {
+    CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
+                      "STARCAT: %s cannot be opened, RC = %ld", Path, (long)Status);
+    return CFE_STATUS_EXTERNAL_RESOURCE_FAIL;
+  }
+  const starcat_status Fits = starcat_receive(&STARCAT_APP_Data.Places, Found.FileSize, Crc);
+  if (Fits != STARCAT_IDENTIFIED) {
+    EndLoad(STARCAT_APP_LOAD_FAILED);
+    CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
+                      "STARCAT: %lu bytes of %s are no image, or too many, status %d",
+                      (unsigned long)Found.FileSize, Path, (int)Fits);
+    return CFE_STATUS_VALIDATION_FAILURE;
+  }
+  HK.LoadState = STARCAT_APP_LOAD_READING;
+  HK.LoadBytes = 0;
+  HK.LoadSize = (uint32)Found.FileSize;
+  STARCAT_APP_Data.CheckBlock = 0;
+  CFE_EVS_SendEvent(STARCAT_APP_LOAD_INF_EID, CFE_EVS_EventType_INFORMATION,
+                    "STARCAT: %lu bytes of %s are being read", (unsigned long)HK.LoadSize, Path);
+  return CFE_SUCCESS;
+}
+
+/* Read a piece of the new image into its place. */
+static void ReadPiece(void) {
+  static uint8 Piece[STARCAT_PIECE_BYTES];
+  const int32 Count = OS_read(STARCAT_APP_Data.LoadFile, Piece, sizeof Piece);
+  starcat_status Status = STARCAT_E_SHORT;
+  if (Count > 0) {
+    Status = starcat_put(&STARCAT_APP_Data.Places, HK.LoadBytes, Piece, (size_t)Count);
+  }
+  if (Status != STARCAT_IDENTIFIED) {
+    EndLoad(STARCAT_APP_LOAD_FAILED);
+    CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
+                      "STARCAT: the new image cannot be read at byte %lu, RC = %ld, status %d",
+                      (unsigned long)HK.LoadBytes, (long)Count, (int)Status);
+    return;
+  }
+  HK.LoadBytes += (uint32)Count;
+  if (HK.LoadBytes >= HK.LoadSize) {
+    EndLoad(STARCAT_APP_LOAD_CHECKING);
+  }
+}
+
+/* Check some blocks of the new image: those of checks first, as they tell of the others. */
+static void CheckLoaded(void) {
+  STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
+  const uint32 Blocks = HK.LoadSize / STARCAT_PIECE_BYTES;
+  uint32_t Bad = 0;
+  starcat_status Status = starcat_missing(&Data->Places, Blocks, &Bad);
+  if (Status == STARCAT_IDENTIFIED) {
+    Status = starcat_scrub(Data->Places.bytes[1u - Data->Places.active], HK.LoadSize,
+                           Data->CheckBlock, Data->Config.ScrubBlocks, &Bad);
+  }
+  Data->CheckBlock += Data->Config.ScrubBlocks;
+  if (Status != STARCAT_IDENTIFIED) {
+    HK.LoadState = STARCAT_APP_LOAD_FAILED;
+    CFE_EVS_SendEvent(STARCAT_APP_REFUSED_ERR_EID, CFE_EVS_EventType_ERROR,
+                      "STARCAT: block %lu of the new image is damaged, status %d",
+                      (unsigned long)Bad, (int)Status);
+  } else if (Data->CheckBlock >= Blocks) {
+    HK.LoadState = STARCAT_APP_LOAD_READY;
+    CFE_EVS_SendEvent(STARCAT_APP_READY_INF_EID, CFE_EVS_EventType_INFORMATION,
+                      "STARCAT: the new image is whole");
+  }
+}
+
+/* Make damage of the image in use good from parity; where that cannot be, use the other image. */
+static void Repair(uint32 Block) {
+  starcat_places *Places = &STARCAT_APP_Data.Places;
+  const uint32 Active = Places->active;
+  uint32_t Mended = 0;
+  HK.DamageFound++;
+  starcat_status Status = starcat_mend(Places->bytes[Active], Places->size[Active], &Mended);
+  HK.BlocksMended += Mended;
+  if (Status == STARCAT_IDENTIFIED) {
+    CFE_EVS_SendEvent(STARCAT_APP_MENDED_INF_EID, CFE_EVS_EventType_INFORMATION,
+                      "STARCAT: block %lu was damaged, %lu blocks were mended",
+                      (unsigned long)Block, (unsigned long)Mended);
+    return;
+  }
+  Status = starcat_start(Places, &STARCAT_APP_Data.Image);
+  STARCAT_APP_ImageInUse(Status);
+  if (Status == STARCAT_IDENTIFIED) {
+    HK.FallBacks++;
+    CFE_EVS_SendEvent(STARCAT_APP_FALLBACK_ERR_EID, CFE_EVS_EventType_ERROR,
+                      "STARCAT: block %lu is damaged beyond its parity, place %u took over",
+                      (unsigned long)Block, (unsigned int)HK.ActivePlace);
+  } else {
+    CFE_EVS_SendEvent(STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
+                      "STARCAT: block %lu is damaged beyond its parity, no image is left, status %d",
+                      (unsigned long)Block, (int)Status);
+  }
+}
+
+static void Scrub(void) {
+  STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
+  const uint32 Active = Data->Places.active;
+  uint32_t Bad = 0;
+  const starcat_status Status =
+      starcat_scrub(Data->Places.bytes[Active], Data->Places.size[Active], HK.ScrubBlock,
+                    Data->Config.ScrubBlocks, &Bad);
+  if (Status != STARCAT_IDENTIFIED) {
+    Repair(Bad); /* the same blocks are checked again in the next tick */
+    return;
+  }
+  HK.ScrubBlock += Data->Config.ScrubBlocks;
+  if (HK.ScrubBlock >= Data->Image.total_bytes / STARCAT_PIECE_BYTES) {
+    HK.ScrubBlock = 0;
+    HK.ScrubPasses++;
+  }
+}
+
+/* A tick of idle time. */
+void STARCAT_APP_Wakeup(const STARCAT_APP_WakeupCmd_t *Msg) {
+  (void)Msg;
+  CFE_ES_PerfLogEntry(STARCAT_APP_SCRUB_PERF_ID);
+  if (HK.LoadState == STARCAT_APP_LOAD_CHECKING) {
+    CheckLoaded();
+  } else if (HK.LoadState == STARCAT_APP_LOAD_READING) {
+    for (uint32 n = 0; (n < STARCAT_APP_Data.Config.LoadPieces) &&
+                       (HK.LoadState == STARCAT_APP_LOAD_READING);
+         n++) {
+      ReadPiece();
+    }
+  } else if (STARCAT_APP_Data.HasImage) {
+    Scrub();
+  }
+  CFE_ES_PerfLogExit(STARCAT_APP_SCRUB_PERF_ID);
+}
+
+/* Read a file whole into the place that is not `Active` then. */
+static void ReadImage(const char *Path, uint32 Active) {
+  STARCAT_APP_Data.Places.active = Active;
+  if (STARCAT_APP_BeginLoad(Path, 0) != CFE_SUCCESS) {
+    return;
+  }
+  while (HK.LoadState == STARCAT_APP_LOAD_READING) {
+    ReadPiece();
+  }
+}
+
+/* Read the images of the start, and open the first one that can be used. */
+void STARCAT_APP_StartImages(void) {
+  starcat_places *Places = &STARCAT_APP_Data.Places;
+  os_fstat_t Found;
+  Places->bytes[0] = (uint8 *)Memory[0];
+  Places->bytes[1] = (uint8 *)Memory[1];
+  Places->capacity = sizeof Memory[0];
+  ReadImage(STARCAT_APP_IMAGE_FILE, 1);
+  if (OS_stat(STARCAT_APP_OTHER_IMAGE_FILE, &Found) == OS_SUCCESS) {
+    ReadImage(STARCAT_APP_OTHER_IMAGE_FILE, 0);
+  }
+  Places->active = 0;
+  HK.LoadState = STARCAT_APP_LOAD_NONE;
+  const starcat_status Status = starcat_start(Places, &STARCAT_APP_Data.Image);
+  STARCAT_APP_ImageInUse(Status);
+  if (Status != STARCAT_IDENTIFIED) {
+    CFE_EVS_SendEvent(STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
+                      "STARCAT: no image can be used, status %d", (int)Status);
+  }
+}

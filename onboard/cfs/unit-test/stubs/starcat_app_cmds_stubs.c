@@ -1,0 +1,12 @@
+/* SPDX-License-Identifier: MIT */
+#include "starcat_app_stubs.h"
+
+STUB_OF_HANDLER(STARCAT_APP_NoopCmd, STARCAT_APP_NoopCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_ResetCountersCmd, STARCAT_APP_ResetCountersCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_LoadImageCmd, STARCAT_APP_LoadImageCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_SwitchImageCmd, STARCAT_APP_SwitchImageCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_SetCameraCmd, STARCAT_APP_SetCameraCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_EnableTrackingCmd, STARCAT_APP_EnableTrackingCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_DisableTrackingCmd, STARCAT_APP_DisableTrackingCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_SetBudgetCmd, STARCAT_APP_SetBudgetCmd_t)
+STUB_OF_HANDLER(STARCAT_APP_SendHkCmd, STARCAT_APP_SendHkCmd_t)

@@ -1,0 +1,59 @@
+/* Makes the next image of the one in use and a patch, as flight software does.
+ *
+ *   patch IMAGE PATCH NEXT
+ *
+ * IMAGE and PATCH are files of `starcat export --to onboard --patch-from`; NEXT is written.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "starcat_update.h"
+
+#define CAPACITY (16u * 1048576u) /* of a place */
+
+/* The two places, and memory for a patch: static, as flight software has them. */
+static uint64_t places_of_images[2][CAPACITY / 8u], patch[CAPACITY / 8u];
+
+static size_t read_file(const char *path, uint64_t *into) {
+  FILE *file = fopen(path, "rb");
+  size_t size = 0;
+  if (file != NULL) {
+    size = fread(into, 1, CAPACITY, file);
+    (void)fclose(file);
+  }
+  return size;
+}
+
+int main(int argc, char **argv) {
+  starcat_image image;
+  starcat_places places = {
+      {(uint8_t *)places_of_images[0], (uint8_t *)places_of_images[1]}, CAPACITY, {0, 0}, 0, 0};
+  if (argc != 4) {
+    (void)fprintf(stderr, "patch IMAGE PATCH NEXT\n");
+    return 2;
+  }
+  places.size[0] = read_file(argv[1], places_of_images[0]);
+  starcat_status status = starcat_start(&places, &image);
+  if (status != STARCAT_IDENTIFIED) {
+    (void)fprintf(stderr, "%s: cannot be used, status %d\n", argv[1], (int)status);
+    return 1;
+  }
+  status = starcat_patch(&places, patch, read_file(argv[2], patch));
+  if (status == STARCAT_IDENTIFIED) {
+    status = starcat_switch(&places, &image);
+  }
+  if (status != STARCAT_IDENTIFIED) {
+    (void)fprintf(stderr, "%s: cannot be applied, status %d\n", argv[2], (int)status);
+    return 1;
+  }
+  FILE *next = fopen(argv[3], "wb");
+  if ((next == NULL) || (fwrite(image.bytes, 1, image.total_bytes, next) != image.total_bytes) ||
+      (fclose(next) != 0)) {
+    (void)fprintf(stderr, "%s: cannot be written\n", argv[3]);
+    return 1;
+  }
+  (void)printf("%.96s in place %u\n", image.name, (unsigned)places.active);
+  return 0;
+}

@@ -1,0 +1,383 @@
+/* Images in flight: pieces that are resumed, switching and falling back, parity, patches; and each
+ * error code of starcat_update.h.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include <string.h>
+
+#include "starcat_update.h"
+#include "unit.h"
+
+#define BLOCK 4096u
+#define CAPACITY (SKY_MOST_BYTES / BLOCK * BLOCK)
+
+static uint64_t words[2][CAPACITY / 8u], patch_words[CAPACITY / 8u];
+static starcat_places places;
+static starcat_image image;
+static uint32_t block, n_mended;
+
+static uint32_t crc_of(const unit_sky *sky) {
+  uint32_t crc;
+  memcpy(&crc, sky->bytes + sky->size - 8u, 4);
+  return crc;
+}
+
+/* Two places with the triangles' sky in use and nothing in the other one. */
+static void begin(void) {
+  memset(words, 0, sizeof words);
+  memset(&places, 0, sizeof places);
+  places.bytes[0] = (uint8_t *)words[0];
+  places.bytes[1] = (uint8_t *)words[1];
+  places.capacity = sizeof words[0];
+  places.size[0] = unit_triangle.size;
+  memcpy(words[0], unit_triangle.bytes, unit_triangle.size);
+  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
+}
+
+static void send(const unit_sky *sky, size_t from, size_t until, size_t most) {
+  for (size_t at = from; at < until; at += most) {
+    const size_t count = until - at < most ? until - at : most;
+    CHECK_IS(starcat_put(&places, at, sky->bytes + at, count), STARCAT_IDENTIFIED);
+  }
+}
+
+static void test_pieces(void) {
+  const unit_sky *sky = &unit_pyramid;
+  const uint32_t n_blocks = (uint32_t)(sky->size / BLOCK);
+  begin();
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_LAYOUT); /* nothing is awaited */
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_receive(&places, sky->size, crc_of(sky)), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(block, n_blocks - 1u); /* checks come first */
+  send(sky, sky->size - BLOCK, sky->size, 700);
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(block, 0);
+  send(sky, 0, 3u * BLOCK + 100u, 1000);
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(block, 3);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
+  CHECK_IS(places.active, 0);
+  /* The computer starts anew with what it kept; the transfer goes on with what is missing. */
+  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
+  CHECK(image.bytes == places.bytes[0]);
+  for (uint32_t n = 0; n < n_blocks && starcat_missing(&places, n, &block) == STARCAT_E_CRC; n++) {
+    send(sky, (size_t)block * BLOCK, ((size_t)block + 1u) * BLOCK, 1);
+    n = block;
+  }
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_IDENTIFIED);
+  CHECK_IS(block, n_blocks);
+  CHECK_IS(starcat_switch(&places, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(places.active, 1);
+  CHECK_IS(places.coming_crc, 0);
+  CHECK(memcmp(image.bytes, sky->bytes, sky->size) == 0);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED); /* falls back */
+  CHECK(image.bytes == places.bytes[0]);
+  /* What is there is whole, but not what is awaited: the image before of the same size. */
+  CHECK_IS(starcat_receive(&places, sky->size, crc_of(sky) ^ 1u), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(block, n_blocks - 1u);
+  CHECK_IS(starcat_receive(&places, sky->size, 0), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_IDENTIFIED);
+}
+
+static void check_update_errors(void) {
+  const uint8_t byte = 0;
+  begin();
+  CHECK_IS(starcat_start(NULL, &image), STARCAT_E_NULL);
+  CHECK_IS(starcat_start(&places, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_put(NULL, 0, &byte, 1), STARCAT_E_NULL);
+  CHECK_IS(starcat_put(&places, 0, NULL, 1), STARCAT_E_NULL);
+  CHECK_IS(starcat_put(&places, 0, &byte, 1), STARCAT_E_SHORT);
+  CHECK_IS(starcat_put(&places, 1, &byte, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_missing(NULL, 0, &block), STARCAT_E_NULL);
+  CHECK_IS(starcat_missing(&places, 0, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend(NULL, BLOCK, &n_mended), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend(words, 2u * BLOCK, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend((uint8_t *)words + 4, 2u * BLOCK, &n_mended), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_mend(words, BLOCK, &n_mended), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_mend(words, 2u * BLOCK + 8u, &n_mended), STARCAT_E_LAYOUT);
+  if (sizeof(size_t) > 4u) {
+    CHECK_IS(starcat_parity_bytes((size_t)BLOCK * 1048575u), (size_t)BLOCK * 32768u);
+    CHECK_IS(starcat_parity_bytes((size_t)BLOCK * 1048576u), 0);
+  }
+  CHECK_IS(starcat_parity_bytes(33u * BLOCK), 2u * BLOCK);
+  CHECK_IS(starcat_receive(NULL, BLOCK, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_receive(&places, BLOCK - 1u, 0), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_receive(&places, places.capacity, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_receive(&places, places.capacity + BLOCK, 0), STARCAT_E_SHORT);
+  places.active = 2;
+  CHECK_IS(starcat_start(&places, &image), STARCAT_E_OPTIONS);
+  for (uint32_t n = 0; n < 2u; n++) {
+    begin();
+    places.bytes[n] = NULL;
+    CHECK_IS(starcat_start(&places, &image), STARCAT_E_NULL);
+  }
+}
+
+/* An image of another sky is in the other place, and was in use before. */
+static void fill_both(void) {
+  begin();
+  CHECK_IS(starcat_receive(&places, unit_pyramid.size, 0), STARCAT_IDENTIFIED);
+  send(&unit_pyramid, 0, unit_pyramid.size, BLOCK);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+}
+
+static void damage(uint32_t place, uint32_t first, uint32_t count) {
+  for (uint32_t n = 0; n < count; n++) {
+    places.bytes[place][(size_t)(first + n) * BLOCK + (size_t)(977u * n % BLOCK)] ^= 0x10u;
+  }
+}
+
+static void test_parity(void) {
+  const uint32_t n_blocks = (uint32_t)(unit_triangle.size / BLOCK);
+  const uint32_t groups = (uint32_t)(starcat_parity_bytes(unit_triangle.size) / BLOCK);
+  fill_both();
+  for (uint32_t n = 0; n < n_blocks + groups; n++) { /* any one block, also of parity */
+    damage(0, n, 1);
+    CHECK_IS(starcat_mend(places.bytes[0], places.size[0], &n_mended), STARCAT_IDENTIFIED);
+    CHECK_IS(n_mended, n < n_blocks ? 1 : 0);
+    CHECK(memcmp(places.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
+  }
+  damage(0, 0, groups); /* as many at once as there are groups, if they are neighbours */
+  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(places.active, 0);
+  CHECK(memcmp(places.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
+  damage(0, 0, groups + 1u);
+  CHECK_IS(starcat_mend(places.bytes[0], places.size[0], &n_mended), STARCAT_E_CRC);
+  CHECK_IS(n_mended, groups - 1u);
+  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED); /* falls back by itself */
+  CHECK_IS(places.active, 1);
+  CHECK(image.bytes == places.bytes[1]);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
+  damage(1, 0, n_blocks);
+  CHECK_IS(starcat_start(&places, &image), STARCAT_E_CRC);
+  CHECK_IS(places.active, 1);
+  /* A place that is larger than the image that is in it. */
+  begin();
+  places.size[0] += BLOCK;
+  CHECK_IS(starcat_start(&places, &image), STARCAT_E_CRC);
+  begin();
+  memcpy(words[0], &(uint32_t){0}, 4); /* sound blocks, but no image */
+  sky_seal((uint8_t *)words[0]);
+  CHECK_IS(starcat_start(&places, &image), STARCAT_E_MAGIC);
+}
+
+/* A patch, written step by step. */
+static struct {
+  size_t size;
+} patch;
+
+static void put_byte(uint32_t byte) { ((uint8_t *)patch_words)[patch.size++] = (uint8_t)byte; }
+
+static void put_number(uint32_t number) {
+  for (; number >= 0x80u; number >>= 7) {
+    put_byte((number & 0x7fu) | 0x80u);
+  }
+  put_byte(number);
+}
+
+static void put_word(size_t at, uint32_t word) { memcpy((uint8_t *)patch_words + at, &word, 4); }
+
+enum { LITERAL, COPY, RENUMBER_16, RENUMBER_32, ADD_16, ADD_32, ZEROS, NO_STEP };
+
+static void put_step(uint32_t kind, uint32_t count, int32_t jump) {
+  put_number(count << 3 | kind);
+  if ((kind != LITERAL) && (kind != ZEROS)) {
+    put_number((uint32_t)(jump < 0 ? -2 * jump - 1 : 2 * jump));
+  }
+}
+
+static void put_literal(const uint8_t *bytes, uint32_t count) {
+  put_step(LITERAL, count, 0);
+  for (uint32_t n = 0; n < count; n++) {
+    put_byte(bytes[n]);
+  }
+}
+
+/* Begin a patch from the active image to the scratch one, by which rows from 100 on are one less,
+ * and those from 200 on three more. */
+static void begin_patch(void) {
+  static const uint32_t runs[4] = {100, 0xffffffffu, 200, 3};
+  memset(patch_words, 0, sizeof patch_words);
+  memcpy(patch_words, "STARPAT", 8);
+  put_word(8, 0x01020304u);
+  put_word(12, 1);
+  put_word(16, (uint32_t)places.size[places.active]);
+  put_word(20, crc_of(&unit_triangle));
+  put_word(24, (uint32_t)unit_scratch.size);
+  put_word(28, crc_of(&unit_scratch));
+  put_word(32, 2);
+  memcpy((uint8_t *)patch_words + 40, runs, sizeof runs);
+  patch.size = 56;
+}
+
+static starcat_status apply(void) {
+  put_word(36, (uint32_t)patch.size);
+  return starcat_patch(&places, patch_words, patch.size);
+}
+
+static uint32_t number_at(size_t at) {
+  uint32_t number;
+  memcpy(&number, unit_scratch.bytes + at, 4);
+  return number;
+}
+
+/* Where a section of the scratch image begins, and its bytes. */
+static size_t section(uint32_t kind, uint32_t *bytes) {
+  size_t entry = 256;
+  while (number_at(entry) != kind) {
+    entry += 16;
+  }
+  *bytes = number_at(entry + 8u);
+  return number_at(entry + 4u);
+}
+
+static void change_u32(size_t at, uint32_t by) {
+  const uint32_t changed = number_at(at) + by;
+  memcpy(unit_scratch.bytes + at, &changed, 4);
+}
+
+/* The scratch image is that of the triangles, with stars of other rows, another K-vector, other
+ * magnitudes, and zeros for the first star numbers. */
+static void patch_all(void) {
+  uint32_t bytes[4];
+  unit_copy(&unit_triangle);
+  const size_t mags = section(2, &bytes[0]), ids = section(3, &bytes[1]);
+  const size_t kvector = section(5, &bytes[2]), rows = section(6, &bytes[3]);
+  uint16_t *row = (uint16_t *)(void *)(unit_scratch.bytes + rows);
+  for (uint32_t n = 0; n < bytes[3] / 2u; n++) {
+    row[n] = (uint16_t)(row[n] < 100u ? row[n] : row[n] < 200u ? row[n] - 1u : row[n] + 3u);
+  }
+  for (uint32_t n = 0; n < bytes[2] / 4u; n++) {
+    change_u32(kvector + 4u * n, n < 5u ? 0u : n < 9u ? 7u : 0xfffffffeu);
+  }
+  int16_t *mag = (int16_t *)(void *)(unit_scratch.bytes + mags);
+  mag[0] = (int16_t)(mag[0] - 1);
+  memset(unit_scratch.bytes + ids, 0, 80);
+  sky_seal(unit_scratch.bytes);
+  begin_patch();
+  put_step(COPY, (uint32_t)mags, 0);
+  put_step(ADD_16, 2, 0);
+  put_number(1); /* -1 */
+  put_number(2); /* and back */
+  put_step(COPY, (uint32_t)(ids - mags) - 4u, 0);
+  put_step(ZEROS, 80, 0);
+  put_step(COPY, (uint32_t)(kvector - ids) - 80u, 80);
+  put_step(ADD_32, bytes[2] / 4u, 0);
+  put_number(0);
+  put_number(4);
+  put_number(14);
+  put_number(0);
+  put_number(2);
+  put_number(17);
+  put_number(0);
+  put_number(bytes[2] / 4u - 11u);
+  put_step(COPY, (uint32_t)(rows - kvector) - bytes[2], 0);
+  put_step(RENUMBER_16, bytes[3] / 2u, 0);
+  put_literal(unit_scratch.bytes + rows + bytes[3],
+              (uint32_t)(unit_scratch.size - rows) - bytes[3]);
+}
+
+static void check_steps(void) {
+  begin();
+  patch_all();
+  CHECK_IS(apply(), STARCAT_IDENTIFIED);
+  CHECK(memcmp(places.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  CHECK(image.bytes == places.bytes[1]);
+  CHECK_IS(apply(), STARCAT_E_VERSION); /* it is not for the image that it made */
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  damage(0, 1, 1);
+  CHECK_IS(apply(), STARCAT_E_CRC); /* of a damaged image comes a damaged one */
+  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
+  /* Rows of four bytes, and a step back. */
+  begin();
+  memcpy(words[0], unit_pyramid.bytes, unit_pyramid.size);
+  places.size[0] = unit_pyramid.size;
+  unit_copy(&unit_pyramid);
+  uint32_t bytes;
+  const size_t rows = section(8, &bytes);
+  uint32_t *row = (uint32_t *)(void *)(unit_scratch.bytes + rows);
+  for (uint32_t n = 0; n < bytes / 4u; n++) {
+    row[n] = row[n] < 100u ? row[n] : row[n] < 200u ? row[n] - 1u : row[n] + 3u;
+  }
+  sky_seal(unit_scratch.bytes);
+  begin_patch();
+  put_word(20, crc_of(&unit_pyramid));
+  put_step(COPY, (uint32_t)rows, 0);
+  put_step(RENUMBER_32, bytes / 4u - 2u, 0);
+  put_step(RENUMBER_32, 1, 4);
+  put_step(RENUMBER_32, 1, -8);
+  put_literal(unit_scratch.bytes + rows + bytes,
+              (uint32_t)(unit_scratch.size - rows) - bytes);
+  CHECK_IS(apply(), STARCAT_E_CRC); /* the last two are exchanged */
+  const uint32_t last = row[bytes / 4u - 1u];
+  row[bytes / 4u - 1u] = row[bytes / 4u - 2u];
+  row[bytes / 4u - 2u] = last;
+  CHECK(memcmp(places.bytes[1], unit_scratch.bytes, rows + bytes) == 0);
+}
+
+/* A patch of one step that cannot be. */
+static void refuse_step(uint32_t kind, uint32_t count, int32_t jump) {
+  begin_patch();
+  put_step(kind, count, jump);
+  CHECK_IS(apply(), STARCAT_E_LAYOUT);
+}
+
+static void check_refused(void) {
+  begin();
+  unit_copy(&unit_triangle);
+  const uint32_t size = (uint32_t)unit_scratch.size;
+  refuse_step(NO_STEP, 1, 0);
+  refuse_step(COPY, 0, 0);
+  refuse_step(COPY, size + 1u, 0);
+  refuse_step(RENUMBER_32, size / 4u + 1u, 0);
+  refuse_step(LITERAL, 1, 0);
+  refuse_step(COPY, 1, -1);
+  refuse_step(COPY, 8, (int32_t)size - 7);
+  refuse_step(ADD_16, 1, 1);
+  begin_patch();
+  put_step(ZEROS, 2, 0);
+  put_step(ADD_32, 1, 0);
+  CHECK_IS(apply(), STARCAT_E_LAYOUT); /* made_at is no multiple of 4 */
+  begin_patch();
+  CHECK_IS(apply(), STARCAT_E_LAYOUT); /* no step */
+  for (uint32_t n = 0; n < 7u; n++) {
+    put_byte(0xffu); /* a number that does not end */
+  }
+  CHECK_IS(apply(), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_patch(NULL, patch_words, patch.size), STARCAT_E_NULL);
+  CHECK_IS(starcat_patch(&places, NULL, patch.size), STARCAT_E_NULL);
+  CHECK_IS(starcat_patch(&places, (uint8_t *)patch_words + 2, patch.size), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_patch(&places, patch_words, 39), STARCAT_E_SHORT);
+  CHECK_IS(starcat_patch(&places, patch_words, patch.size - 1u), STARCAT_E_SHORT);
+  static const struct {
+    size_t at;
+    uint32_t value;
+    starcat_status status;
+  } headers[] = {{0, 0, STARCAT_E_MAGIC},        {8, 0x04030201u, STARCAT_E_BYTE_ORDER},
+                 {12, 2, STARCAT_E_VERSION},     {16, 4096, STARCAT_E_VERSION},
+                 {20, 0, STARCAT_E_VERSION},     {24, 100, STARCAT_E_LAYOUT},
+                 {24, CAPACITY, STARCAT_E_SHORT}, {32, 3, STARCAT_E_LAYOUT},
+                 {36, 39, STARCAT_E_LAYOUT}};
+  for (size_t n = 0; n < sizeof headers / sizeof headers[0]; n++) {
+    begin_patch();
+    put_word(36, (uint32_t)patch.size);
+    put_word(headers[n].at, headers[n].value);
+    CHECK_IS(starcat_patch(&places, patch_words, patch.size), headers[n].status);
+  }
+  begin_patch();
+  places.size[0] = 0;
+  CHECK_IS(apply(), STARCAT_E_VERSION); /* no image is in use */
+}
+
+void test_update(void) {
+  test_pieces();
+  check_update_errors();
+  test_parity();
+  check_steps();
+  check_refused();
+}
