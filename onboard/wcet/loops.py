@@ -98,11 +98,13 @@ def check(source: Source) -> list[str]:
     found = [(loop.file, loop.function, loop.head) for loop in source.loops]
     wrong = [f"not in loops.md: {' '.join(loop)}" for loop in found if loop not in listed]
     wrong += [f"only in loops.md: {' '.join(row)}" for row in listed if row not in found]
-    if not wrong and listed != found:
-        wrong = ["loops.md has another order, or one loop more often, than the source"]
-    for loop, row in zip(source.loops, rows_of("Loops"), strict=False):
+    if wrong:
+        return wrong
+    if listed != found:
+        return ["loops.md has the loops in another order than the source"]
+    for loop, row in zip(source.loops, rows_of("Loops"), strict=True):
         loop.longest, loop.counts = row[3], row[4]
-    return wrong + [f"no count: {loop.head}" for loop in source.loops if not loop.counts]
+    return [f"no count: {loop.head}" for loop in source.loops if not loop.counts]
 
 
 def main() -> int:
