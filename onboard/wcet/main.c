@@ -9,6 +9,7 @@
  *
  * SPDX-License-Identifier: MIT
  */
+#include <math.h>
 #include <stdio.h>
 #include <string.h>
 
@@ -33,19 +34,29 @@ static adversary made;
 static uint8_t worst[N_WORST][N_GENES];
 static double worst_ratio[N_WORST];
 
+/* Whether one of the centroids that may be used has a magnitude. */
+static int has_magnitudes(void) {
+  int known = 0;
+  for (uint32_t n = 0; n < made.sky.count; n++) {
+    known |= made.has_magnitudes && isfinite(made.sky.magnitudes[n]) &&
+             (result.star[n] != STARCAT_DROPPED_NOT_FINITE) &&
+             (result.star[n] != STARCAT_DROPPED_OUT_OF_FRAME);
+  }
+  return known;
+}
+
 static uint32_t flags_of(void) {
   return (uint32_t)((made.camera.k1 != (starcat_real)0.0 ? 1 : 0) |
                     (made.options.fov_error > (starcat_real)0.0 ? 2 : 0) |
-                    ((result.n_usable > 32u) && !work.has_magnitudes ? 4 : 0) |
+                    ((result.n_usable > 32u) && !has_magnitudes() ? 4 : 0) |
                     (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0) |
-                    (work.has_magnitudes ? 32 : 0));
+                    (has_magnitudes() ? 32 : 0));
 }
 
 /* Make a call and print it. Returns instructions for a step. */
 static double measure(char kind, unsigned id, const uint8_t *genes) {
   adversary_make(&image, genes, &made);
   memset(&result, 0, sizeof result);
-  work.has_magnitudes = 0;
   const uint64_t before = clock_now();
   const starcat_status status = adversary_call(&image, &made, &work, &result);
   const uint64_t took = clock_now() - before + CLOCK_STEP;
