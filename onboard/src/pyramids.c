@@ -113,6 +113,9 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
   if (o->is_marked == 0) {
     return 1;
   }
+  if (!starcat_spend(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS)) {
+    return 0; /* before the work: there may be as many pairs as the image has */
+  }
   for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
     w->corner[0][n] = UINT32_MAX;
     w->corner[1][n] = UINT32_MAX;
@@ -128,7 +131,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
       w->third[k] &= w->corner[own][k];
     }
   }
-  return starcat_spend(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS);
+  return 1;
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */

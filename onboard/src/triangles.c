@@ -577,7 +577,7 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
     part[1] = part[1] < end ? part[1] : end;
     radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
     radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
-    if (look_up(call, o, part, radii) != 0) {
+    if (!starcat_spend(call, 1) || (look_up(call, o, part, radii) != 0)) {
       return 1;
     }
     part[0] = part[1];

@@ -235,8 +235,11 @@ static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
     starcat_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
+    if (!starcat_spend(call, call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
+      return 0;
+    }
     matched = match(call, factor * call->reach_px);
-    if (!starcat_spend(call, call->own->n_near + call->own->count * (call->own->n_within + 1u) + STEPS_OF_MATCH * matched)) {
+    if (!starcat_spend(call, STEPS_OF_MATCH * matched)) {
       return 0;
     }
     if ((matched < STARCAT_MIN_STARS) || (is_as_before(call) && is_final)) {
@@ -372,6 +375,9 @@ static void try_rivals(starcat_call *call) {
   const uint32_t count = find_rivals(call);
   for (uint32_t n = 0; n < count; n++) {
     real m[9];
+    if (!starcat_spend(call, STEPS_OF_MATCH * w->found.n_matched)) {
+      return;
+    }
     begin_at(call, &w->found, m);
     fit_rival(call, w->rival[n], starcat_below(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
     judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
@@ -389,13 +395,14 @@ static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
          (!(b->log_chance < a->log_chance) && (a->log_bound < b->log_bound));
 }
 
-/* How many of the matched centroids are within smaller reaches: halves of the one before. */
-static void count_nearer(const starcat_call *call, uint32_t nearer[3]) {
+/* How many of the matched centroids are within smaller reaches: halves of the one before. Where none
+ * matched, nothing may be known of their places. */
+static void count_nearer(const starcat_call *call, uint32_t matched, uint32_t nearer[3]) {
   const starcat_workspace *w = call->work;
   for (uint32_t k = 0; k < 3u; k++) {
     const real reach = call->reach_px / (real)(2u << k);
     nearer[k] = 0;
-    for (uint32_t i = 0; i < call->own->count; i++) {
+    for (uint32_t i = 0; (i < call->own->count) && (matched > 0u); i++) {
       nearer[k] += (uint32_t)((w->match[i] >= 0) && (w->match_square[i] <= reach * reach));
     }
   }
@@ -459,7 +466,7 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   starcat_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
-  count_nearer(call, nearer);
+  count_nearer(call, count, nearer);
   if (found->log_chance < R(0.0)) {
     try_rivals(call);
   }
