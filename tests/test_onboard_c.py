@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -233,6 +234,34 @@ def test_tools_find_nothing(folder, target):
         assert "(100.00 %)" in said
     if target == "size":
         assert len(re.findall(r"stack of starcat_\w+: \d+ bytes", said)) == 5
+
+
+def test_every_loop_has_its_longest_count(folder, tmp_path):
+    """``loops.md`` has every loop; one that is added to the source is named."""
+    compare = [sys.executable, "-B", "wcet/loops.py"]
+    said = subprocess.run(compare, cwd=folder, capture_output=True, text=True, check=True).stdout
+    assert re.match(r"loops.md has all \d+ loops of the library", said)
+    copy = tmp_path / "onboard"
+    for name in ("src", "wcet"):
+        shutil.copytree(folder / name, copy / name)
+    source = copy / "src" / "sky.c"
+    text = source.read_text(encoding="utf-8")
+    added = text.replace("  query->count = count;\n", "  while (count > 9u) {\n  }\n")
+    assert added != text
+    source.write_text(added, encoding="utf-8")
+    ran = subprocess.run(compare, cwd=copy, capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    assert ran.stdout == "not in loops.md: sky.c gather_sectors while (count > 9u)\n"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_no_call_takes_longer_than_its_bound(folder):
+    said = make(folder, "wcet", "WCET_FRAMES=400", "BUILD=build-wcet")
+    assert "Cortex-M7" in said
+    assert "RISC-V" in said
+    assert said.count("440 frames, 0 beyond the bound") == 2
+    assert "wcet: no call beyond the bound" in said
 
 
 @pytest.mark.slow

@@ -34,8 +34,6 @@ typedef struct {
 
 struct starcat_workspace {
   /* The usable centroids in their own order: brightest first, or nearest to the centre first. */
-  uint32_t count;
-  uint32_t has_magnitudes;
   uint32_t row[STARCAT_MAX_CENTROIDS];
   starcat_real x[STARCAT_MAX_CENTROIDS];
   starcat_real y[STARCAT_MAX_CENTROIDS];
@@ -54,7 +52,6 @@ struct starcat_workspace {
 
   /* The nearest centroids of each one in a crowded frame, which has no separations of pairs. */
   uint16_t neighbour[STARCAT_MAX_CENTROIDS][STARCAT_NEIGHBOURS];
-  uint32_t is_crowded;
 
   /* Stars that may be corners of a triangle of centroids: either of the first two, and each. */
   uint32_t either[STARCAT_MARKS];
@@ -62,8 +59,6 @@ struct starcat_workspace {
   uint32_t third[STARCAT_MARKS];
 
   /* The stars around the field of an attitude, and where it puts them. */
-  uint32_t n_near;
-  uint32_t n_within;
   uint32_t near_row[STARCAT_MAX_STARS];
   starcat_real near_icrs[STARCAT_MAX_STARS][3];
 
@@ -81,7 +76,6 @@ struct starcat_workspace {
   starcat_real match_square[STARCAT_MAX_CENTROIDS];
 
   /* Centroids without a star near the star of another one, which stands beside each. */
-  uint32_t n_rivals;
   uint16_t rival[STARCAT_MAX_CENTROIDS];
   uint16_t rival_of[STARCAT_MAX_CENTROIDS];
 
@@ -97,14 +91,10 @@ struct starcat_workspace {
   starcat_agreement best;
 
   /* The centroids of the answer that are stars, where these are, and their weights. */
-  uint32_t n_seen;
   uint16_t seen[STARCAT_MAX_CENTROIDS];
   starcat_real seen_body[STARCAT_MAX_CENTROIDS][3];
   starcat_real seen_icrs[STARCAT_MAX_CENTROIDS][3];
   starcat_real weight[STARCAT_MAX_CENTROIDS];
-
-  uint32_t steps_left;
-  uint32_t n_tried;
 };
 
 #endif

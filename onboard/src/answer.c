@@ -5,18 +5,19 @@
 #include "internal.h"
 
 /* Say why there is no answer, and how good the best agreement was. */
-static void refuse(const starcat_call *call, starcat_result *result) {
+static starcat_status refuse(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   result->best_n_matched = w->best.n_matched;
   result->best_log_chance = w->best.log_bound;
   result->best_share = w->best.share;
-  if (w->steps_left == 0u) {
+  if (call->own->steps_left == 0u) {
     result->reason = STARCAT_REASON_STEPS;
-  } else if (w->n_tried == 0u) {
+  } else if (call->own->n_tried == 0u) {
     result->reason = STARCAT_REASON_NO_CANDIDATE;
   } else {
     result->reason = w->best.withheld != 0u ? w->best.withheld : STARCAT_REASON_CHANCE;
   }
+  return call->own->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
 }
 
 /* The noise of a centroid on each axis; 0 where it is not stated. */
@@ -27,79 +28,81 @@ static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
   return starcat_are_finite(sigma_px + row, 1) ? sigma_px[row] : R(0.0);
 }
 
+/* The same of one of the usable centroids. */
+static real noise_of_centroid(const starcat_call *call, uint32_t centroid) {
+  const uint32_t row = call->work->row[starcat_below(centroid, STARCAT_MAX_CENTROIDS)];
+  return noise_of(call->sigma_px, call->noise_px, starcat_below(row, call->own->given));
+}
+
 /* List the centroids of the best agreement that are stars, with directions of the image or others,
- * and their weights: one over the square of the noise, over the largest. */
-static void take_stars(const starcat_image *image, const real *directions, const real *sigma_px,
-                       starcat_workspace *w) {
-  real(*body)[3] = w->best.focal == R(1.0) ? w->body : w->scaled;
+ * and their weights: one over the square of the noise, over the largest. Returns how many. */
+static uint32_t take_stars(const starcat_image *image, const real *directions,
+                           const real *sigma_px, uint32_t count, uint32_t given,
+                           starcat_workspace *w) {
   real least = R(0.0);
   uint32_t n = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
-    const int32_t star = w->best.star[i];
-    if (star >= 0) {
+  for (uint32_t i = 0; i < count; i++) {
+    if (w->best.star[i] >= 0) {
+      const uint32_t star = starcat_below((uint32_t)w->best.star[i], image->n_stars);
       real *icrs = w->seen_icrs[n];
-      starcat_star(image, (uint32_t)star, icrs);
+      starcat_star(image, star, icrs);
       for (uint32_t k = 0; k < 3u; k++) {
-        w->seen_body[n][k] = body[i][k];
+        w->seen_body[n][k] = w->scaled[i][k];
         icrs[k] = directions != NULL ? directions[3u * (size_t)star + k] : icrs[k];
       }
-      const real noise = noise_of(sigma_px, R(0.0), w->row[i]);
+      const real noise = noise_of(sigma_px, R(0.0), starcat_below(w->row[i], given));
       least = (noise > R(0.0)) && ((noise < least) || !(least > R(0.0))) ? noise : least;
       w->weight[n] = noise;
       w->seen[n] = (uint16_t)i;
       n++;
     }
   }
-  w->n_seen = n;
   for (uint32_t i = 0; i < n; i++) {
     const real ratio = w->weight[i] > R(0.0) ? least / w->weight[i] : R(0.0);
     const real weight = ratio * ratio;
     w->weight[i] = weight > STARCAT_LEAST_WEIGHT ? weight : STARCAT_LEAST_WEIGHT;
     w->weight[i] = least > R(0.0) ? w->weight[i] : R(1.0);
   }
-}
-
-static void set_attitude(const real m[9], starcat_result *result) {
-  starcat_quaternion(m, result->q_body_from_icrs);
-  starcat_matrix(result->q_body_from_icrs, result->matrix);
+  return n;
 }
 
 /* Fit the attitude of the answer to the stars that are listed. */
-static void fit_stars(const starcat_workspace *w, starcat_result *result) {
+static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result *result) {
   real square = R(0.0);
   starcat_refine(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
-                 w->n_seen, 4);
-  set_attitude(result->matrix, result);
-  for (uint32_t i = 0; i < w->n_seen; i++) {
+                 count, 4);
+  starcat_quaternion(result->matrix, result->q_body_from_icrs);
+  starcat_matrix(result->q_body_from_icrs, result->matrix);
+  for (uint32_t i = 0; i < count; i++) {
     real turned[3];
     starcat_turn(result->matrix, w->seen_icrs[i], turned);
     square += starcat_chord_square(w->seen_body[i], turned);
   }
-  result->residual_rad = STARCAT_SQRT(square / (real)w->n_seen);
+  result->residual_rad = STARCAT_SQRT(square / (real)count);
 }
 
 #ifdef STARCAT_GROUND
 /* Fit the attitude of an answer once more, with other directions than those of the image. */
 void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
                         starcat_workspace *work, starcat_result *result) {
-  take_stars(image, directions, sigma_px, work);
-  fit_stars(work, result);
+  fit_stars(work,
+            take_stars(image, directions, sigma_px, result->n_usable, STARCAT_MAX_CENTROIDS, work),
+            result);
 }
 #endif
 
 /* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
  * the attitude. Sums the squared residuals of stated noise, in it, and counts these centroids. */
-static real residuals(const starcat_call *call, const real m[9], real *chi_square,
-                      uint32_t *n_stated) {
+static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen,
+                      real *chi_square, uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
   real square = R(0.0);
-  for (uint32_t n = 0; n < w->n_seen; n++) {
-    const uint32_t i = w->seen[n];
-    const real noise = noise_of(call->sigma_px, call->noise_px, w->row[i]);
-    real body[3], x = w->x[i], y = w->y[i];
+  for (uint32_t n = 0; n < n_seen; n++) {
+    const uint32_t i = starcat_below(w->seen[n], STARCAT_MAX_CENTROIDS);
+    const real noise = noise_of_centroid(call, i);
+    real body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
     starcat_turn(m, w->seen_icrs[n], body);
-    (void)starcat_pixel(&call->camera, body, &x,
-                        &y); /* it was within reach of its centroid before */
+    (void)starcat_pixel(&call->camera, body, &x, &y);
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     square += dx * dx + dy * dy;
     if (noise > R(0.0)) {
@@ -107,24 +110,27 @@ static real residuals(const starcat_call *call, const real m[9], real *chi_squar
       (*n_stated)++;
     }
   }
-  return STARCAT_SQRT(square /
-                      (real)(2u * w->n_seen - 3u)); /* there are STARCAT_MIN_STARS at least */
+  return STARCAT_SQRT(square / (real)(2u * n_seen - 3u)); /* there are STARCAT_MIN_STARS at least */
 }
 
 /* Tell the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the turns t that the noises of
- * centroids stand for, and the reduced chi-square. */
-static void tell_errors(const starcat_call *call, starcat_result *result) {
+ * centroids stand for, and the reduced chi-square. Returns 0 if the stars are not where the attitude
+ * puts them: both agreed, but a bit was flipped since. */
+static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result *result) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
-  const real unstated = residuals(call, result->matrix, &chi_square, &n_stated);
+  const real unstated = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
   const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
+  if (!(unstated <= call->reach_px)) {
+    return 0;
+  }
   if (2u * n_stated > unknowns) {
     result->reduced_chi_square = chi_square / (real)(2u * n_stated - unknowns);
   }
-  for (uint32_t n = 0; n < w->n_seen; n++) {
+  for (uint32_t n = 0; n < n_seen; n++) {
     const real *b = w->seen_body[n], v = w->weight[n];
-    const real noise = noise_of(call->sigma_px, call->noise_px, w->row[w->seen[n]]);
+    const real noise = noise_of_centroid(call, w->seen[n]);
     const real scale = v * (noise > R(0.0) ? noise : unstated);
     real turn[2][3];
     h[0] += v * (R(1.0) - b[0] * b[0]);
@@ -140,7 +146,7 @@ static void tell_errors(const starcat_call *call, starcat_result *result) {
     }
   }
   if (!starcat_solve(h, s[0], unused, inverse)) {
-    return; /* all stars are at one place */
+    return 1; /* all stars are at one place */
   }
   const real p[3][3] = {{inverse[0], inverse[1], inverse[2]},
                         {inverse[1], inverse[3], inverse[4]},
@@ -150,30 +156,37 @@ static void tell_errors(const starcat_call *call, starcat_result *result) {
       result->covariance_rad2[k] += p[k / 3u][i] * starcat_dot(s[i], p[k % 3u]);
     }
   }
+  return 1;
 }
 
 starcat_status starcat_end(starcat_call *call, const starcat_options *options,
                            starcat_result *result) {
   starcat_workspace *w = call->work;
-  result->steps = options->max_steps - w->steps_left;
-  result->n_tried = w->n_tried;
-  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
-    refuse(call, result);
-    return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
+  result->steps = options->max_steps - call->own->steps_left;
+  result->n_tried = call->own->n_tried;
+  if (!(w->best.log_chance <= call->log_limit) || !(w->best.log_bound <= call->log_limit)) {
+    return refuse(call, result);
   }
+  call->focal = R(0.0); /* so that the directions are worked out again */
   starcat_set_focal(call, w->best.focal);
-  take_stars(call->image, NULL, call->sigma_px, w);
-  set_attitude(w->best.matrix, result);
-  result->residual_rad = w->best.residual_rad;
-  if (call->sigma_px != NULL) {
-    fit_stars(w, result);
+  const uint32_t count = call->own->count;
+  const uint32_t n_seen =
+      take_stars(call->image, NULL, call->sigma_px, count, call->own->given, w);
+  if (n_seen < STARCAT_MIN_STARS) {
+    return refuse(call, result);
   }
-  tell_errors(call, result);
+  for (uint32_t k = 0; k < 9u; k++) {
+    result->matrix[k] = w->best.matrix[k];
+  }
+  fit_stars(w, n_seen, result);
+  if (!tell_errors(call, n_seen, result)) {
+    return refuse(call, result);
+  }
   result->log_chance = w->best.log_chance;
-  result->n_matched = w->best.n_matched;
+  result->n_matched = n_seen;
   result->focal_length_px = call->camera.given.focal_length_px;
-  for (uint32_t i = 0; i < w->count; i++) {
-    result->star[w->row[i]] = w->best.star[i];
+  for (uint32_t i = 0; i < count; i++) {
+    result->star[starcat_below(w->row[i], call->own->given)] = w->best.star[i];
   }
   return STARCAT_IDENTIFIED;
 }

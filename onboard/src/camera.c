@@ -193,7 +193,7 @@ static int scale_camera(starcat_call *call, real focal) {
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
   int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
-  for (uint32_t i = 0; good && (i < w->count); i++) {
+  for (uint32_t i = 0; good && (i < call->own->count); i++) {
     good = starcat_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
   }
   call->focal = focal;

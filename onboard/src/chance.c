@@ -23,7 +23,7 @@
 static real information_of_places(const starcat_call *call, real *of_scale) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, cross[3] = {0}, along = R(0.0), unused[6], share[3];
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
       const real *body = call->body[i];
       const real x = body[0] / body[2], y = body[1] / body[2];
@@ -96,8 +96,7 @@ static real log_of_sum(real a, real b) {
 
 /* Logarithm of the bound; 0 if it says nothing. */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched) {
-  const starcat_workspace *w = call->work;
-  const uint32_t fewer = w->count < w->n_within ? w->count : w->n_within;
+  const uint32_t fewer = call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   const int is_stated = call->noise_px > R(0.0);
   real of_scale;
   const real information = information_of_places(call, &of_scale);
@@ -114,7 +113,7 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
                          STARCAT_LOG(starcat_larger(information * of_scale, STARCAT_LEAST_NUMBER)),
                          4));
   }
-  expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(w->count - 3u));
+  expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(call->own->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
 }
 
@@ -170,7 +169,7 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
   starcat_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
   starcat_information own, with_scale;
   const int has_scale = call->fov_error > R(0.0);
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     starcat_inform(&centroids, call->body[i]);
     if (w->match[i] >= 0) {
       starcat_inform(&matched, call->body[i]);
@@ -184,16 +183,16 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
              corner_deviation(&with_scale, &call->camera);
     found->is_firm = corner <= (has_scale ? R(2.0) : R(1.0)) * STARCAT_SURE_CORNER * tolerance_rad;
   }
-  if (found->n_matched >= w->n_within) {
+  if (found->n_matched >= call->own->n_within) {
     return;
   }
   found->share = R(0.0);
   if (has_scale ? !is_whole : !invert_angles(&matched, &own)) {
     return;
   }
-  for (uint32_t j = 0; j < w->n_within; j++) {
+  for (uint32_t j = 0; j < call->own->n_within; j++) {
     real body[3];
-    starcat_turn(m, w->near_icrs[w->within[j]], body);
+    starcat_turn(m, w->near_icrs[starcat_near(w, j)], body);
     starcat_inform(&stars, body);
   }
   const starcat_information *covariance = has_scale ? &with_scale : &own;
@@ -217,18 +216,18 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   const real n = (real)n_matched;
   real mean_x = R(0.0), mean_y = R(0.0), off_x = R(0.0), off_y = R(0.0);
   real extent = R(0.0), product = R(0.0), left = R(0.0);
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = (uint32_t)w->match[i];
+      const uint32_t j = starcat_match(w, i);
       mean_x += w->x_of[j] / n;
       mean_y += w->y_of[j] / n;
       off_x += (w->x[i] - w->x_of[j]) / n;
       off_y += (w->y[i] - w->y_of[j]) / n;
     }
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = (uint32_t)w->match[i];
+      const uint32_t j = starcat_match(w, i);
       const real x = w->x_of[j] - mean_x, y = w->y_of[j] - mean_y;
       extent += x * x + y * y;
       product += x * (w->x[i] - w->x_of[j]) + y * (w->y[i] - w->y_of[j]);
@@ -242,9 +241,9 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   if (!(moved > tolerance_px)) {
     return 0;
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = (uint32_t)w->match[i];
+      const uint32_t j = starcat_match(w, i);
       const real x = w->x[i] - w->x_of[j] - off_x - excess * (w->x_of[j] - mean_x);
       const real y = w->y[i] - w->y_of[j] - off_y - excess * (w->y_of[j] - mean_y);
       left += x * x + y * y;

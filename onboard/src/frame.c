@@ -60,9 +60,10 @@ static starcat_status check_options(const starcat_options *o) {
 
 /* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
  * last; then the nearer to the centre; then by x and y. */
-static int comes_before(const starcat_workspace *w, real magnitude, real square, real x, real y,
+static int comes_before(const starcat_call *call, real magnitude, real square, real x, real y,
                         uint32_t other) {
-  if ((w->has_magnitudes != 0u) && (magnitude != w->magnitude[other])) {
+  const starcat_workspace *w = call->work;
+  if ((call->own->has_magnitudes != 0u) && (magnitude != w->magnitude[other])) {
     return magnitude < w->magnitude[other];
   }
   if (square != w->square[other]) {
@@ -76,8 +77,8 @@ static void insert(const starcat_call *call, uint32_t row, real magnitude, real 
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
   const real square = dx * dx + dy * dy;
-  uint32_t at = w->count;
-  while ((at > 0u) && comes_before(w, magnitude, square, x, y, at - 1u)) {
+  uint32_t at = call->own->count;
+  while ((at > 0u) && comes_before(call, magnitude, square, x, y, at - 1u)) {
     w->row[at] = w->row[at - 1u];
     w->magnitude[at] = w->magnitude[at - 1u];
     w->square[at] = w->square[at - 1u];
@@ -90,15 +91,14 @@ static void insert(const starcat_call *call, uint32_t row, real magnitude, real 
   w->square[at] = square;
   w->x[at] = x;
   w->y[at] = y;
-  w->count++;
+  call->own->count++;
 }
 
 /* Which centroids can be used; the others get their reason as their result. */
 static void take_usable(const starcat_call *call, const starcat_frame *frame,
                         starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
-  starcat_workspace *w = call->work;
-  w->has_magnitudes = 0;
+  call->own->has_magnitudes = 0;
   for (uint32_t i = 0; i < frame->count; i++) {
     const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
@@ -108,21 +108,22 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
                (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
     } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes + i)) {
-      w->has_magnitudes = 1;
+      call->own->has_magnitudes = 1;
     }
   }
 }
 
 /* Leave out centroids at exactly the place of an earlier one. */
-static void drop_repeats(starcat_workspace *w, starcat_result *result) {
+static void drop_repeats(const starcat_call *call, starcat_result *result) {
+  starcat_workspace *w = call->work;
   uint32_t kept = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     uint32_t k = 0;
-    while ((k < kept) && !((w->x[k] == w->x[i]) && (w->y[k] == w->y[i]))) {
+    while ((k < kept) && ((w->x[k] != w->x[i]) || (w->y[k] != w->y[i]))) {
       k++;
     }
     if (k < kept) {
-      result->star[w->row[i]] = STARCAT_DROPPED_DUPLICATE;
+      result->star[starcat_below(w->row[i], call->own->given)] = STARCAT_DROPPED_DUPLICATE;
     } else {
       w->row[kept] = w->row[i];
       w->x[kept] = w->x[i];
@@ -131,11 +132,10 @@ static void drop_repeats(starcat_workspace *w, starcat_result *result) {
       kept++;
     }
   }
-  w->count = kept;
+  call->own->count = kept;
 }
 
 static void set_limits(starcat_call *call, const starcat_options *options) {
-  const starcat_workspace *w = call->work;
   call->tolerance_px = options->noise_px > R(0.0) ? STARCAT_SIGMAS_OF_TOLERANCE * options->noise_px
                                                   : options->tolerance_px;
   call->noise_px = options->noise_px;
@@ -144,7 +144,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   starcat_allow_scales(call, options->fov_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = STARCAT_REACH * call->tolerance_px;
-  call->mag_reach = w->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->mag_reach = call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
   call->log_certain = options->log_chance;
@@ -192,9 +192,11 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
   }
   call->image = image;
   call->work = work;
-  work->count = 0;
-  work->n_tried = 0;
-  work->steps_left = options->max_steps;
+  call->own = &call->counters;
+  call->own->given = frame->count;
+  call->own->count = 0;
+  call->own->n_tried = 0;
+  call->own->steps_left = options->max_steps;
   work->best.log_chance = R(0.0);
   work->best.log_bound = R(0.0);
   work->best.n_matched = 0;
@@ -210,21 +212,21 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     }
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
-          (work->has_magnitudes != 0u) && is_finite(frame->magnitudes + i);
+          (call->own->has_magnitudes != 0u) && is_finite(frame->magnitudes + i);
       insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }
   }
-  drop_repeats(work, result);
+  drop_repeats(call, result);
   starcat_list_columns(call);
-  for (uint32_t i = 0; i < work->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (!starcat_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
     }
   }
   set_limits(call, options);
-  result->n_usable = work->count;
-  if (work->count < STARCAT_MIN_STARS) {
+  result->n_usable = call->own->count;
+  if (call->own->count < STARCAT_MIN_STARS) {
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
   }

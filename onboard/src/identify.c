@@ -70,9 +70,9 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
 static int predict(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
-    w->n_near = starcat_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
+    call->own->n_near = starcat_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
                                w->near_row, w->near_icrs);
-    if ((w->n_near > STARCAT_MAX_STARS) || !starcat_spend(w, w->n_near)) {
+    if ((call->own->n_near > STARCAT_MAX_STARS) || !starcat_spend(call, call->own->n_near)) {
       return 0;
     }
     starcat_project(call, p->matrix, p->shift_px);
@@ -91,10 +91,10 @@ static int32_t next_star(const starcat_call *call, const prior *p, uint32_t cent
   const starcat_workspace *w = call->work;
   real least = p->shift_px * p->shift_px;
   int32_t found = -1;
-  for (uint32_t k = 0; k < w->n_within; k++) {
+  for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x[centroid], w->y[centroid]);
     if ((square > *past) && (square <= least) &&
-        starcat_compatible(call, centroid, w->near_row[w->within[k]])) {
+        starcat_compatible(call, centroid, w->near_row[starcat_near(w, k)])) {
       least = square;
       found = (int32_t)k;
     }
@@ -104,10 +104,11 @@ static int32_t next_star(const starcat_call *call, const prior *p, uint32_t cent
 }
 
 /* The centroid farthest from another one: the two determine the attitude best. */
-static uint32_t farthest(const starcat_workspace *w, uint32_t from) {
+static uint32_t farthest(const starcat_call *call, uint32_t from) {
+  const starcat_workspace *w = call->work;
   uint32_t best = from;
   real most = R(0.0);
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     const real dx = w->x[i] - w->x[from], dy = w->y[i] - w->y[from];
     if (dx * dx + dy * dy > most) {
       most = dx * dx + dy * dy;
@@ -127,20 +128,20 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
              high = starcat_chord_of_angle(apart + error);
   const real dx = w->x[b] - w->x[a], dy = w->y[b] - w->y[a];
   const real slack = R(2.0) * call->reach_px + p->turn * STARCAT_SQRT(dx * dx + dy * dy);
-  const real *first = w->near_icrs[w->within[star]];
+  const real *first = w->near_icrs[starcat_near(w, star)];
   real least = slack * slack, m[9];
   int32_t partner = -1;
-  for (uint32_t k = 0; k < w->n_within; k++) {
+  for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
     if (square <= least) {
-      const real chord = starcat_chord_square(first, w->near_icrs[w->within[k]]);
+      const real chord = starcat_chord_square(first, w->near_icrs[starcat_near(w, k)]);
       if ((chord >= low * low) && (chord <= high * high)) {
         least = square;
         partner = (int32_t)k;
       }
     }
   }
-  if (!starcat_spend(w, w->n_within + 1u)) {
+  if (!starcat_spend(call, call->own->n_within + 1u)) {
     return 1;
   }
   if (partner < 0) {
@@ -151,7 +152,7 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
     body[0][k] = w->body[a][k];
     body[1][k] = w->body[b][k];
     icrs[0][k] = first[k];
-    icrs[1][k] = w->near_icrs[w->within[partner]][k];
+    icrs[1][k] = w->near_icrs[starcat_near(w, (uint32_t)partner)][k];
   }
   if (!starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
@@ -164,11 +165,10 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
 /* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if
  * the search can end. */
 static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
-  starcat_workspace *w = call->work;
   real past = R(-1.0);
   int32_t star = 0;
   while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
-    if (!predict(call, p) || !starcat_spend(w, w->n_within + 1u)) {
+    if (!predict(call, p) || !starcat_spend(call, call->own->n_within + 1u)) {
       return 1;
     }
     star = next_star(call, p, a, &past);
@@ -195,13 +195,13 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
   if (status != STARCAT_IDENTIFIED) {
     return status;
   }
-  if (!predict(&call, &p) && (work->steps_left > 0u)) {
+  if (!predict(&call, &p) && (call.counters.steps_left > 0u)) {
     return STARCAT_E_CAPACITY; /* so wide a prior, and so many stars */
   }
-  for (uint32_t a = 0; (a < work->count) && (a < MOST_ANCHORS); a++) {
-    const uint32_t b = farthest(work, a);
+  for (uint32_t a = 0; (a < call.counters.count) && (a < MOST_ANCHORS); a++) {
+    const uint32_t b = farthest(&call, a);
     /* A false spot may be the farthest one; then the next one in order serves. */
-    if (try_anchor(&call, &p, a, b) || try_anchor(&call, &p, a, (a + 1u) % work->count)) {
+    if (try_anchor(&call, &p, a, b) || try_anchor(&call, &p, a, (a + 1u) % call.counters.count)) {
       break;
     }
   }

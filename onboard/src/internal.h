@@ -81,12 +81,25 @@ typedef struct {
   int distorted;
 } starcat_optics;
 
+/* What a call counts. It is not in the workspace, where a flipped bit of it would lead out of that;
+ * what is in there and leads to a place is held to its range by starcat_below when it is used. */
+typedef struct {
+  uint32_t given;          /* centroids of the frame */
+  uint32_t count;          /* those that can be used */
+  uint32_t has_magnitudes;
+  uint32_t is_crowded;     /* whether separations of pairs are not listed */
+  uint32_t n_near, n_within; /* stars around the field of an attitude; those within reach of it */
+  uint32_t steps_left, n_tried;
+} starcat_counters;
+
 /* One call. Where the focal length is fitted, the camera and the directions of the centroids are
  * those of the attitude that is tried; the rest does not change while it lasts. */
 typedef struct {
-  const starcat_image *image;
-  starcat_optics camera;
+  const starcat_image *image; /* what is used the most comes first, which makes the code shorter */
+  starcat_workspace *work;
+  starcat_counters *own; /* the counters below */
   real (*body)[3];
+  starcat_counters counters;
   real focal, focal_px; /* of the camera over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
   real log_scales, bend;
@@ -97,7 +110,7 @@ typedef struct {
   real log_limit; /* largest accepted chance */
   real log_certain;
   const real *sigma_px; /* noise of the frame's centroids; null: not stated */
-  starcat_workspace *work;
+  starcat_optics camera;
 } starcat_call;
 
 /* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles, how the logarithm of the
@@ -107,6 +120,21 @@ typedef struct {
   real with_scale[3];
   real scale;
 } starcat_information;
+
+/* A place in an array of so many; the first one where it is beyond them, by a flipped bit. */
+static inline uint32_t starcat_below(uint32_t place, uint32_t count) {
+  return place < count ? place : 0u;
+}
+
+/* The place among the near stars of one of those within reach. */
+static inline uint32_t starcat_near(const starcat_workspace *w, uint32_t star) {
+  return starcat_below(w->within[star], STARCAT_MAX_STARS);
+}
+
+/* The place among those within reach of the star that a centroid is. */
+static inline uint32_t starcat_match(const starcat_workspace *w, uint32_t centroid) {
+  return starcat_below((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
+}
 
 /* The direction of a star. */
 static inline void starcat_star(const starcat_image *image, uint32_t row, real icrs[3]) {
@@ -177,7 +205,7 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
 int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
-int starcat_spend(starcat_workspace *work, uint32_t steps);
+int starcat_spend(const starcat_call *call, uint32_t steps);
 int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 int starcat_try(starcat_call *call, const real m[9], real focal);
 void starcat_project(const starcat_call *call, const real m[9], real margin_px);

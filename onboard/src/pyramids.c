@@ -113,6 +113,9 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
   if (o->is_marked == 0) {
     return 1;
   }
+  if (!starcat_spend(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS)) {
+    return 0; /* before the work: there may be as many pairs as the image has */
+  }
   for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
     w->corner[0][n] = UINT32_MAX;
     w->corner[1][n] = UINT32_MAX;
@@ -128,7 +131,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
       w->third[k] &= w->corner[own][k];
     }
   }
-  return starcat_spend(w, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS);
+  return 1;
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */
@@ -136,7 +139,7 @@ static int complete(starcat_call *call, const base *o, const real first[3], cons
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
-  if (!starcat_spend(call->work, STEPS_OF_THIRD)) {
+  if (!starcat_spend(call, STEPS_OF_THIRD)) {
     return 1;
   }
   starcat_cross(first, second, normal);
@@ -151,7 +154,7 @@ static int complete(starcat_call *call, const base *o, const real first[3], cons
     third[k] *= scale;
   }
   uint32_t count = starcat_gather(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
-  if (w->steps_left == 0u) {
+  if (call->own->steps_left == 0u) {
     return 1;
   }
   if (count > MOST_THIRD) {
@@ -214,7 +217,7 @@ int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sid
   }
   for (uint32_t pair = o.start; pair < o.stop; pair++) {
     uint32_t rows[3];
-    if (!starcat_spend(call->work, 1)) {
+    if (!starcat_spend(call, 1)) {
       return 1;
     }
     starcat_rows_of(image, pair, 2, rows);

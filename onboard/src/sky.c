@@ -79,7 +79,7 @@ uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos
   const real x = centre[0], y = centre[1], z = centre[2];
   const real level = STARCAT_SQRT(x * x + y * y);
   cap query = {image, centre, cos_r - COSINE_MARGIN,  rows, icrs, most,
-               0,     0,      call->work->steps_left};
+               0,     0,      call->own->steps_left};
   const int has_pole = (z >= cos_r) || (-z >= cos_r) || (level <= sin_r);
   const real high = z >= cos_r ? R(1.0) : z * cos_r + level * sin_r;
   const real low = -z >= cos_r ? R(-1.0) : z * cos_r - level * sin_r;
@@ -103,5 +103,5 @@ uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos
       }
     }
   }
-  return starcat_spend(call->work, query.visited) ? query.count : most + 1u;
+  return starcat_spend(call, query.visited) ? query.count : most + 1u;
 }

@@ -36,7 +36,7 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
 
 real starcat_side(const starcat_call *call, uint32_t i, uint32_t j) {
   const starcat_workspace *w = call->work;
-  return w->is_crowded != 0u ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
+  return call->own->is_crowded != 0u ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
                              : w->separation_rad[pair_of(i, j)];
 }
 
@@ -64,7 +64,7 @@ static int take(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t 
   const real sides[3] = {starcat_side(call, j, k), starcat_side(call, i, k),
                          starcat_side(call, i, j)};
   const int good = is_well_shaped(sides, s->least_side_rad, STARCAT_COS_MIN_ANGLE);
-  if (!starcat_spend(call->work, 1)) {
+  if (!starcat_spend(call, 1)) {
     return 1;
   }
   if ((s->poor != 0) == (good != 0)) {
@@ -108,7 +108,8 @@ static int by_brightness(starcat_call *call, search *s) {
 
 /* Whether pair a is to come before pair b: the closer one, else that of the earlier place. */
 static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
-  const real x = w->separation_rad[a], y = w->separation_rad[b];
+  const real x = w->separation_rad[starcat_below(a, STARCAT_MOST_PAIRS)];
+  const real y = w->separation_rad[starcat_below(b, STARCAT_MOST_PAIRS)];
   return (x < y) || (!(y < x) && (a < b));
 }
 
@@ -154,7 +155,8 @@ static int with_longest_side(starcat_call *call, search *s, uint16_t pair) {
  * pairs are sorted no further than they are needed. */
 static int by_longest_side(starcat_call *call, search *s) {
   starcat_workspace *w = call->work;
-  uint32_t count = s->count * (s->count - 1u) / 2u;
+  const uint32_t pairs = s->count * (s->count - 1u) / 2u;
+  uint32_t count = pairs;
   if (s->poor == 0) {
     for (uint32_t k = 1; k < s->count; k++) {
       separate(call, k);
@@ -166,11 +168,11 @@ static int by_longest_side(starcat_call *call, search *s) {
   for (uint32_t n = count / 2u; n > 0u; n--) {
     sift(w, n - 1u, count);
   }
-  if (!starcat_spend(w, 2u * count)) {
+  if (!starcat_spend(call, 2u * count)) {
     return 1;
   }
   while (count > 0u) {
-    const uint16_t closest = w->heap[0];
+    const uint16_t closest = (uint16_t)starcat_below(w->heap[0], pairs);
     count--;
     w->heap[0] = w->heap[count];
     sift(w, 0, count);
@@ -231,14 +233,15 @@ static int by_neighbours(starcat_call *call, search *s) {
   uint32_t most = 0;
   for (uint32_t i = 0; i < s->count; i++) {
     most = list_neighbours(call, i, s->count);
-    if (!starcat_spend(call->work, s->count)) {
+    if (!starcat_spend(call, s->count)) {
       return 1;
     }
   }
   for (uint32_t second = 1; second < most; second++) {
     for (uint32_t first = 0; first < second; first++) {
       for (uint32_t i = 0; i < s->count; i++) {
-        const uint32_t a = w->neighbour[i][first], b = w->neighbour[i][second];
+        const uint32_t a = starcat_below(w->neighbour[i][first], s->count);
+        const uint32_t b = starcat_below(w->neighbour[i][second], s->count);
         const uint32_t low = a < b ? a : b, high = a < b ? b : a;
         if (!is_earlier(w, a, i, b, first, second, a < i) &&
             !is_earlier(w, b, i, a, first, second, b < i) &&
@@ -253,12 +256,11 @@ static int by_neighbours(starcat_call *call, search *s) {
 }
 
 void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
-  starcat_workspace *w = call->work;
-  search s = {look_up, w->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
+  search s = {look_up, call->own->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
   s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
   s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
-  w->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (w->has_magnitudes == 0u);
-  if (w->is_crowded != 0u) {
+  call->own->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (call->own->has_magnitudes == 0u);
+  if (call->own->is_crowded != 0u) {
     s.count = s.count < STARCAT_SPREAD_CENTROIDS ? s.count : STARCAT_SPREAD_CENTROIDS;
     (void)by_neighbours(call, &s);
     return;
@@ -269,7 +271,7 @@ void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
   const uint32_t rounds = s.count <= STARCAT_FEW_CENTROIDS ? 2u : 1u;
   for (uint32_t n = 0; n < rounds; n++) {
     s.poor = n > 0u;
-    if ((w->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) != 0) {
+    if ((call->own->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) != 0) {
       return;
     }
   }
@@ -537,13 +539,13 @@ static int look_up(starcat_call *call, const sought *o, const real area[2], cons
   starcat_rows_between(image, area[0], area[1], &start, &stop);
   for (uint32_t row = start; row < stop; row += BLOCK) {
     const uint32_t count = stop - row < BLOCK ? stop - row : BLOCK;
-    if (!starcat_spend(call->work, count)) {
+    if (!starcat_spend(call, count)) {
       return 1;
     }
     if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
       for (uint32_t n = 0; n < count; n++) {
         if (((uint16_t)(image->radii[row + n] - low) <= width) &&
-            (!starcat_spend(call->work, STEPS_OF_SIDES) || compare(call, o, row + n))) {
+            (!starcat_spend(call, STEPS_OF_SIDES) || compare(call, o, row + n))) {
           return 1;
         }
       }
@@ -575,7 +577,7 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
     part[1] = part[1] < end ? part[1] : end;
     radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
     radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
-    if (look_up(call, o, part, radii) != 0) {
+    if (!starcat_spend(call, 1) || (look_up(call, o, part, radii) != 0)) {
       return 1;
     }
     part[0] = part[1];

@@ -9,19 +9,19 @@
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
 
 /* Take steps from what is left of the budget. Returns 0 if it is used up. */
-int starcat_spend(starcat_workspace *work, uint32_t steps) {
-  if (steps >= work->steps_left) {
-    work->steps_left = 0;
+int starcat_spend(const starcat_call *call, uint32_t steps) {
+  if (steps >= call->own->steps_left) {
+    call->own->steps_left = 0;
     return 0;
   }
-  work->steps_left -= steps;
+  call->own->steps_left -= steps;
   return 1;
 }
 
 /* Whether a centroid may be a star, by their magnitudes. */
 int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
-  const int16_t stored = call->image->magnitudes[row];
+  const int16_t stored = call->image->magnitudes[starcat_below(row, call->image->n_stars)];
   if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN) ||
       !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
     return 1;
@@ -36,7 +36,7 @@ void starcat_project(const starcat_call *call, const real m[9], real margin_px) 
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
   const real most_x = x0 + margin_px, most_y = y0 + margin_px;
   uint32_t count = 0;
-  for (uint32_t j = 0; j < w->n_near; j++) {
+  for (uint32_t j = 0; j < call->own->n_near; j++) {
     real body[3], x, y;
     starcat_turn(m, w->near_icrs[j], body);
     if (starcat_pixel(&call->camera, body, &x, &y) != 0) {
@@ -47,7 +47,7 @@ void starcat_project(const starcat_call *call, const real m[9], real margin_px) 
       count += (uint32_t)((dx <= most_x) && (-dx <= most_x) && (dy <= most_y) && (-dy <= most_y));
     }
   }
-  w->n_within = count;
+  call->own->n_within = count;
 }
 
 /* The column of the detector that a place is in; the first or the last one outside of it. */
@@ -66,16 +66,16 @@ void starcat_list_columns(starcat_call *call) {
   for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
     w->column[n] = 0;
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     w->column[column_of(call, w->x[i])]++;
   }
   for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
     w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
   }
-  for (uint32_t i = w->count; i > 0u; i--) { /* where it begins */
+  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
     const uint32_t n = column_of(call, w->x[i - 1u]);
     w->column[n]--;
-    w->in_column[w->column[n]] = (uint16_t)(i - 1u);
+    w->in_column[starcat_below(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
   }
 }
 
@@ -86,11 +86,12 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
   const real x = w->x_of[k], y = w->y_of[k];
   const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
   w->nearest[k] = UINT16_MAX;
-  for (uint32_t n = w->column[column_of(call, x - reach_px)]; n < stop; n++) {
-    const uint32_t i = w->in_column[n];
+  for (uint32_t n = w->column[column_of(call, x - reach_px)];
+       (n < stop) && (n < STARCAT_MAX_CENTROIDS); n++) {
+    const uint32_t i = starcat_below(w->in_column[n], STARCAT_MAX_CENTROIDS);
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     const real square = dx * dx + dy * dy;
-    if ((square <= reach) && starcat_compatible(call, i, w->near_row[w->within[k]])) {
+    if ((square <= reach) && starcat_compatible(call, i, w->near_row[starcat_near(w, k)])) {
       if ((w->match[i] < 0) || (square < w->match_square[i])) {
         w->match_square[i] = square;
         w->match[i] = (int16_t)k;
@@ -109,14 +110,14 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
 static uint32_t match(const starcat_call *call, real reach_px) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     w->match[i] = -1;
   }
-  for (uint32_t k = 0; k < w->n_within; k++) {
+  for (uint32_t k = 0; k < call->own->n_within; k++) {
     match_star(call, k, reach_px, reach_px * reach_px);
   }
-  for (uint32_t i = 0; i < w->count; i++) {
-    if ((w->match[i] >= 0) && (w->nearest[w->match[i]] != i)) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if ((w->match[i] >= 0) && (w->nearest[starcat_match(w, i)] != i)) {
       w->match[i] = -1;
     }
     matched += (uint32_t)(w->match[i] >= 0);
@@ -125,10 +126,11 @@ static uint32_t match(const starcat_call *call, real reach_px) {
 }
 
 /* Remember the matches; returns whether they are those that were remembered. */
-static int is_as_before(starcat_workspace *w) {
+static int is_as_before(const starcat_call *call) {
+  starcat_workspace *w = call->work;
   int same = 1;
-  for (uint32_t i = 0; i < w->count; i++) {
-    const int16_t star = (int16_t)(w->match[i] >= 0 ? w->within[w->match[i]] : -1);
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    const int16_t star = (int16_t)(w->match[i] >= 0 ? w->within[starcat_match(w, i)] : -1);
     same &= w->before[i] == star;
     w->before[i] = star;
   }
@@ -184,9 +186,9 @@ static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
   uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
   uint32_t n = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      which[n] = w->within[w->match[i]];
+      which[n] = (uint16_t)starcat_near(w, starcat_match(w, i));
       of[n] = (uint16_t)i;
       n++;
     }
@@ -214,8 +216,8 @@ static int gather(const starcat_call *call, const real m[9]) {
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
   }
-  w->n_near = starcat_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
-  return w->n_near <= STARCAT_MAX_STARS;
+  call->own->n_near = starcat_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
+  return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
 /* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
@@ -226,18 +228,21 @@ static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
   if (!gather(call, m)) {
     return 0;
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     w->before[i] = -2;
   }
   for (uint32_t n = 0; n < r->count + STARCAT_REFINEMENTS; n++) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
     starcat_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
-    matched = match(call, factor * call->reach_px);
-    if (!starcat_spend(w, w->n_near + w->count * (w->n_within + 1u) + STEPS_OF_MATCH * matched)) {
+    if (!starcat_spend(call, call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
       return 0;
     }
-    if ((matched < STARCAT_MIN_STARS) || (is_as_before(w) && is_final)) {
+    matched = match(call, factor * call->reach_px);
+    if (!starcat_spend(call, STEPS_OF_MATCH * matched)) {
+      return 0;
+    }
+    if ((matched < STARCAT_MIN_STARS) || (is_as_before(call) && is_final)) {
       break;
     }
     refine_matched(call, m);
@@ -248,13 +253,12 @@ static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
 /* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
  * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
 static int spend_on_bound(const starcat_call *call) {
-  starcat_workspace *w = call->work;
-  const uint32_t most = w->count < w->n_within ? w->count : w->n_within;
-  uint32_t steps = STEPS_OF_MATCH * (w->count + w->n_within);
+  const uint32_t most = call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
+  uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
   if (call->mag_reach > R(0.0)) {
-    steps += w->count * w->n_within + (w->count + w->n_within) * most;
+    steps += call->own->count * call->own->n_within + (call->own->count + call->own->n_within) * most;
   }
-  return starcat_spend(w, steps);
+  return starcat_spend(call, steps);
 }
 
 static void withhold(starcat_agreement *found, uint32_t reason) {
@@ -285,10 +289,10 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
     found->n_matched = 0; /* as if it had not been found */
     return;
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     found->star[i] = STARCAT_NO_STAR;
     if (w->match[i] >= 0) {
-      const uint32_t j = w->within[w->match[i]];
+      const uint32_t j = starcat_near(w, starcat_match(w, i));
       real body[3];
       starcat_turn(m, w->near_icrs[j], body);
       square_rad += starcat_chord_square(call->body[i], body);
@@ -302,7 +306,7 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
   if (found->log_bound < R(0.0)) {
     starcat_weigh(call, m, factor * call->tolerance_rad, found);
     if ((found->share < STARCAT_MIN_SHARE) &&
-        !((found->is_firm != 0u) && (found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
+        ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
       withhold(found, STARCAT_REASON_SHARE);
     } else if (starcat_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
       withhold(found, STARCAT_REASON_SCALE);
@@ -311,16 +315,17 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
 }
 
 /* List the centroids without a star that are near the star of another one. */
-static void find_rivals(const starcat_call *call) {
+static uint32_t find_rivals(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const real reach_px = STARCAT_RIVAL_REACH * call->reach_px;
-  w->n_rivals = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
+  uint32_t n = 0;
+  for (uint32_t i = 0; i < call->own->count; i++) {
     real least = reach_px * reach_px;
-    uint32_t of = w->count;
-    for (uint32_t k = 0; (k < w->count) && (w->match[i] < 0); k++) {
+    uint32_t of = call->own->count;
+    for (uint32_t k = 0; (k < call->own->count) && (w->match[i] < 0); k++) {
       if (w->match[k] >= 0) {
-        const real dx = w->x[i] - w->x_of[w->match[k]], dy = w->y[i] - w->y_of[w->match[k]];
+        const uint32_t star = starcat_match(w, k);
+        const real dx = w->x[i] - w->x_of[star], dy = w->y[i] - w->y_of[star];
         const real square = dx * dx + dy * dy;
         if (square < least) {
           least = square;
@@ -328,12 +333,13 @@ static void find_rivals(const starcat_call *call) {
         }
       }
     }
-    if ((of < w->count) && starcat_compatible(call, i, w->near_row[w->within[w->match[of]]])) {
-      w->rival[w->n_rivals] = (uint16_t)i;
-      w->rival_of[w->n_rivals] = (uint16_t)of;
-      w->n_rivals++;
+    if ((of < call->own->count) && starcat_compatible(call, i, w->near_row[starcat_near(w, starcat_match(w, of))])) {
+      w->rival[n] = (uint16_t)i;
+      w->rival_of[n] = (uint16_t)of;
+      n++;
     }
   }
+  return n;
 }
 
 /* Give the star of a centroid to its rival, and fit the attitude to that. */
@@ -342,10 +348,10 @@ static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, rea
   real icrs[STARCAT_MAX_CENTROIDS][3];
   uint16_t of[STARCAT_MAX_CENTROIDS];
   uint32_t n = 0;
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     const uint32_t owner = i == rival ? centroid : i;
     if ((i != centroid) && (w->found.star[owner] >= 0)) {
-      starcat_star(call->image, (uint32_t)w->found.star[owner], icrs[n]);
+      starcat_star(call->image, starcat_below((uint32_t)w->found.star[owner], call->image->n_stars), icrs[n]);
       of[n] = (uint16_t)i;
       n++;
     }
@@ -366,11 +372,14 @@ static void begin_at(starcat_call *call, const starcat_agreement *from, real m[9
  * is taken. */
 static void try_rivals(starcat_call *call) {
   starcat_workspace *w = call->work;
-  find_rivals(call);
-  for (uint32_t n = 0; n < w->n_rivals; n++) {
+  const uint32_t count = find_rivals(call);
+  for (uint32_t n = 0; n < count; n++) {
     real m[9];
+    if (!starcat_spend(call, STEPS_OF_MATCH * w->found.n_matched)) {
+      return;
+    }
     begin_at(call, &w->found, m);
-    fit_rival(call, w->rival[n], w->rival_of[n], m);
+    fit_rival(call, w->rival[n], starcat_below(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
     judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
     /* The fit may lead back to where it began, but for rounding. */
     if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
@@ -386,13 +395,14 @@ static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
          (!(b->log_chance < a->log_chance) && (a->log_bound < b->log_bound));
 }
 
-/* How many of the matched centroids are within smaller reaches: halves of the one before. */
-static void count_nearer(const starcat_call *call, uint32_t nearer[3]) {
+/* How many of the matched centroids are within smaller reaches: halves of the one before. Where none
+ * matched, nothing may be known of their places. */
+static void count_nearer(const starcat_call *call, uint32_t matched, uint32_t nearer[3]) {
   const starcat_workspace *w = call->work;
   for (uint32_t k = 0; k < 3u; k++) {
     const real reach = call->reach_px / (real)(2u << k);
     nearer[k] = 0;
-    for (uint32_t i = 0; i < w->count; i++) {
+    for (uint32_t i = 0; (i < call->own->count) && (matched > 0u); i++) {
       nearer[k] += (uint32_t)((w->match[i] >= 0) && (w->match_square[i] <= reach * reach));
     }
   }
@@ -449,14 +459,14 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   for (uint32_t k = 0; k < 9u; k++) {
     attitude[k] = m[k];
   }
-  w->n_tried++;
-  if (!starcat_spend(w, STEPS_OF_TRY)) {
+  call->own->n_tried++;
+  if (!starcat_spend(call, STEPS_OF_TRY)) {
     return 1;
   }
   starcat_set_focal(call, focal);
   judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
-  count_nearer(call, nearer);
+  count_nearer(call, count, nearer);
   if (found->log_chance < R(0.0)) {
     try_rivals(call);
   }
@@ -479,5 +489,5 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
     w->best = *found;
   }
-  return (w->best.log_chance <= call->log_certain) || (w->steps_left == 0u);
+  return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
 }

@@ -102,7 +102,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n) {
       logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
                   (real)n * w->log_largest[bound];
       if (bound >= 2u) {
-        logarithm += filled(bound == 2u ? w->n_within : w->count, n);
+        logarithm += filled(bound == 2u ? call->own->n_within : call->own->count, n);
       }
     }
     least = logarithm < least ? logarithm : least;
@@ -116,27 +116,27 @@ static void count_compatible(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const real reach = call->mag_reach;
   uint16_t unknown = 0;
-  for (uint32_t j = 0; j < w->n_within; j++) {
-    const int16_t stored = call->image->magnitudes[w->near_row[w->within[j]]];
+  for (uint32_t j = 0; j < call->own->n_within; j++) {
+    const int16_t stored = call->image->magnitudes[starcat_below(w->near_row[starcat_near(w, j)], call->image->n_stars)];
     const int is_known = stored != INT16_MIN;
     w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
-    w->nearest[j] = is_known ? 0u : (uint16_t)w->count;
+    w->nearest[j] = is_known ? 0u : (uint16_t)call->own->count;
     unknown = (uint16_t)(unknown + (is_known ? 0u : 1u));
   }
-  for (uint32_t i = 0; i < w->count; i++) {
+  for (uint32_t i = 0; i < call->own->count; i++) {
     const real observed = w->magnitude[i];
     const int is_known = observed < STARCAT_UNKNOWN_MAGNITUDE;
     uint16_t some = unknown;
-    for (uint32_t j = 0; j < w->n_within; j++) {
+    for (uint32_t j = 0; j < call->own->n_within; j++) {
       const real apart = observed - w->nearest_square[j];
       const uint16_t fits = (uint16_t)((apart <= reach) & (-apart <= reach));
       some = (uint16_t)(some + fits);
       w->nearest[j] = (uint16_t)(w->nearest[j] + fits);
     }
-    for (uint32_t j = 0; !is_known && (j < w->n_within); j++) {
+    for (uint32_t j = 0; !is_known && (j < call->own->n_within); j++) {
       w->nearest[j] = (uint16_t)(w->nearest[j] + (w->nearest_square[j] < FAR_MAGNITUDE ? 1u : 0u));
     }
-    w->compatible[i] = is_known ? some : (uint16_t)w->n_within;
+    w->compatible[i] = is_known ? some : (uint16_t)call->own->n_within;
   }
 }
 
@@ -144,17 +144,17 @@ static void count_compatible(const starcat_call *call) {
  * are stated four bounds of those of like magnitude, from the centroids and from the stars. */
 void starcat_count_ways(const starcat_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
-  const uint32_t stars = w->n_within;
+  const uint32_t stars = call->own->n_within;
   w->log_ways[0] = R(0.0);
   for (uint32_t n = 1; n <= most; n++) {
-    w->log_ways[n] = w->log_ways[n - 1u] + STARCAT_LOG((real)(w->count - n + 1u) *
+    w->log_ways[n] = w->log_ways[n - 1u] + STARCAT_LOG((real)(call->own->count - n + 1u) *
                                                        (real)(stars - n + 1u) / (real)n);
   }
   if (call->mag_reach > R(0.0)) {
     count_compatible(call);
-    add_up(w, 0, w->compatible, w->count, most);
+    add_up(w, 0, w->compatible, call->own->count, most);
     add_up(w, 1, w->nearest, stars, most);
-    add_up(w, 2, w->compatible, w->count, most);
+    add_up(w, 2, w->compatible, call->own->count, most);
     add_up(w, 3, w->nearest, stars, most);
   }
 }

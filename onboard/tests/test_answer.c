@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "internal.h"
+#include "traps.h"
 #include "unit.h"
 
 #define NOISE_PX 0.2
@@ -94,6 +95,8 @@ static void check_unknown(unit_sky *sky) {
 /* Stars at one place determine no attitude. */
 static void check_one_place(const unit_sky *sky) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+  static const starcat_real axis[2][3] = {{0, 0, 1}, {1, 0, 0}};
+  starcat_real star[3], other[3];
   starcat_call call;
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   const starcat_agreement best = unit_work.best;
@@ -101,12 +104,73 @@ static void check_one_place(const unit_sky *sky) {
                          &unit_result),
            STARCAT_IDENTIFIED);
   unit_work.best = best;
-  for (uint32_t i = 0; i < unit_work.count; i++) {
-    unit_work.body[i][0] = unit_work.body[i][1] = (starcat_real)0.0;
-    unit_work.body[i][2] = (starcat_real)1.0;
+  for (uint32_t i = 0; i < call.own->count; i++) {
+    unit_work.x[i] = call.camera.half_width;
+    unit_work.y[i] = call.camera.half_height;
+    unit_work.best.star[i] = 0;
   }
+  starcat_star(&sky->image, 0, star);
+  starcat_star(&sky->image, 1, other);
+  CHECK(starcat_triad(axis[0], axis[1], star, other, unit_work.best.matrix));
   CHECK_IS(starcat_end(&call, &sky->options, &unit_result), STARCAT_IDENTIFIED);
   CHECK(unit_result.covariance_rad2[0] == (starcat_real)0.0);
+}
+
+/* An agreement that a flipped bit has changed since it was verified: its attitude, its bound or its
+ * stars. */
+static void check_changed(const unit_sky *sky) {
+  static const starcat_real other = (starcat_real)-1.0;
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+  starcat_call call;
+  CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
+  const starcat_agreement best = unit_work.best;
+  for (uint32_t n = 0; n < 6u; n++) {
+    CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                           &unit_result),
+             STARCAT_IDENTIFIED);
+    unit_work.best = best;
+    for (uint32_t k = 0; k < 6u; k++) { /* turned by a half */
+      unit_work.best.matrix[k] *= n == 1u ? other : (starcat_real)1.0;
+    }
+    unit_work.best.log_bound = n == 2u ? (starcat_real)0.0 : best.log_bound;
+    for (uint32_t k = 0; k < STARCAT_MAX_CENTROIDS; k++) {
+      unit_work.best.star[k] = n == 3u ? -1 : best.star[k];
+      unit_work.best.star[k] ^= (n == 4u) && (best.star[k] >= 0) ? 0x40000000 : 0;
+    }
+    for (uint32_t k = 6; k < 9u; k++) { /* all that was before the camera is behind it */
+      unit_work.best.matrix[k] *= n == 5u ? other : (starcat_real)1.0;
+    }
+    CHECK_IS(starcat_end(&call, &sky->options, &unit_result),
+             n == 0u ? STARCAT_IDENTIFIED : STARCAT_NO_MATCH);
+    CHECK((unit_result.n_matched > 0u) == (n == 0u));
+  }
+}
+
+/* Whatever numbers of the workspace lead to a place, they lead to none outside of it. */
+static void check_places(const unit_sky *sky) {
+  const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+  starcat_call call;
+  starcat_real m[9];
+  CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
+  memcpy(m, unit_result.matrix, sizeof m);
+  CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                         &unit_result),
+           STARCAT_IDENTIFIED);
+  traps_off(); /* the numbers make no sense, and may be none */
+  memset(unit_work.in_column, 0xff, sizeof unit_work.in_column);
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) {
+    unit_work.column[n] = n % 2u == 0u ? 0u : UINT16_MAX;
+  }
+  (void)starcat_try(&call, m, (starcat_real)1.0);
+  memset(unit_work.row, 0x7f, sizeof unit_work.row);
+  memset(unit_work.within, 0x7f, sizeof unit_work.within);
+  memset(unit_work.near_row, 0x7f, sizeof unit_work.near_row);
+  memset(unit_work.match, 0x7f, sizeof unit_work.match);
+  starcat_count_ways(&call, 4);
+  CHECK(starcat_is_scaled(&call, 4, (starcat_real)1e6) == 0);
+  starcat_weigh(&call, m, call.tolerance_rad, &unit_work.found);
+  (void)starcat_end(&call, &sky->options, &unit_result);
+  traps_on();
 }
 
 /* An answer that is fitted once more, with the stars turned about the pole: its attitude is turned
@@ -139,6 +203,8 @@ void test_answer(void) {
   unit_sky *sky = &unit_scratch;
   unit_copy(&unit_triangle);
   check_unknown(sky);
+  check_changed(sky);
+  check_places(sky);
   check_one_place(sky);
   check_other_directions(sky);
   for (int is_weighted = 0; is_weighted < 2; is_weighted++) {

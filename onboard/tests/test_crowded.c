@@ -51,7 +51,7 @@ static double apart(uint32_t i, uint32_t j) {
 /* Whether centroid j is one of the nearest ones of i. */
 static int is_near(uint32_t i, uint32_t j) {
   uint32_t nearer = 0;
-  for (uint32_t k = 0; k < unit_work.count; k++) {
+  for (uint32_t k = 0; k < call.own->count; k++) {
     nearer += (uint32_t)((k != i) && (k != j) && (apart(i, k) < apart(i, j)));
   }
   return nearer < STARCAT_NEIGHBOURS;
@@ -73,7 +73,7 @@ static void check_each_once(void) {
   uint32_t expected = 0, missing = 0;
   sky_look(&sky.image, &sky.camera, &state, 0.0, SPOTS, SPOTS - 1u, &truth);
   CHECK_IS(begin(&sky), STARCAT_IDENTIFIED);
-  CHECK_IS(unit_work.count, SPOTS);
+  CHECK_IS(call.own->count, SPOTS);
   n_taken = n_again = 0;
   memset(is_taken, 0, sizeof is_taken);
   starcat_each_triangle(&call, count_taken);

@@ -39,11 +39,11 @@ static void check_degenerate(void) {
   CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
   starcat_agreement weighed = unit_work.best;
   weighed.residual_rad = (starcat_real)0.0;
-  unit_work.n_within++; /* one more star than was matched, so that a share is worked out */
-  unit_work.within[unit_work.n_within - 1u] = unit_work.within[0];
+  call.own->n_within++; /* one more star than was matched, so that a share is worked out */
+  unit_work.within[call.own->n_within - 1u] = unit_work.within[0];
   starcat_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
   CHECK((weighed.share > (starcat_real)0.5) && (weighed.is_firm != 0u));
-  for (uint32_t i = 0; i < unit_work.count; i++) {
+  for (uint32_t i = 0; i < call.own->count; i++) {
     unit_work.match[i] = -1;
   }
   CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
@@ -66,13 +66,13 @@ static void check_coincident(void) {
           starcat_angle_of_chord(starcat_chord_square(body[t[0]], body[t[2]])),
           starcat_angle_of_chord(starcat_chord_square(body[t[0]], body[t[1]]))};
       memcpy(unit_work.body, body, sizeof body);
-      unit_work.steps_left = 1000000;
+      call.own->steps_left = 1000000;
       memcpy(unit_work.body[t[1]], unit_work.body[t[0]], sizeof body[0]);
       CHECK_IS(starcat_triangle(&call, t, sides), 0);
       CHECK_IS(starcat_triangle(&call, t, line), 0);
     }
   }
-  CHECK_IS(unit_work.n_tried, 0);
+  CHECK_IS(call.own->n_tried, 0);
 }
 
 #ifndef STARCAT_SINGLE
@@ -106,7 +106,7 @@ static void check_too_near(void) {
   unit_scratch.image.kvector_slope = (starcat_real)1e5; /* every side is that of the first pairs */
   call.tolerance_rad = (starcat_real)2e-8;
   CHECK_IS(starcat_pyramid(&call, triple, sides), 0);
-  CHECK_IS(unit_work.n_tried, 0);
+  CHECK_IS(call.own->n_tried, 0);
 }
 #endif
 
@@ -185,9 +185,9 @@ static void check_bounds_of_shapes(void) {
     const starcat_real sides[3] = {(starcat_real)size[0], (starcat_real)size[1],
                                    (starcat_real)size[2]};
     call.tolerance_rad = (starcat_real)errors[n / 4u];
-    unit_work.steps_left = 20000;
+    call.own->steps_left = 20000;
     const int has_ended = starcat_triangle(&call, triple, sides);
-    CHECK((has_ended == 0) || (unit_work.steps_left == 0u) ||
+    CHECK((has_ended == 0) || (call.own->steps_left == 0u) ||
           (unit_work.best.log_chance <= call.log_certain));
   }
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
@@ -196,13 +196,13 @@ static void check_bounds_of_shapes(void) {
     unit_work.x[SKY_SPOTS - 1u] = unit_work.x[0];
     unit_work.y[SKY_SPOTS - 1u] = unit_work.y[0];
     starcat_list_columns(&call);
-    for (uint32_t at = 1; (n > 0u) && (at < unit_work.count); at++) {
+    for (uint32_t at = 1; (n > 0u) && (at < call.own->count); at++) {
       if (unit_work.in_column[at] == SKY_SPOTS - 1u) {
         unit_work.in_column[at] = unit_work.in_column[at - 1u];
         unit_work.in_column[at - 1u] = SKY_SPOTS - 1u;
       }
     }
-    unit_work.steps_left = 1000000;
+    call.own->steps_left = 1000000;
     unit_matrix_of(&truth, m);
     (void)starcat_try(&call, m, (starcat_real)1.0);
     CHECK(unit_work.found.star[0] >= 0);
@@ -374,16 +374,16 @@ static void check_ways(void) {
   const double all = (double)unit_work.log_ways[5];
   CHECK_NEAR((double)starcat_log_ways(&call, 5), all, 1e-4);
   /* Of more stars than single precision adds up in units of the largest number. */
-  const uint32_t stars = unit_work.n_within;
+  const uint32_t stars = call.own->n_within;
   for (uint32_t j = stars; j < 180u; j++) {
     unit_work.within[j] = unit_work.within[j - stars];
   }
-  unit_work.n_within = 180;
+  call.own->n_within = 180;
   starcat_count_ways(&call, SKY_SPOTS);
   CHECK_NEAR((double)starcat_log_ways(&call, SKY_SPOTS), (double)unit_work.log_ways[SKY_SPOTS],
              1e-3);
-  unit_work.n_within = stars;
-  for (uint32_t i = 0; i < unit_work.count; i++) {
+  call.own->n_within = stars;
+  for (uint32_t i = 0; i < call.own->count; i++) {
     unit_work.magnitude[i] = (starcat_real)1000.0;
   }
   starcat_count_ways(&call, 5);
@@ -430,7 +430,7 @@ static void check_cap(const double centre[3], double cosine, double sine, uint32
   const starcat_real cos_r = (starcat_real)cosine;
   const starcat_real margin = (starcat_real)IF_SINGLE(7e-7, 2e-9);
   uint32_t within = 0, beside = 0, missing = 0;
-  unit_work.steps_left = 1000000;
+  call.own->steps_left = 1000000;
   const uint32_t count = starcat_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real star[3];
@@ -459,7 +459,7 @@ static void check_narrow_caps(void) {
     for (uint32_t k = 0; k < 3u; k++) {
       centre[k] /= length;
     }
-    unit_work.steps_left = 1000000;
+    call.own->steps_left = 1000000;
     const uint32_t count = starcat_gather(&call, centre, (starcat_real)(1.0 - 5e-13),
                                           (starcat_real)1e-6, 8, rows, icrs);
     missing += (uint32_t)!is_listed(rows, count, row);
@@ -550,7 +550,7 @@ static void check_clusters(void) {
       m[6u + k] = z - turn * x;
     }
     certain += (uint32_t)starcat_try(&call, m, (starcat_real)1.0);
-    for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < unit_work.count);
+    for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < call.own->count);
          k++) {
       const int32_t star = unit_work.best.star[k];
       wrong += (uint32_t)((star >= 0) && (truth.star[unit_work.row[k]] >= 0) &&

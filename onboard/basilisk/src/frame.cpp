@@ -21,6 +21,7 @@ struct Body {
   double glare_mag, glare_rad;      // loss of limit at its edge, and the angle by which it falls to 1/e
   double lit;                       // 1: its edge at the field is in the Sun, 0: in the dark
   double false_lit, false_dark;     // false centroids that it makes
+  double false_rad;                 // how far beyond its edge
   double brightest_mag;             // of these, below the limit
 
   double above(const Vector &direction) const {
@@ -45,15 +46,30 @@ double lit_edge(const Scene &scene, const Vector &towards) {
 }
 
 Body moon_of(const Scene &scene) {
-  return {scene.moon_m.normalized(), std::asin(kMoonRadius_m / scene.moon_m.norm()),
-          4.0, 1.5 * kDegree, 1.0, 3.0, 3.0, 5.0};
+  Body moon{};
+  moon.middle = scene.moon_m.normalized();
+  moon.radius_rad = std::asin(kMoonRadius_m / scene.moon_m.norm());
+  moon.glare_mag = 4.0;
+  moon.glare_rad = 1.5 * kDegree;
+  moon.lit = 1.0;
+  moon.false_lit = 3.0;
+  moon.false_rad = 0.1 * kDegree;
+  moon.brightest_mag = 5.0;
+  return moon;
 }
 
 Body earth_of(const Scene &scene) {
-  const Vector axis = scene.camera_from_icrs.row(2);
-  const double sine = std::min(kEarthRadius_m / scene.earth_m.norm(), 1.0);
-  return {scene.earth_m.normalized(), std::asin(sine), 6.0, 6.0 * kDegree,
-          lit_edge(scene, axis), 12.0, 1.0, 4.0};
+  Body earth{};
+  earth.middle = scene.earth_m.normalized();
+  earth.radius_rad = std::asin(std::min(kEarthRadius_m / scene.earth_m.norm(), 1.0));
+  earth.glare_mag = 6.0;
+  earth.glare_rad = 6.0 * kDegree;
+  earth.lit = lit_edge(scene, scene.camera_from_icrs.row(2));
+  earth.false_lit = 12.0;
+  earth.false_dark = 1.0;
+  earth.false_rad = 0.3 * kDegree;
+  earth.brightest_mag = 4.0;
+  return earth;
 }
 
 Centroid measured(const Optics &optics, double x, double y, double mag, double limit_mag,
@@ -135,13 +151,13 @@ void add_pieces(const Body &body, const Lens &lens, const Optics &optics, const 
   double reach = 0.5 * std::max(lens.width_px, lens.height_px);
   if (body.radius_rad < 2.0 * kDegree) {
     lens.project(scene.camera_from_icrs * body.middle, x, y);
-    reach = 1.5 * body.radius_rad * lens.focal_length_px;
+    reach = (body.radius_rad + body.false_rad) * lens.focal_length_px;
   }
   for (int piece = 0, tries = 0; piece < count && tries < kTries * count; tries++) {
     const double at_x = x + reach * (2.0 * random.uniform() - 1.0);
     const double at_y = y + reach * (2.0 * random.uniform() - 1.0);
     const Vector u = scene.camera_from_icrs.transpose() * lens.direction(at_x, at_y);
-    if (lens.contains(at_x, at_y) && body.above(u) < 0.3 * body.radius_rad * (1.0 - body.radius_rad)) {
+    if (lens.contains(at_x, at_y) && body.above(u) < body.false_rad) {
       const double mag = optics.limit_mag - body.brightest_mag * random.uniform();
       centroids.push_back(measured(optics, at_x, at_y, mag, optics.limit_mag, 0.0, random));
       piece++;

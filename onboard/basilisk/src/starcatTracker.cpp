@@ -49,7 +49,8 @@ struct StarcatTracker::Parts {
   std::unique_ptr<starcat::matcher> matcher;
   star_camera::Lens lens{};
   std::vector<star_camera::Star> sky;
-  star_camera::Random random{0};
+  star_camera::Random random{0}, drops{0};  // the same frames are dropped whatever is in them
+  std::vector<Centroid> last;
 };
 
 // The centroids of a frame, without what only the simulation knows.
@@ -102,6 +103,22 @@ void StarcatTracker::setSky(const std::vector<double> &directions,
 
 void StarcatTracker::setOutages(const std::vector<double> &times) { outages = times; }
 
+std::vector<double> StarcatTracker::lastCentroids() const {
+  std::vector<double> numbers;
+  for (const Centroid &one : parts->last) {
+    numbers.insert(numbers.end(), {one.x_px, one.y_px, one.mag});
+  }
+  return numbers;
+}
+
+std::vector<long long> StarcatTracker::lastIds() const {
+  std::vector<long long> ids;
+  for (const Centroid &one : parts->last) {
+    ids.push_back(one.id);
+  }
+  return ids;
+}
+
 double StarcatTracker::focalLength() const { return parts->lens.focal_length_px; }
 
 double StarcatTracker::cornerAngle() const { return parts->lens.corner_rad(); }
@@ -115,11 +132,13 @@ void StarcatTracker::Reset(uint64_t) {
     bskLogger.bskError("starcatTracker: call loadImage and setSky before the simulation starts");
   }
   parts->random = star_camera::Random(RNGSeed);
+  parts->drops = star_camera::Random(~static_cast<std::uint64_t>(RNGSeed));
 }
 
 void StarcatTracker::UpdateState(uint64_t now) {
   StarcatFrameMsgPayload frame = {};
   frame.timeTag = now;
+  parts->last.clear();
   if (isDropped(static_cast<double>(now) * kNano)) {
     frame.outcome = STARCAT_OUTCOME_DROPPED;
   } else {
@@ -129,7 +148,7 @@ void StarcatTracker::UpdateState(uint64_t now) {
 }
 
 bool StarcatTracker::isDropped(double time_s) {
-  bool dropped = parts->random.uniform() < droppedShare;
+  bool dropped = parts->drops.uniform() < droppedShare;
   for (std::size_t n = 0; n + 1 < outages.size(); n += 2) {
     dropped = dropped || (time_s >= outages[n] && time_s < outages[n + 1]);
   }
@@ -161,6 +180,7 @@ void StarcatTracker::see(uint64_t now, StarcatFrameMsgPayload &frame) {
   optics.missed_share = missedShare;
   optics.false_mean = falseMean;
   const auto seen = star_camera::expose(parts->sky, parts->lens, optics, scene, parts->random);
+  parts->last = seen.centroids;
   frame.streak_px = seen.streak_px;
   frame.moonSeen = seen.moon_seen;
   frame.earthSeen = seen.earth_seen;

@@ -45,6 +45,9 @@ class StarcatTracker : public SysModel {
               const std::vector<long long> &ids);
   //! times without frames: begin and end one after the other [s]
   void setOutages(const std::vector<double> &times);
+  //! the last frame: x and y [px] and magnitude of each centroid, one after the other
+  std::vector<double> lastCentroids() const;
+  std::vector<long long> lastIds() const;  //!< and its star's number in the catalog; 0: none
   double focalLength() const;  //!< [px] of the camera that the image was built for
   double cornerAngle() const;  //!< [rad] from its boresight to a corner of the field
 

@@ -8,9 +8,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from Basilisk.architecture.bskLogging import BasiliskError
 
 from starcat_basilisk.results import content_of, drawing_of, flight_of, rows_of, table_of
 from starcat_basilisk.scenario import SEED, simulate, the_orbit
+
+LONGEST_MIN = 1440.0
+LARGEST_SEED = 2**32 - 2  # Basilisk's have 32 bits, and two more follow for gyro and orbit
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,11 +34,16 @@ def main(arguments: list[str] | None = None) -> int:
             "starcat export DATABASE --to onboard -o FILE"
         )
     minutes = the_orbit().period_min if given.minutes is None else given.minutes
-    if not minutes > 0.0:
-        reader.error(f"--minutes is {minutes}; expected a number above 0")
-    orbit, records, tracker = simulate(
-        given.image, minutes, given.seed, with_prior=not given.without_prior
-    )
+    if not 0.0 < minutes <= LONGEST_MIN:
+        reader.error(f"--minutes is {minutes:g}; expected a number above 0, to {LONGEST_MIN:g}")
+    if not 0 <= given.seed < LARGEST_SEED:
+        reader.error(f"--seed is {given.seed}; expected a number from 0, below {LARGEST_SEED:,}")
+    try:
+        orbit, records, tracker = simulate(
+            given.image, minutes, given.seed, with_prior=not given.without_prior
+        )
+    except BasiliskError as error:
+        reader.error(str(error))
     flight = flight_of(orbit, records)
     scale_arcsec = np.degrees(1.0 / tracker.focalLength()) * 3600.0
     rows = rows_of(orbit, flight, scale_arcsec, tracker.cornerAngle())

@@ -13,6 +13,9 @@
  * multiple of 8. */
 #define STARCAT_APP_PLACE_BYTES 4194304
 
+/* Bytes of the largest patch of an image, a multiple of 4. */
+#define STARCAT_APP_PATCH_BYTES 262144
+
 /* Images that are read into the places at the start. The second one need not be there. */
 #define STARCAT_APP_IMAGE_FILE       "/cf/starcat.img"
 #define STARCAT_APP_OTHER_IMAGE_FILE "/cf/starcat2.img"

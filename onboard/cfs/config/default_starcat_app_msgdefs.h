@@ -51,6 +51,10 @@ typedef struct {
 } STARCAT_APP_LoadImage_Payload_t;
 
 typedef struct {
+  char Path[STARCAT_APP_PATH_LEN]; /* file of the patch */
+} STARCAT_APP_LoadPatch_Payload_t;
+
+typedef struct {
   STARCAT_APP_Camera_t Camera; /* camera to be used from now on */
 } STARCAT_APP_SetCamera_Payload_t;
 
@@ -104,8 +108,8 @@ typedef struct {
   uint8 LoadState;                 /* 0: none, 1: reading, 2: checking, 3: ready, 4: failed */
   uint8 Spare[2];                  /* zeros */
   uint32 ImageBytes;               /* size of the image in use */
-  uint32 LoadBytes;                /* bytes of the new image that were read */
-  uint32 LoadSize;                 /* size of the new image */
+  uint32 LoadBytes;                /* bytes of the new image, or patch, that were read */
+  uint32 LoadSize;                 /* size of the new image, or patch */
   uint32 MaxSteps;                 /* steps that a frame may take */
   uint32 ScrubBlock;               /* block that is checked next */
   uint32 ScrubPasses;              /* how often the whole image was checked */

@@ -29,6 +29,11 @@ typedef struct {
 
 typedef struct {
   CFE_MSG_CommandHeader_t CommandHeader;
+  STARCAT_APP_LoadPatch_Payload_t Payload;
+} STARCAT_APP_LoadPatchCmd_t;
+
+typedef struct {
+  CFE_MSG_CommandHeader_t CommandHeader;
   STARCAT_APP_SetCamera_Payload_t Payload;
 } STARCAT_APP_SetCameraCmd_t;
 

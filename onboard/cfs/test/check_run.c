@@ -19,6 +19,7 @@
 #define TELEMETRY_HEADER 16u
 #define MOST_BYTES (1u << 24)
 #define RIGHT_DEG 0.25
+#define MOST_WAITING 8u
 #define MOST_SIGMAS_SQUARE 50.0 /* of three degrees of freedom: 1e-10 */
 
 typedef STARCAT_APP_FrameTlm_Payload_t frame_in;
@@ -33,14 +34,15 @@ static starcat_result result;
 static starcat_camera commanded;
 
 static frame_in last_frame;
-static int has_frame;
+static frame_in waiting[MOST_WAITING]; /* frames without an attitude so far, in order */
+static unsigned n_waiting, most_waiting;
 static housekeeping hk; /* the last one that came */
 static double prior[4];
 static int has_prior;
 static double prior_s;
 
 static unsigned answers, right, wrong, unanswered, extras, packets, hks, differences;
-static unsigned seen, identified, tracked, not_identified[6], errors;
+static unsigned seen, identified, tracked, not_identified[6], without_image, errors;
 static double worst_deg, worst_sigmas;
 
 static void differ(const char *what, unsigned long sequence) {
@@ -137,6 +139,13 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
                                (last_frame.Flags & 1) != 0 ? numbers[2] : NULL,
                                (last_frame.Flags & 2) != 0 ? numbers[3] : NULL};
   *steps = 0;
+  if (hk.ImageName[0] == '\0') {
+    *mode = STARCAT_APP_MODE_NONE;
+    result.n_matched = 0;
+    result.n_usable = 0;
+    result.reason = STARCAT_REASON_NONE;
+    return STARCAT_E_CRC;
+  }
   if ((hk.Tracking == 1) && has_prior && (fabs(now_s - prior_s) < age_s - 1e-6)) {
     const starcat_status status = starcat_track(image, &camera, &options, &frame, prior, prior_rad,
                                                 &work, &result);
@@ -171,7 +180,9 @@ static void compare_numbers(const attitude_out *out) {
 
 static void count(starcat_status status, uint8_t mode) {
   seen++;
-  if (status == STARCAT_IDENTIFIED) {
+  if (mode == STARCAT_APP_MODE_NONE) {
+    without_image++;
+  } else if (status == STARCAT_IDENTIFIED) {
     identified += mode == STARCAT_APP_MODE_IDENTIFY;
     tracked += mode == STARCAT_APP_MODE_TRACK;
   } else if ((status > 0) || (status == STARCAT_E_BUDGET)) {
@@ -186,12 +197,14 @@ static void take_attitude(const uint8_t *payload) {
   uint8_t mode = 0;
   uint32_t steps = 0;
   memcpy(&out, payload, sizeof out);
-  const double now_s = (double)last_frame.Seconds + (double)last_frame.Subseconds / 4294967296.0;
-  if (!has_frame || (out.Sequence != last_frame.Sequence)) {
+  if ((n_waiting == 0u) || (out.Sequence != waiting[0].Sequence)) {
     differ("sequence", out.Sequence);
     return;
   }
-  has_frame = 0;
+  last_frame = waiting[0];
+  n_waiting--;
+  memmove(waiting, waiting + 1, n_waiting * sizeof waiting[0]);
+  const double now_s = (double)last_frame.Seconds + (double)last_frame.Subseconds / 4294967296.0;
   const starcat_status status = call_directly(&mode, &steps, now_s);
   count(status, mode);
   if ((out.Status != (int16)status) || (out.Mode != mode) || (out.Steps != steps) ||
@@ -225,7 +238,7 @@ static void take_hk(const uint8_t *payload) {
   hks++;
   if ((hk.FramesIn != seen) || (hk.FramesIdentified != identified) ||
       (hk.FramesTracked != tracked) || (hk.FrameErrors != errors) ||
-      (hk.FramesWithoutImage != 0u) ||
+      (hk.FramesWithoutImage != without_image) ||
       (memcmp(hk.FramesNotIdentified, not_identified, sizeof not_identified) != 0)) {
     differ("housekeeping", hk.FramesIn);
   }
@@ -253,9 +266,10 @@ static void take(unsigned id, size_t size, const uint8_t *packet) {
   packets++;
   switch (id) {
     case STARCAT_APP_FRAME_TLM_MID:
-      if (size == TELEMETRY_HEADER + sizeof last_frame) {
-        memcpy(&last_frame, packet + TELEMETRY_HEADER, sizeof last_frame);
-        has_frame = 1;
+      if ((size == TELEMETRY_HEADER + sizeof last_frame) && (n_waiting < MOST_WAITING)) {
+        memcpy(&waiting[n_waiting], packet + TELEMETRY_HEADER, sizeof last_frame);
+        n_waiting++;
+        most_waiting = n_waiting > most_waiting ? n_waiting : most_waiting;
       } else {
         seen++;
         errors++;
@@ -303,6 +317,7 @@ int main(int argc, char **argv) {
   (void)printf("  without an answer             %6u\n", unanswered);
   (void)printf("  identified, tracked           %6u, %u\n", identified, tracked);
   (void)printf("  frames made to have none      %6u\n", extras);
+  (void)printf("  frames that waited at once    %6u\n", most_waiting);
   (void)printf("  housekeeping packets          %6u\n", hks);
   (void)printf("  packets                       %6u\n", packets);
   (void)printf("  differences to the library    %6u\n", differences);

@@ -40,6 +40,7 @@ COMMANDS = {
     "ENABLE_TRACKING": None,
     "DISABLE_TRACKING": None,
     "SET_BUDGET": "SetBudget",
+    "LOAD_PATCH": "LoadPatch",
 }
 ENUMERATED = {
     "Status": "status",
@@ -364,6 +365,20 @@ def decode(definition: object, packet: bytes) -> dict[str, object]:
     return values
 
 
+def check_commands(icd: Path, packets: list[bytes]) -> list[str]:
+    """Return the commands of the ICD whose header no packet of the recording has."""
+    sent = {packet[:2] + packet[4:7] for packet in packets}  # identifier, length, code
+    wrong = []
+    commands = ET.parse(icd).findall(f".//{{{XTCE}}}MetaCommand")
+    for command in commands:
+        header = command.find(f".//{{{XTCE}}}FixedValueEntry")
+        expected = bytes.fromhex("" if header is None else header.get("binaryValue", ""))
+        if expected[:2] + expected[4:7] not in sent:
+            wrong.append(f"no packet of the recording is {command.get('name')}")
+    print(f"  commands as in the ICD        {len(commands) - len(wrong):6} of {len(commands)}")
+    return wrong
+
+
 def check_recording(headers: Headers, icd: Path, recording: Path) -> list[str]:
     """Decode each packet of telemetry by the ICD, and compare with what lies in it."""
     try:
@@ -412,6 +427,7 @@ def main() -> int:
     if given.build is not None:
         wrong += check_compiler(headers, given.build)
     if given.recording is not None and given.check is not None:
+        wrong += check_commands(given.check, packets_of(given.recording.read_bytes()))
         wrong += check_recording(headers, given.check, given.recording)
     for line in wrong[:20]:
         print(f"icd: {line}", file=sys.stderr)

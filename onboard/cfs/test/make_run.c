@@ -47,6 +47,47 @@ static void write_whole(const char *folder, const char *name, const void *bytes,
   }
 }
 
+static uint8_t *put_number(uint8_t *at, uint32_t number) {
+  while (number >= 0x80u) {
+    *at++ = (uint8_t)(number | 0x80u);
+    number >>= 7;
+  }
+  *at++ = (uint8_t)number;
+  return at;
+}
+
+/* Bytes of the new image that are given, or that are those of the old one at the same place. */
+static uint8_t *put_step(uint8_t *at, const uint8_t *given, size_t count, uint32_t back) {
+  at = put_number(at, (uint32_t)count * 8u + (given == NULL ? 1u : 0u));
+  if (given == NULL) {
+    return put_number(at, 2u * back);
+  }
+  memcpy(at, given, count);
+  return at + count;
+}
+
+/* The patch that gives the first image another name: its first block, and the block of checks. */
+static void make_patch(const char *folder) {
+  static uint64_t renamed[SKY_MOST_BYTES / 8u];
+  static uint8_t patch[4u * BLOCK];
+  uint8_t *bytes = (uint8_t *)renamed;
+  const size_t size = sizes[0], check = size - BLOCK;
+  memcpy(renamed, words[0], size);
+  memcpy(bytes + 160, TEST_PATCHED, strlen(TEST_PATCHED));
+  sky_seal(bytes);
+  const uint32_t header[8] = {0x01020304u, 1u, (uint32_t)size, 0u, (uint32_t)size, 0u, 0u, 0u};
+  memcpy(patch, "STARPAT", 8);
+  memcpy(patch + 8, header, sizeof header);
+  memcpy(patch + 20, (uint8_t *)words[0] + size - 8u, 4);
+  memcpy(patch + 28, bytes + size - 8u, 4);
+  uint8_t *at = put_step(patch + 40, bytes, BLOCK, 0);
+  at = put_step(at, NULL, check - BLOCK, BLOCK);
+  at = put_step(at, bytes + check, BLOCK, 0);
+  const uint32_t patch_bytes = (uint32_t)(at - patch);
+  memcpy(patch + 36, &patch_bytes, 4);
+  write_whole(folder, "a.patch", patch, patch_bytes);
+}
+
 static void make_images(const char *folder) {
   static const char *const names[2] = {TEST_IMAGE_A, TEST_IMAGE_B};
   static const char *const files[2] = {"starcat.img", "b.img"};
@@ -65,6 +106,7 @@ static void make_images(const char *folder) {
     }
     write_whole(folder, files[n], bytes, sizes[n]);
   }
+  make_patch(folder);
   starcat_camera_of(&images[0], &camera);
   memcpy(copy, words[0], sizes[0]);
   copy[5u * BLOCK + 17u] ^= 4u;

@@ -47,9 +47,13 @@ END
 
 # The queues of cFS are deeper than what Linux allows by default.
 depth=/proc/sys/fs/mqueue/msg_max
-if [ "$(cat $depth)" -lt 64 ] && ! (echo 64 >$depth) 2>/dev/null; then
-  echo "cfs: skipped, as $depth is $(cat $depth), and only root can make it 64"
-  exit 0
+before=$(cat $depth)
+if [ "$before" -lt 64 ]; then
+  if ! (echo 64 >$depth) 2>/dev/null; then
+    echo "cfs: skipped, as $depth is $before, and only root can make it 64"
+    exit 0
+  fi
+  trap 'echo "$before" >$depth' EXIT
 fi
 cd "$out/exe/cpu1"
 ended=0

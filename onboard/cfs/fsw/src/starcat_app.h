@@ -40,6 +40,7 @@ typedef struct {
   starcat_real Prior[4];
 
   osal_id_t LoadFile;
+  bool IsPatch;
   uint32 CheckBlock;
 
   starcat_workspace Work;
@@ -59,6 +60,7 @@ void STARCAT_APP_TaskPipe(const CFE_SB_Buffer_t *Buffer);
 void STARCAT_APP_NoopCmd(const STARCAT_APP_NoopCmd_t *Msg);
 void STARCAT_APP_ResetCountersCmd(const STARCAT_APP_ResetCountersCmd_t *Msg);
 void STARCAT_APP_LoadImageCmd(const STARCAT_APP_LoadImageCmd_t *Msg);
+void STARCAT_APP_LoadPatchCmd(const STARCAT_APP_LoadPatchCmd_t *Msg);
 void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg);
 void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg);
 void STARCAT_APP_EnableTrackingCmd(const STARCAT_APP_EnableTrackingCmd_t *Msg);
@@ -79,7 +81,7 @@ void STARCAT_APP_Frame(const STARCAT_APP_FrameTlm_t *Msg);
 /* starcat_app_image.c: images in their places */
 void STARCAT_APP_StartImages(void);
 void STARCAT_APP_ImageInUse(starcat_status Status);
-CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc);
+CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch);
 void STARCAT_APP_Wakeup(const STARCAT_APP_WakeupCmd_t *Msg);
 
 #endif

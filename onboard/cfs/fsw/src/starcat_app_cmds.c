@@ -33,15 +33,23 @@ void STARCAT_APP_ResetCountersCmd(const STARCAT_APP_ResetCountersCmd_t *Msg) {
                     "STARCAT: counters are 0");
 }
 
-void STARCAT_APP_LoadImageCmd(const STARCAT_APP_LoadImageCmd_t *Msg) {
+static void Load(const char Given[STARCAT_APP_PATH_LEN], uint32 Crc, bool IsPatch) {
   char Path[STARCAT_APP_PATH_LEN + 1];
-  memcpy(Path, Msg->Payload.Path, STARCAT_APP_PATH_LEN);
+  memcpy(Path, Given, STARCAT_APP_PATH_LEN);
   Path[STARCAT_APP_PATH_LEN] = 0;
-  if (STARCAT_APP_BeginLoad(Path, Msg->Payload.Crc) == CFE_SUCCESS) {
+  if (STARCAT_APP_BeginLoad(Path, Crc, IsPatch) == CFE_SUCCESS) {
     HK.CommandCounter++;
   } else {
     HK.CommandErrorCounter++;
   }
+}
+
+void STARCAT_APP_LoadImageCmd(const STARCAT_APP_LoadImageCmd_t *Msg) {
+  Load(Msg->Payload.Path, Msg->Payload.Crc, false);
+}
+
+void STARCAT_APP_LoadPatchCmd(const STARCAT_APP_LoadPatchCmd_t *Msg) {
+  Load(Msg->Payload.Path, 0, true);
 }
 
 void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg) {
@@ -112,7 +120,7 @@ void STARCAT_APP_DisableTrackingCmd(const STARCAT_APP_DisableTrackingCmd_t *Msg)
 void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
   starcat_options Options = STARCAT_APP_Data.Options;
   Options.max_steps = Msg->Payload.MaxSteps;
-  const starcat_status Status = STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &Options);
+  const starcat_status Status = STARCAT_APP_CheckSettings(NULL, &Options);
   if (Status != STARCAT_IDENTIFIED) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_BUDGET_ERR_EID, CFE_EVS_EventType_ERROR,

@@ -31,26 +31,26 @@ static void TakeOptions(const STARCAT_APP_Config_t *Config, starcat_options *Opt
 }
 
 /* What the library says to a camera and to options: with them it looks at a frame of no centroids,
- * for which it needs no image. */
+ * for which it needs no image. Options may be checked without a camera. */
 starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
                                          const starcat_options *Options) {
   static const starcat_image NoImage;
   static const starcat_frame NoFrame;
+  static const starcat_camera AnyCamera = {1024, 1024, 2048, 512, 512, 0, 0, 0, 0, 0, 0};
   const starcat_status Status =
-      starcat_identify(&NoImage, Camera, Options, &NoFrame, &STARCAT_APP_Data.Work,
-                       &STARCAT_APP_Data.Result);
+      starcat_identify(&NoImage, Camera != NULL ? Camera : &AnyCamera, Options, &NoFrame,
+                       &STARCAT_APP_Data.Work, &STARCAT_APP_Data.Result);
   return Status == STARCAT_TOO_FEW_STARS ? STARCAT_IDENTIFIED : Status;
 }
 
 CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
   const STARCAT_APP_Config_t *Config = Table;
-  starcat_camera Camera = {1024, 1024, 2048, 512, 512, 0, 0, 0, 0, 0, 0};
+  starcat_camera Camera;
   starcat_options Options;
   TakeOptions(Config, &Options);
-  if (Config->CameraOfImage == 0) {
-    STARCAT_APP_TakeCamera(&Config->Camera, &Camera);
-  }
-  const starcat_status Status = STARCAT_APP_CheckSettings(&Camera, &Options);
+  STARCAT_APP_TakeCamera(&Config->Camera, &Camera);
+  const starcat_status Status =
+      STARCAT_APP_CheckSettings(Config->CameraOfImage == 0 ? &Camera : NULL, &Options);
   const bool IsSound = (Config->Prior_rad > 0.0) && (Config->Prior_rad <= WIDEST_PRIOR_RAD) &&
                        (Config->ScrubBlocks > 0) && (Config->LoadPieces > 0) &&
                        (Config->CameraOfImage <= 1) && (Config->Tracking <= 1);

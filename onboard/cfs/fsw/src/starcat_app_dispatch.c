@@ -57,6 +57,9 @@ static void GroundCommand(const CFE_SB_Buffer_t *Buffer) {
     case STARCAT_APP_SET_BUDGET_CC:
       OBEY(STARCAT_APP_SetBudgetCmd, STARCAT_APP_SetBudgetCmd_t);
       break;
+    case STARCAT_APP_LOAD_PATCH_CC:
+      OBEY(STARCAT_APP_LoadPatchCmd, STARCAT_APP_LoadPatchCmd_t);
+      break;
     default:
       STARCAT_APP_Data.HkTlm.Payload.CommandErrorCounter++;
       CFE_EVS_SendEvent(STARCAT_APP_CC_ERR_EID, CFE_EVS_EventType_ERROR,

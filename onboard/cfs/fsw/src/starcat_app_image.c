@@ -13,6 +13,9 @@
 /* The two places, as words: images begin at a multiple of 8. */
 static uint64 Memory[2][STARCAT_APP_PLACE_BYTES / sizeof(uint64)];
 
+/* A patch as it is read; it is applied when it is whole. */
+static uint32 Patch[STARCAT_APP_PATCH_BYTES / sizeof(uint32)];
+
 /* After a start, a switch or damage: what is known of the image in use. */
 void STARCAT_APP_ImageInUse(starcat_status Status) {
   STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
@@ -39,8 +42,8 @@ static void EndLoad(uint8 State) {
   HK.LoadState = State;
 }
 
-/* Open the file of an image and prepare the other place for it. */
-CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc) {
+/* Open the file of an image and prepare the other place for it, or the file of a patch. */
+CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch) {
   os_fstat_t Found;
   memset(&Found, 0, sizeof Found);
   if (HK.LoadState == STARCAT_APP_LOAD_READING) {
@@ -55,7 +58,10 @@ CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc) {
                       "STARCAT: %s cannot be opened, RC = %ld", Path, (long)Status);
     return CFE_STATUS_EXTERNAL_RESOURCE_FAIL;
   }
-  const starcat_status Fits = starcat_receive(&STARCAT_APP_Data.Places, Found.FileSize, Crc);
+  starcat_status Fits = Found.FileSize <= sizeof Patch ? STARCAT_IDENTIFIED : STARCAT_E_SHORT;
+  if (!IsPatch) {
+    Fits = starcat_receive(&STARCAT_APP_Data.Places, Found.FileSize, Crc);
+  }
   if (Fits != STARCAT_IDENTIFIED) {
     EndLoad(STARCAT_APP_LOAD_FAILED);
     CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -66,18 +72,24 @@ CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc) {
   HK.LoadState = STARCAT_APP_LOAD_READING;
   HK.LoadBytes = 0;
   HK.LoadSize = (uint32)Found.FileSize;
+  STARCAT_APP_Data.IsPatch = IsPatch;
   STARCAT_APP_Data.CheckBlock = 0;
   CFE_EVS_SendEvent(STARCAT_APP_LOAD_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: %lu bytes of %s are being read", (unsigned long)HK.LoadSize, Path);
   return CFE_SUCCESS;
 }
 
-/* Read a piece of the new image into its place. */
+/* Read a piece of the new image into its place, or of a patch. */
 static void ReadPiece(void) {
   static uint8 Piece[STARCAT_PIECE_BYTES];
   const int32 Count = OS_read(STARCAT_APP_Data.LoadFile, Piece, sizeof Piece);
   starcat_status Status = STARCAT_E_SHORT;
-  if (Count > 0) {
+  if ((Count > 0) && STARCAT_APP_Data.IsPatch) {
+    if ((uint32)Count <= sizeof Patch - HK.LoadBytes) {
+      memcpy((uint8 *)Patch + HK.LoadBytes, Piece, (size_t)Count);
+      Status = STARCAT_IDENTIFIED;
+    }
+  } else if (Count > 0) {
     Status = starcat_put(&STARCAT_APP_Data.Places, HK.LoadBytes, Piece, (size_t)Count);
   }
   if (Status != STARCAT_IDENTIFIED) {
@@ -93,13 +105,15 @@ static void ReadPiece(void) {
   }
 }
 
-/* Check some blocks of the new image: those of checks first, as they tell of the others. */
+/* Check some blocks of the new image: those of checks first, as they tell of the others. A patch is
+ * applied instead, which makes and checks the new image in one go. */
 static void CheckLoaded(void) {
   STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
-  const uint32 Blocks = HK.LoadSize / STARCAT_PIECE_BYTES;
+  const uint32 Blocks = Data->IsPatch ? 0u : HK.LoadSize / STARCAT_PIECE_BYTES;
   uint32_t Bad = 0;
-  starcat_status Status = starcat_missing(&Data->Places, Blocks, &Bad);
-  if (Status == STARCAT_IDENTIFIED) {
+  starcat_status Status = Data->IsPatch ? starcat_patch(&Data->Places, Patch, HK.LoadSize)
+                                        : starcat_missing(&Data->Places, Blocks, &Bad);
+  if ((Status == STARCAT_IDENTIFIED) && !Data->IsPatch) {
     Status = starcat_scrub(Data->Places.bytes[1u - Data->Places.active], HK.LoadSize,
                            Data->CheckBlock, Data->Config.ScrubBlocks, &Bad);
   }
@@ -107,7 +121,7 @@ static void CheckLoaded(void) {
   if (Status != STARCAT_IDENTIFIED) {
     HK.LoadState = STARCAT_APP_LOAD_FAILED;
     CFE_EVS_SendEvent(STARCAT_APP_REFUSED_ERR_EID, CFE_EVS_EventType_ERROR,
-                      "STARCAT: block %lu of the new image is damaged, status %d",
+                      "STARCAT: the new image, or patch, is refused, block %lu, status %d",
                       (unsigned long)Bad, (int)Status);
   } else if (Data->CheckBlock >= Blocks) {
     HK.LoadState = STARCAT_APP_LOAD_READY;
@@ -183,7 +197,7 @@ void STARCAT_APP_Wakeup(const STARCAT_APP_WakeupCmd_t *Msg) {
 /* Read a file whole into the place that is not `Active` then. */
 static void ReadImage(const char *Path, uint32 Active) {
   STARCAT_APP_Data.Places.active = Active;
-  if (STARCAT_APP_BeginLoad(Path, 0) != CFE_SUCCESS) {
+  if (STARCAT_APP_BeginLoad(Path, 0, false) != CFE_SUCCESS) {
     return;
   }
   while (HK.LoadState == STARCAT_APP_LOAD_READING) {

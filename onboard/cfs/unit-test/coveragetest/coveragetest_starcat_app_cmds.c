@@ -33,6 +33,14 @@ static void TestLoadImage(void) {
   IS(HK.CommandErrorCounter, 1);
 }
 
+static void TestLoadPatch(void) {
+  STARCAT_APP_LoadPatchCmd_t Msg;
+  memset(&Msg, 0, sizeof Msg);
+  STARCAT_APP_LoadPatchCmd(&Msg);
+  IS(HK.CommandCounter, 1);
+  CALLED(STARCAT_APP_BeginLoad, 1);
+}
+
 static void TestSwitchImage(void) {
   HK.LoadState = STARCAT_APP_LOAD_READY;
   STARCAT_APP_SwitchImageCmd(NULL);
@@ -115,6 +123,7 @@ void UtTest_Setup(void) {
   ADD(TestNoop);
   ADD(TestResetCounters);
   ADD(TestLoadImage);
+  ADD(TestLoadPatch);
   ADD(TestSwitchImage);
   ADD(TestSwitchImageThatCannotBe);
   ADD(TestSetCamera);

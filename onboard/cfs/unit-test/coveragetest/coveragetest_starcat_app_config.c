@@ -20,6 +20,8 @@ static void TestCheckSettings(void) {
   ONCE(starcat_identify, STARCAT_TOO_FEW_STARS);
   IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
      STARCAT_IDENTIFIED);
+  ONCE(starcat_identify, STARCAT_TOO_FEW_STARS);
+  IS(STARCAT_APP_CheckSettings(NULL, &STARCAT_APP_Data.Options), STARCAT_IDENTIFIED);
   ONCE(starcat_identify, STARCAT_E_CAMERA);
   IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
      STARCAT_E_CAMERA);

@@ -23,7 +23,7 @@ static void GiveFile(uint32 Pieces) {
 
 static void TestLoad(void) {
   GiveFile(3);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   IS(LastEvent(), STARCAT_APP_LOAD_INF_EID);
   IS(HK.LoadState, STARCAT_APP_LOAD_READING);
   IS(HK.LoadSize, 3 * PIECE);
@@ -47,21 +47,21 @@ static void TestLoad(void) {
 
 static void TestLoadThatCannotBegin(void) {
   ONCE(OS_stat, OS_ERROR);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_STATUS_EXTERNAL_RESOURCE_FAIL);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_STATUS_EXTERNAL_RESOURCE_FAIL);
   ONCE(OS_OpenCreate, OS_ERROR);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_STATUS_EXTERNAL_RESOURCE_FAIL);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_STATUS_EXTERNAL_RESOURCE_FAIL);
   IS(LastEvent(), STARCAT_APP_LOAD_ERR_EID);
   IS(HK.LoadState, STARCAT_APP_LOAD_NONE);
   ONCE(starcat_receive, STARCAT_E_SHORT);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_STATUS_VALIDATION_FAILURE);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_STATUS_VALIDATION_FAILURE);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   CALLED(CFE_EVS_SendEvent, 3);
 }
 
 static void TestLoadThatBreaksOff(void) {
   GiveFile(3);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS); /* anew, while it is read */
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS); /* anew, while it is read */
   CALLED(OS_close, 1);
   ONCE(OS_read, 0);
   STARCAT_APP_Wakeup(NULL);
@@ -70,7 +70,7 @@ static void TestLoadThatBreaksOff(void) {
   CALLED(OS_read, 1);
   CALLED(starcat_put, 0);
   GiveFile(3);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   ONCE(starcat_put, STARCAT_E_SHORT);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
@@ -78,7 +78,7 @@ static void TestLoadThatBreaksOff(void) {
 
 static void TestLoadOfADamagedImage(void) {
   GiveFile(1);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_CHECKING);
   ONCE(starcat_missing, STARCAT_E_CRC);
@@ -86,11 +86,44 @@ static void TestLoadOfADamagedImage(void) {
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
   GiveFile(1);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0), CFE_SUCCESS);
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   STARCAT_APP_Wakeup(NULL);
   ONCE(starcat_scrub, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
+}
+
+static void TestPatch(void) {
+  GiveFile(1);
+  IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_SUCCESS);
+  CALLED(starcat_receive, 0);
+  STARCAT_APP_Wakeup(NULL);
+  CALLED(starcat_put, 0);
+  IS(HK.LoadState, STARCAT_APP_LOAD_CHECKING);
+  STARCAT_APP_Wakeup(NULL);
+  CALLED(starcat_patch, 1);
+  CALLED(starcat_missing, 0);
+  CALLED(starcat_scrub, 0);
+  IS(HK.LoadState, STARCAT_APP_LOAD_READY);
+  GiveFile(1);
+  IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_SUCCESS);
+  STARCAT_APP_Wakeup(NULL);
+  ONCE(starcat_patch, STARCAT_E_VERSION);
+  STARCAT_APP_Wakeup(NULL);
+  IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
+  IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
+}
+
+static void TestPatchThatIsTooLarge(void) {
+  GiveFile(1 + STARCAT_APP_PATCH_BYTES / PIECE);
+  IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_STATUS_VALIDATION_FAILURE);
+  IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
+  GiveFile(STARCAT_APP_PATCH_BYTES / PIECE);
+  IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_SUCCESS);
+  HK.LoadBytes = STARCAT_APP_PATCH_BYTES - 1; /* a file that grew while it was read */
+  STARCAT_APP_Wakeup(NULL);
+  IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
+  IS(LastEvent(), STARCAT_APP_LOAD_ERR_EID);
 }
 
 static void TestScrub(void) {
@@ -172,6 +205,8 @@ void UtTest_Setup(void) {
   ADD(TestLoadThatCannotBegin);
   ADD(TestLoadThatBreaksOff);
   ADD(TestLoadOfADamagedImage);
+  ADD(TestPatch);
+  ADD(TestPatchThatIsTooLarge);
   ADD(TestScrub);
   ADD(TestMend);
   ADD(TestFallBack);

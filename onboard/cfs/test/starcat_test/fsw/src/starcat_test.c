@@ -18,9 +18,11 @@
 
 #define TIMEOUT_MS  5000
 #define SETTLE_MS   150 /* for tasks of table services */
+#define QUIET_MS    2000 /* event services hold back who sends more than 15 events a second */
 #define N_EVENT_IDS 32
 #define MOST_TICKS  2000
 #define BLOCK_BYTES 4096u
+#define BURST       4 /* as many messages of an identifier as wait in a pipe by default */
 
 typedef STARCAT_APP_HkTlm_Payload_t hk;
 
@@ -141,6 +143,13 @@ static void LoadImage(const char *Path, uint32 Crc, bool IsRight) {
   Command(STARCAT_APP_LOAD_IMAGE_CC, &Payload, sizeof Payload, IsRight);
 }
 
+static void LoadPatch(const char *Path, bool IsRight) {
+  STARCAT_APP_LoadPatch_Payload_t Payload;
+  memset(&Payload, 0, sizeof Payload);
+  strncpy(Payload.Path, Path, sizeof Payload.Path - 1);
+  Command(STARCAT_APP_LOAD_PATCH_CC, &Payload, sizeof Payload, IsRight);
+}
+
 static void SetCamera(double FocalLength_px, bool IsRight) {
   STARCAT_APP_SetCamera_Payload_t Payload;
   memset(&Payload, 0, sizeof Payload);
@@ -162,31 +171,44 @@ static uint32 Since_us(OS_time_t Before) {
   return (uint32)OS_TimeGetTotalMicroseconds(OS_TimeSubtract(After, Before));
 }
 
-/* Send the frame that lies ready, at its time, and take its attitude. */
-static void SendFrame(void) {
-  OS_time_t Before;
+/* Send the frame that lies ready, at its time. */
+static void PostFrame(void) {
   Frame.Payload.Seconds = FrameClock / 10;
   Frame.Payload.Subseconds = (uint32)(((uint64)(FrameClock % 10) << 32) / 10);
   FrameClock++;
-  OS_GetLocalTime(&Before);
   Send(CFE_MSG_PTR(Frame.TelemetryHeader), STARCAT_APP_FRAME_TLM_MID, 0, sizeof Frame);
+}
+
+/* Take the attitude of a frame. */
+static void TakeAttitude(uint32 Sequence) {
   CHECK(Await(STARCAT_APP_ATTITUDE_TLM_MID));
-  const uint32 Took_us = Since_us(Before);
-  Longest_us = Took_us > Longest_us ? Took_us : Longest_us;
-  CHECK(Attitude.Sequence == Frame.Payload.Sequence);
-  CHECK(Attitude.Seconds == Frame.Payload.Seconds);
-  CHECK(Attitude.Subseconds == Frame.Payload.Subseconds);
+  CHECK(Attitude.Sequence == Sequence);
   Seen++;
   Identified += (Attitude.Status == STARCAT_IDENTIFIED) && (Attitude.Mode == 1);
   Tracked += (Attitude.Status == STARCAT_IDENTIFIED) && (Attitude.Mode == 2);
   Errors += (Attitude.Status < 0) && (Attitude.Status != STARCAT_E_BUDGET) && (Attitude.Mode != 0);
 }
 
+static bool NextFrame(uint32 Source) {
+  return OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
+         (int32)sizeof Frame.Payload;
+}
+
+static void SendFrame(void) {
+  OS_time_t Before;
+  OS_GetLocalTime(&Before);
+  PostFrame();
+  TakeAttitude(Frame.Payload.Sequence);
+  const uint32 Took_us = Since_us(Before);
+  Longest_us = Took_us > Longest_us ? Took_us : Longest_us;
+  CHECK(Attitude.Seconds == Frame.Payload.Seconds);
+  CHECK(Attitude.Subseconds == Frame.Payload.Subseconds);
+}
+
 /* The next frames of a file: 0 sky A, 1 its slew, 2 sky B. Each is followed by a tick. */
 static void Fly(uint32 Source, uint32 Count) {
   for (uint32 n = 0; n < Count; n++) {
-    CHECK(OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
-          (int32)sizeof Frame.Payload);
+    CHECK(NextFrame(Source));
     SendFrame();
     CHECK(Attitude.Status == STARCAT_IDENTIFIED);
     Wakeup();
@@ -386,6 +408,27 @@ static void ScrubUntil(const uint32 *Counter, uint32 Wanted) {
   CHECK(*Counter == Wanted);
 }
 
+/* Neither image can be used: frames are answered with that, until one is loaded. */
+static void TestNoImage(STARCAT_APP_Data_t *App, size_t Blocks) {
+  for (size_t n = 0; n < Blocks; n++) {
+    Upset(App, n * BLOCK_BYTES + 600);
+  }
+  ScrubUntil(&Hk.DamageFound, 3);
+  CHECK(Events[STARCAT_APP_NO_IMAGE_ERR_EID] == 1);
+  CHECK(Hk.ImageStatus == STARCAT_E_CRC);
+  CHECK(Hk.ImageName[0] == 0);
+  FlyExtra(STARCAT_E_CRC);
+  CHECK(Attitude.Mode == STARCAT_APP_MODE_NONE);
+  CHECK(Hk.FramesWithoutImage == 1);
+  LoadImage("/cf/b.img", 0, true);
+  for (uint32 n = 0; (n < MOST_TICKS) && (Hk.LoadState != STARCAT_APP_LOAD_READY); n++) {
+    Wakeup();
+    AskHk();
+  }
+  Switch(TEST_IMAGE_B, true);
+  Fly(2, 5);
+}
+
 static void TestUpsets(void) {
   osal_id_t Module;
   cpuaddr Address = 0;
@@ -410,22 +453,36 @@ static void TestUpsets(void) {
   CHECK(Events[STARCAT_APP_FALLBACK_ERR_EID] == 1);
   CHECK(strcmp(Hk.ImageName, TEST_IMAGE_B) == 0);
   Fly(2, 10);
+  TestNoImage(App, Blocks);
+  LoadPatch("/cf/big.img", false);
+  LoadPatch("/cf/a.patch", true); /* for the other image */
+  FlyUntilLoaded(2, STARCAT_APP_LOAD_FAILED);
+  CHECK(Events[STARCAT_APP_REFUSED_ERR_EID] == 5);
   LoadImage("/cf/starcat.img", 0, true);
   FlyUntilLoaded(2, STARCAT_APP_LOAD_READY);
 }
 
-/* All frames that are left, of the sky whose image is in use. */
+/* All frames that are left, of the sky whose image is in use, several at once. */
 static void FlyTheRest(void) {
   for (uint32 Source = 2; Source <= 2; Source -= 2) {
-    while (OS_read(Sources[Source], &Frame.Payload, sizeof Frame.Payload) ==
-           (int32)sizeof Frame.Payload) {
-      SendFrame();
-      CHECK(Attitude.Status == STARCAT_IDENTIFIED);
+    uint32 Sequences[BURST], Posted = BURST;
+    while (Posted == BURST) {
+      for (Posted = 0; (Posted < BURST) && NextFrame(Source); Posted++) {
+        Sequences[Posted] = Frame.Payload.Sequence;
+        PostFrame();
+      }
       Wakeup();
+      for (uint32 n = 0; n < Posted; n++) {
+        TakeAttitude(Sequences[n]);
+        CHECK(Attitude.Status == STARCAT_IDENTIFIED);
+      }
     }
     AskHk();
     if (Source == 2) {
       Switch(TEST_IMAGE_A, true);
+      LoadPatch("/cf/a.patch", true);
+      FlyUntilLoaded(0, STARCAT_APP_LOAD_READY);
+      Switch(TEST_PATCHED, true);
     }
   }
 }
@@ -449,11 +506,15 @@ static void Fly1000(void) {
   TestTable();
   TestReload();
   TestSettings();
+  OS_TaskDelay(QUIET_MS);
   TestDamagedFiles();
+  OS_TaskDelay(QUIET_MS);
   TestUpsets();
+  OS_TaskDelay(QUIET_MS);
   FlyTheRest();
   CHECK(Hk.FramesIdentified + Hk.FramesTracked == TEST_FRAMES);
   CHECK(Hk.ScrubPasses > 0);
+  CHECK(Events[STARCAT_APP_SWITCH_INF_EID] == 7);
   OS_printf("starcat_test: longest switch %lu us, longest tick with damage %lu us\n",
             (unsigned long)LongestSwitch_us, (unsigned long)LongestMend_us);
 }

@@ -17,6 +17,7 @@
 
 #define TEST_IMAGE_A "sky-a-1.0.0"
 #define TEST_IMAGE_B "sky-b-1.0.0"
+#define TEST_PATCHED "sky-a-1.0.1" /* the first one by a patch: another name, the same stars */
 
 /* The table that the app is given in flight; its camera is that of the images. */
 #define TEST_NOISE_PX   0.4
