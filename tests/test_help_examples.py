@@ -36,6 +36,9 @@ NEEDS = {
     "releases": ("publish",),
     "pull": ("publish",),
     "identify": ("simulate",),
+    "keys roles": ("keys new",),
+    "keys show": ("keys new", "keys roles"),
+    "keys renew": ("keys new", "keys roles"),
 }
 """The commands whose examples make what another example reads."""
 SLOW = ("build", "rebuild")

@@ -158,7 +158,10 @@ def test_tables_fit(registry, starcat, artifact_version):
     for arguments, outcome in (
         (["publish", artifact_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
         (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
-        (["pull", "small@1.0.0", "--registry", "registry"], "pulled: dist/small-1.0.0"),
+        (
+            ["pull", "small@1.0.0", "--registry", "registry"],
+            "pulled: dist/small-1.0.0; nothing is signed in this registry",
+        ),
         (["pull", "--locked"], "unchanged: dist/small-1.0.0"),
         (["releases", "registry"], ""),
     ):

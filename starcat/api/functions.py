@@ -421,14 +421,41 @@ def diff(a: PathLike, b: PathLike) -> Difference:
     return diff_artifacts(open_artifact(Path(a)), open_artifact(Path(b)))
 
 
-def publish(database: PathLike, registry: PathLike) -> Published:
-    """Check a database and put it into a registry, a folder, where it will never change."""
+def publish(
+    database: PathLike,
+    registry: PathLike,
+    *,
+    sign: PathLike | Sequence[PathLike] = (),
+    threshold: int | None = None,
+) -> Published:
+    """Check a database and put it into a registry, a folder, where it will never change.
+
+    Parameters
+    ----------
+    database : str or path-like
+        The folder of a database.
+    registry : str or path-like
+        A folder; made if need be.
+    sign : path or sequence of paths, default none
+        Files of keys to sign with, as ``starcat keys new`` makes them.
+    threshold : int, optional
+        Signatures that are needed from now on; only for a registry without any.
+
+    Returns
+    -------
+    Published
+        What became of it.
+    """
+    from starcat.releases.metadata import read_signing
     from starcat.releases.publishing import publish_artifact
 
-    return publish_artifact(Path(database), os.fspath(registry))
+    signing = read_signing(_paths(sign), threshold)
+    return publish_artifact(Path(database), os.fspath(registry), signing=signing)
 
 
-def pull(wanted: str, registry: PathLike, output: PathLike = "dist") -> Pulled:
+def pull(
+    wanted: str, registry: PathLike, output: PathLike = "dist", *, trust: PathLike | None = None
+) -> Pulled:
     """Get a published database and check every file of it.
 
     Parameters
@@ -440,6 +467,8 @@ def pull(wanted: str, registry: PathLike, output: PathLike = "dist") -> Pulled:
     output : str or path-like, default "dist"
         Folder that the folder ``<name>-<version>`` is put into; the version is pinned in
         ``starcat.lock`` there.
+    trust : str or path-like, optional
+        A public key, or a root.json, that has to have signed it; remembered for further pulls.
 
     Returns
     -------
@@ -453,8 +482,8 @@ def pull(wanted: str, registry: PathLike, output: PathLike = "dist") -> Pulled:
     """
     from starcat.releases.lockfile import pull_wanted
 
-    place = Path(output)
-    return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock")
+    place, key = Path(output), None if trust is None else Path(trust)
+    return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock", trust=key)
 
 
 def _inputs(given: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import print_facts, show
+from starcat.cli.console import print_facts, print_things, show
 from starcat.cli.options import Json
+
+if TYPE_CHECKING:
+    from starcat.releases.signing import RoleFacts
 
 app = typer.Typer()
 keys = typer.Typer(
@@ -18,6 +22,9 @@ keys = typer.Typer(
     no_args_is_help=True,
 )
 app.add_typer(keys)
+
+Registry = Annotated[Path, typer.Argument(help="Folder of the registry.")]
+Sign = Annotated[list[Path], typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")]
 
 
 @keys.command()
@@ -38,3 +45,87 @@ def new(
         "public key": raw_public(read_public(public)).hex(),
     }
     show(json, facts, print_facts, "", facts)
+
+
+@keys.command("show")
+def show_roles(registry: Registry, json: Json = False) -> None:
+    """Show which keys a registry is signed with, and until when, after checking it against itself.
+
+    Example: starcat keys show registry
+    """
+    from starcat.releases.signing import roles_of
+
+    _show(roles_of(registry), json)
+
+
+@keys.command()
+def renew(
+    registry: Registry,
+    sign: Sign,
+    days: Annotated[float, typer.Option(min=0.001, help="Days until it has to be renewed.")] = 90.0,
+    json: Json = False,
+) -> None:
+    """Sign the newest state of a registry again, so that it holds longer.
+
+    Who pulls with --trust refuses a registry whose signatures have ended: news may be kept back.
+
+    Example: starcat keys renew registry --sign flight.key
+    """
+    from starcat.releases.metadata import signing_with
+    from starcat.releases.signing import renew as run
+
+    _show(run(registry, signing_with(sign, days=days)), json)
+
+
+@keys.command()
+def roles(
+    registry: Registry,
+    sign: Sign,
+    root: Annotated[
+        list[Path] | None, typer.Option(help="Public key that may change roles. Repeatable.")
+    ] = None,
+    release: Annotated[
+        list[Path] | None, typer.Option(help="Public key that may sign releases. Repeatable.")
+    ] = None,
+    timestamp: Annotated[
+        list[Path] | None, typer.Option(help="Public key that may only renew. Repeatable.")
+    ] = None,
+    root_threshold: Annotated[
+        int | None, typer.Option(min=1, help="Signatures that a change of roles needs.")
+    ] = None,
+    release_threshold: Annotated[
+        int | None, typer.Option(min=1, help="Signatures that a release needs.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Say which keys count in a registry from now on; a role that is not named keeps its keys.
+
+    --sign takes keys that may change roles now, and those that may afterwards. Who has trusted the
+    registry before goes on with the new keys without doing anything.
+
+    Example: starcat keys roles registry --sign flight.key --release flight.pub
+    """
+    from starcat.releases.metadata import signing_with
+    from starcat.releases.signing import change_roles
+    from starcat.storage.keys import read_public
+
+    given = {"root": root, "targets": release, "timestamp": timestamp}
+    thresholds = {"root": root_threshold, "targets": release_threshold}
+    changed = change_roles(
+        registry,
+        signing_with(sign),
+        {role: [read_public(path) for path in paths] for role, paths in given.items() if paths},
+        {role: count for role, count in thresholds.items() if count is not None},
+    )
+    _show(changed, json)
+
+
+def _show(facts: Sequence[RoleFacts], json: bool) -> None:
+    columns = {
+        "role": "{0.role}",
+        "keys": "{0.listed}",
+        "needed": "{0.threshold}",
+        "version": "{0.version}",
+        "until": "{0.until}",
+    }
+    show(json, [one.as_dict() for one in facts], print_things, "", facts, columns, (2, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +15,7 @@ from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bar
 from starcat.errors import QueryError, StarcatError
 from starcat.query.gallery import gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
+from starcat.storage.state import state_folder
 
 if TYPE_CHECKING:
     from starcat.query.result import ResultTable
@@ -224,8 +224,7 @@ HISTORY_LINES = 2000
 
 def history_path() -> Path:
     """Return the file that keeps the queries of earlier prompts."""
-    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(state) / "starcat" / "sql_history"
+    return state_folder() / "sql_history"
 
 
 def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> None:

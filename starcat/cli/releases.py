@@ -21,22 +21,44 @@ app = typer.Typer()
 Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an address.")]
 
 
+SIGNED = {
+    "checked": "; signed by keys that you trust",
+    "unchecked": "; signed, but not checked: name a key that you trust with --trust",
+    "unsigned": "; nothing is signed in this registry",
+    "pinned": "",
+}
+"""What is said of the signatures of what was pulled."""
+
+
 @app.command()
 def publish(
     artifact: Annotated[
         Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
     ],
     registry: Annotated[str, typer.Argument(help="Folder of the registry; made if need be.")],
+    sign: Annotated[
+        list[Path] | None, typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")
+    ] = None,
+    threshold: Annotated[
+        int | None, typer.Option(min=1, help="Signatures needed; the first --sign sets it.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Check a database and put it into a registry, where it will never change.
+
+    With --sign, who pulls can check who published it: 'starcat keys new' makes a key.
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
     from starcat.releases.publishing import publish_artifact
 
+    signing = None
+    if sign or threshold is not None:
+        from starcat.releases.metadata import read_signing
+
+        signing = read_signing(sign or (), threshold)
     with progress_bars() as progress:
-        published = publish_artifact(artifact, registry, progress)
+        published = publish_artifact(artifact, registry, progress, signing)
     show(json, published.as_dict(), print_published, published)
 
 
@@ -62,6 +84,10 @@ def pull(
     max_bytes: Annotated[
         int | None, typer.Option(min=0, help="Refuse a database with more bytes than this.")
     ] = None,
+    trust: Annotated[
+        Path | None,
+        typer.Option(help="Public key or root.json that has to have signed it; then remembered."),
+    ] = None,
     retries: Retries = 3,
     json: Json = False,
 ) -> None:
@@ -74,10 +100,11 @@ def pull(
 
     options = DownloadOptions(retries)
     with progress_bars() as progress:
+        given = (registry, output, lock, options, progress, max_bytes, trust)
         if locked:
-            pulled = pull_pinned(wanted, registry, output, lock, options, progress, max_bytes)
+            pulled = pull_pinned(wanted, *given)
         elif wanted:
-            pulled = [pull_wanted(wanted, registry, output, lock, options, progress, max_bytes)]
+            pulled = [pull_wanted(wanted, *given)]
         else:
             raise ConfigError("pull what? Name it, NAME@VERSION, or say --locked for all pins")
     show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
@@ -114,7 +141,8 @@ def print_published(published: Published) -> None:
         "manifest": "{0.release.manifest.sha256:.16}",
     }
     print_things("", [published], columns, numbers=(2, 3, 4, 5))
-    say(f"{published.outcome}: {published.release.title} in {published.registry}")
+    signed = ", signed" if published.is_signed else ""
+    say(f"{published.outcome}: {published.release.title} in {published.registry}{signed}")
 
 
 def print_pulled(pulled: Sequence[Pulled]) -> None:
@@ -127,7 +155,7 @@ def print_pulled(pulled: Sequence[Pulled]) -> None:
     }
     print_things("", pulled, columns)
     for one in pulled:
-        say(f"{one.outcome}: {one.folder}")
+        say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
 
 
 def print_releases(listed: Sequence[dict[str, Any]]) -> None:

@@ -53,10 +53,7 @@ def copy_to_part(
 @contextmanager
 def _reading(source: Path, blob: Blob) -> Iterator[int]:
     try:
-        _refuse_links(source)
-        # Without waiting, should it be a pipe.
-        flags = os.O_RDONLY | _WITHOUT_LINKS | _WITHOUT_WAITING | _AS_BYTES
-        reader = os.open(source, flags)
+        reader = _opened(source)
     except OSError as error:
         known = {errno.ELOOP: "a symbolic link; expected a file", errno.ENOENT: "missing"}
         what = known.get(error.errno or 0, f"cannot be read ({reason(error)})")
@@ -70,6 +67,24 @@ def _reading(source: Path, blob: Blob) -> Iterator[int]:
         yield reader
     finally:
         os.close(reader)
+
+
+def read_small(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a file that is no link, no pipe, and not longer than it may be."""
+    reader = _opened(path)
+    with os.fdopen(reader, "rb") as file:
+        if not stat.S_ISREG(os.fstat(reader).st_mode):
+            raise damaged(path, "not a file; the registry is damaged")
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise damaged(path, f"longer than {most_bytes} bytes; the registry is damaged")
+    return data
+
+
+def _opened(path: Path) -> int:
+    """Open a file to read it, without following a link, and without waiting at a pipe."""
+    _refuse_links(path)
+    return os.open(path, os.O_RDONLY | _WITHOUT_LINKS | _WITHOUT_WAITING | _AS_BYTES)
 
 
 def _refuse_links(path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 from starcat.errors import ConfigError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.pulling import Pulled, pull_release
-from starcat.releases.registry import open_registry
+from starcat.releases.registry import Registry, has_signatures, is_trusted, open_registry
 from starcat.releases.tree import Release, check_version, choose, parse, parse_wanted
 from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
@@ -131,17 +132,24 @@ def pull_wanted(
     options: DownloadOptions | None = None,
     progress: Progress = no_progress,
     max_bytes: int | None = None,
+    trust: Path | None = None,
 ) -> Pulled:
-    """Pull what a registry lists, and pin it."""
+    """Pull what a registry lists, or what trusted keys have signed there, and pin it."""
     name, version = parse_wanted(wanted)
     pin = read_pins(lock).get(name)
     opened = open_registry(registry or _registry_of(lock, name, pin), options)
-    release = choose(opened.releases(), name, version, opened.address)
+    if trust is not None or is_trusted(opened.address):
+        from starcat.releases.trust import signed_release
+
+        release, signed = signed_release(opened, name, version, trust), "checked"
+    else:
+        release = choose(opened.releases(), name, version, opened.address)
+        signed = "unchecked" if has_signatures(opened) else "unsigned"
     _check_pin(lock, pin, release, opened.address)
     prepare(lock)
     pulled = pull_release(opened, release, output, progress, max_bytes)
     write_pin(lock, release, opened.address)
-    return pulled
+    return replace(pulled, signed=signed)
 
 
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
@@ -174,8 +182,12 @@ def pull_pinned(
     options: DownloadOptions | None = None,
     progress: Progress = no_progress,
     max_bytes: int | None = None,
+    trust: Path | None = None,
 ) -> list[Pulled]:
-    """Pull exactly what a lock file says; no index is read, and the lock file stays."""
+    """Pull exactly what a lock file says; no index is read, and the lock file stays.
+
+    Whether trusted keys have signed it is looked up only where ``trust`` is given.
+    """
     pins = read_pins(lock)
     if not pins:
         raise ConfigError(
@@ -186,13 +198,18 @@ def pull_pinned(
     chosen = [pins[name] for name in sorted(pins)]
     if wanted is not None:
         chosen = [pin_of(lock, pins, *parse_wanted(wanted))]
-    return [
-        pull_release(
-            open_registry(registry or pinned_registry(lock, pin), options),
-            pin,
-            output,
-            progress,
-            max_bytes,
-        )
-        for pin in chosen
-    ]
+    pulled = []
+    for pin in chosen:
+        opened = open_registry(registry or pinned_registry(lock, pin), options)
+        if trust is not None:
+            _check_signed(lock, pin, opened, trust)
+        one = pull_release(opened, pin, output, progress, max_bytes)
+        pulled.append(replace(one, signed="pinned" if trust is None else "checked"))
+    return pulled
+
+
+def _check_signed(lock: Path, pin: Pin, registry: Registry, trust: Path) -> None:
+    from starcat.releases.trust import signed_release
+
+    signed = signed_release(registry, pin.name, pin.version, trust, with_index=False)
+    _check_pin(lock, pin, signed, registry.address)

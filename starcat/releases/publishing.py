@@ -12,24 +12,34 @@ import errno
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.files import copy_to_part, damaged
-from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
+from starcat.releases.tree import (
+    INCOMING,
+    INDEX_NAME,
+    LOCK,
+    METADATA,
+    Blob,
+    Listed,
+    files_of,
+    index_bytes,
+    parse,
+    release_bytes,
+)
 from starcat.storage.atomic import make_folder, replace_file, sync, unique, writing
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.download import is_address
 from starcat.storage.locks import locked
 
-INCOMING = ".incoming"
-"""Folder for what is not finished; may be removed while nobody publishes."""
+if TYPE_CHECKING:  # the libraries behind it are for who signs
+    from starcat.releases.metadata import Signing
 
-_LOCK = ".lock"
-_PARTS = {INCOMING, _LOCK, INDEX_NAME, "blobs", "versions"}
+_PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,7 @@ class Published:
     # new_blobs, new_bytes: content that the registry did not have
     new_blobs: int
     new_bytes: int
+    is_signed: bool = False  # whether it was signed
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -51,12 +62,15 @@ class Published:
             "registry": str(self.registry),
             "new_blobs": self.new_blobs,
             "new_bytes": self.new_bytes,
+            "is_signed": self.is_signed,
             **self.release.model_dump(),
         }
 
 
-def publish_artifact(artifact: Path, registry: str, progress: Progress = no_progress) -> Published:
-    """Put a database into a registry."""
+def publish_artifact(
+    artifact: Path, registry: str, progress: Progress = no_progress, signing: Signing | None = None
+) -> Published:
+    """Put a database into a registry, and sign it there."""
     if is_address(registry, "registry"):
         raise ConfigError(
             f"{registry}: a registry behind an address can only be read; publish into a folder, "
@@ -69,11 +83,24 @@ def publish_artifact(artifact: Path, registry: str, progress: Progress = no_prog
     with writing(root, "what has arrived is kept: publish again to go on"):
         _prepare(root)
         _check_not_taken(root, release)
+        if signing is not None or (root / METADATA).is_dir():
+            from starcat.releases.signing import check_can_sign
+
+            check_can_sign(root, signing)
         new = _add_all(root, contents, progress)
         is_new = _record(root, release)
         _make_index(root)
+        if signing is not None:  # last, so that all that is signed is listed
+            from starcat.releases.signing import sign_release
+
+            sign_release(root, release, signing)
     return Published(
-        release, root, "published" if is_new else "unchanged", len(new), sum(b.bytes for b in new)
+        release,
+        root,
+        "published" if is_new else "unchanged",
+        len(new),
+        sum(blob.bytes for blob in new),
+        signing is not None,
     )
 
 
@@ -176,7 +203,7 @@ def _record(root: Path, release: Listed) -> bool:
     make_folder(final.parent)
     new = unique(root / INCOMING, f"{release.title}.json")
     try:
-        new.write_bytes(json_bytes(release.model_dump()))
+        new.write_bytes(release_bytes(release))
         sync(new)
         new.chmod(new.stat().st_mode & 0o555)
         _give_free_name(root, new, final)
@@ -195,7 +222,7 @@ def _give_free_name(root: Path, new: Path, final: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS):
             raise
-        with locked(root / _LOCK):  # no links on this file system
+        with locked(root / LOCK):  # no links on this file system
             if os.path.lexists(final):
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
             new.rename(final)
@@ -208,7 +235,7 @@ def _make_index(root: Path) -> None:
     writes last has looked after writing, so no release of another publisher is lost.
     """
     path = root / INDEX_NAME
-    with locked(root / _LOCK):
+    with locked(root / LOCK):
         releases: list[Listed] | None = None
         while releases != (found := recorded(root)):
             releases = found

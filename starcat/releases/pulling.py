@@ -35,12 +35,16 @@ class Pulled:
     registry: str  # the folder or address that it came from
     folder: Path  # the folder of the database
     outcome: Literal["pulled", "unchanged"]  # ``unchanged`` where it was there already, whole
+    # whether trusted keys have signed it: ``checked``; ``unchecked``, but something is signed
+    # there; ``unsigned``; or ``pinned`` by its digest, without looking
+    signed: str = "unsigned"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
         release = self.release
         return {
             "outcome": self.outcome,
+            "signed": self.signed,
             "folder": str(self.folder),
             "registry": self.registry,
             "name": release.name,

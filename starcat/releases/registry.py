@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from starcat.errors import DownloadError, ProductError, SourceMissing, reason
+from starcat.errors import DownloadError, ProductError, SourceMissing, StarcatError, reason
 from starcat.progress import Progress
-from starcat.releases.files import copy_to_part
-from starcat.releases.tree import INDEX_NAME, MAX_INDEX_BYTES, Blob, Listed, read_index
+from starcat.releases.files import copy_to_part, damaged, read_small
+from starcat.releases.tree import (
+    INDEX_NAME,
+    MAX_INDEX_BYTES,
+    MAX_METADATA_BYTES,
+    METADATA,
+    Blob,
+    Listed,
+    read_index,
+)
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import (
     DownloadOptions,
@@ -19,6 +29,7 @@ from starcat.storage.download import (
     is_address,
     part_of,
 )
+from starcat.storage.state import state_folder
 
 
 @dataclass(frozen=True)
@@ -31,19 +42,25 @@ class FolderRegistry:
         """Return what the index lists, by name, then by version."""
         path = Path(self.address, INDEX_NAME)
         try:
-            with path.open("rb") as file:
-                data = file.read(MAX_INDEX_BYTES + 1)
-        except OSError as error:
+            data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
+        except NotFound as error:
             raise SourceMissing(
-                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({reason(error)}); "
+                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({error}); "
                 "'starcat publish' makes one",
                 path=path,
             ) from error
-        if len(data) > MAX_INDEX_BYTES:
-            raise ProductError(
-                f"{path}: longer than {MAX_INDEX_BYTES} bytes; the registry is damaged", path=path
-            )
         return read_index(data, str(path))
+
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return the content of a small file, which has to be one: no link, no pipe."""
+        path = Path(self.address, name)
+        try:
+            return read_small(path, most_bytes)
+        except OSError as error:
+            if error.errno == errno.ELOOP:
+                what = "a symbolic link; expected a file. The registry is damaged"
+                raise damaged(path, what) from error
+            raise NotFound(reason(error)) from error
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
         """Copy content, checked, to the part of a path; go on where an earlier copy ended."""
@@ -66,18 +83,24 @@ class HttpRegistry:
 
     def releases(self) -> list[Listed]:
         """Return what the index lists."""
-        url = f"{self.address}/{INDEX_NAME}"
+        try:
+            data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
+        except NotFound as error:
+            raise SourceMissing(f"{self.address}: no registry, {INDEX_NAME}: {error}") from error
+        return read_index(data, f"{self.address}/{INDEX_NAME}")
+
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return the content of a small file."""
+        url = f"{self.address}/{name}"
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-            path = Path(folder) / INDEX_NAME
+            path = Path(folder) / "file"
             try:
-                download(url, path, replace(self.options, most_bytes=MAX_INDEX_BYTES))
-            except NotFound as error:
-                raise SourceMissing(
-                    f"{self.address}: no registry, {INDEX_NAME}: {error}"
-                ) from error
+                download(url, path, replace(self.options, most_bytes=most_bytes))
+            except NotFound:
+                raise
             except DownloadError as error:
                 raise DownloadError(f"{url}: {error}. Try again later") from error
-            return read_index(part_of(path).read_bytes(), url)
+            return part_of(path).read_bytes()
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
         """Download content, going on where an earlier download ended."""
@@ -114,3 +137,26 @@ def open_registry(text: str, options: DownloadOptions | None = None) -> Registry
     if is_address(text, "registry"):
         return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
     return FolderRegistry(str(Path(text)))
+
+
+ANCHOR = "trusted.json"
+"""The root of a registry that is trusted, in the folder that `remembered` returns."""
+
+
+def remembered(address: str) -> Path:
+    """Return the user's folder for what was seen of a registry whose signatures were checked."""
+    here = address if is_address(address, "registry") else str(Path(address).resolve())
+    return state_folder() / "trust" / hashlib.sha256(here.encode()).hexdigest()[:32]
+
+
+def is_trusted(address: str) -> bool:
+    """Return whether a registry was pulled from with a trusted key before."""
+    return (remembered(address) / ANCHOR).is_file()
+
+
+def has_signatures(registry: Registry) -> bool:
+    """Return whether a registry says that something is signed in it; nothing is checked."""
+    try:
+        return bool(registry.read(f"{METADATA}/timestamp.json", MAX_METADATA_BYTES))
+    except StarcatError:
+        return False

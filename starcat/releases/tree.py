@@ -27,6 +27,23 @@ LATEST = "latest"
 MAX_INDEX_BYTES = MAX_MANIFEST_BYTES = 1 << 26
 """More than any index or manifest has: a longer one is refused, not read."""
 
+INCOMING = ".incoming"
+"""Folder for what is not finished; may be removed while nobody publishes."""
+
+LOCK = ".lock"
+"""Held by who writes the index, or signs."""
+
+METADATA = "metadata"
+"""Folder with what is signed, as The Update Framework has it."""
+
+MAX_METADATA_BYTES = 5_000_000
+"""More than a file of metadata has: a thousand releases take 250 kB."""
+
+RELEASE_PATH = re.compile(
+    rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json", re.ASCII
+)
+"""Path of the file of a release."""
+
 _STEP = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}"
 _FILE_NAME = re.compile(rf"{_STEP}(/{_STEP}){{0,7}}")
 _M = TypeVar("_M", bound=BaseModel)
@@ -83,6 +100,9 @@ class Listed(Release):
         return f"versions/{self.name}/{self.version}.json"
 
 
+_R = TypeVar("_R", bound=Release)
+
+
 class _Head(_Model):
     format: Literal["starcat-registry"]
     registry_version: str
@@ -94,6 +114,11 @@ class _Index(_Head):
 
 class _Files(_Model):
     files: dict[str, Blob]
+
+
+def release_bytes(release: Listed) -> bytes:
+    """Return the file of a release."""
+    return json_bytes(release.model_dump())
 
 
 def index_bytes(releases: Iterable[Listed]) -> bytes:
@@ -177,7 +202,7 @@ def parse_wanted(text: str) -> tuple[str, str | None]:
     return name, None if version == LATEST else version
 
 
-def choose(releases: Iterable[Listed], name: str, version: str | None, where: str) -> Listed:
+def choose(releases: Iterable[_R], name: str, version: str | None, where: str) -> _R:
     """Find a release."""
     listed = list(releases)
     named = sorted((r for r in listed if r.name == name), key=lambda r: r.order)

@@ -13,21 +13,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import TargetMissing
 from starcat.releases.publishing import publish_artifact, recorded
-from starcat.releases.tree import INDEX_NAME, Listed
+from starcat.releases.tree import INDEX_NAME, RELEASE_PATH, Listed
 from starcat.service.access import Publisher, Reader
 from starcat.service.problems import REFUSALS
 from starcat.service.records import Records
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
-from starcat.specs.product_sections import NAME_PATTERN, VERSION_PATTERN
 
 router = APIRouter(prefix="/releases", tags=["releases"])
 registry_router = APIRouter(prefix="/registry", tags=["releases"], responses=REFUSALS)
 
 BLOB = re.compile(r"blobs/sha256/(?P<two>[0-9a-f]{2})/(?P<digest>(?P=two)[0-9a-f]{62})", re.ASCII)
-RELEASE = re.compile(
-    rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json", re.ASCII
-)
 
 MAX_NOTE = 4000
 
@@ -186,7 +182,7 @@ def registry_file(
     # A name is of one of the forms that the tree has, or there is no such file: no other text
     # becomes part of a path.
     blob = BLOB.fullmatch(path)
-    if blob is None and path != INDEX_NAME and RELEASE.fullmatch(path) is None:
+    if blob is None and path != INDEX_NAME and RELEASE_PATH.fullmatch(path) is None:
         raise _no_file(path)
     found = root / path
     if found.is_symlink() or not found.is_file():

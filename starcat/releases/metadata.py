@@ -1,0 +1,271 @@
+"""What a registry's signatures are: metadata of The Update Framework (TUF), below ``metadata/``.
+
+Four roles, each with its keys: ``root`` says which keys count, ``targets`` signs the files of the
+releases, ``snapshot`` and ``timestamp`` say which state of all is the newest. A file
+``<version>.<role>.json`` never changes; ``timestamp.json`` is replaced as a whole, last of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from securesystemslib.signer import CryptoSigner
+from tuf.api.exceptions import RepositoryError
+from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, Targets, Timestamp
+
+from starcat.errors import ConfigError, ProductError, reason
+from starcat.releases.tree import INCOMING, METADATA
+from starcat.storage.atomic import make_folder, replace_file
+from starcat.storage.keys import read_private
+
+ROOT_DAYS, TARGETS_DAYS, TIMESTAMP_DAYS = 3650, 1825, 90
+"""Days that a signature holds. A reader who is kept from news finds out after the last one."""
+
+ROLES = ("root", "targets", "snapshot", "timestamp")
+
+
+@dataclass(frozen=True)
+class Signing:
+    """The keys that sign a registry, and how long the newest state of it holds."""
+
+    keys: tuple[Ed25519PrivateKey, ...]
+    threshold: int | None = None  # signatures that root and releases need, where none is signed yet
+    days: float = TIMESTAMP_DAYS
+    now: datetime | None = None  # by default the clock's
+
+    def until(self, days: float) -> datetime:
+        """Return when a signature ends that holds so many days."""
+        now = self.now or datetime.now(UTC)
+        return (now + timedelta(days=days)).replace(microsecond=0)
+
+    @property
+    def signers(self) -> dict[str, CryptoSigner]:
+        """The signers by their key ids."""
+        made = [CryptoSigner(key) for key in self.keys]
+        return {signer.public_key.keyid: signer for signer in made}
+
+
+def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing | None:
+    """Read the keys to publish with; None for none."""
+    if paths:
+        return signing_with(paths, threshold)
+    if threshold is not None:
+        raise ConfigError(
+            "--threshold is the number of signatures, and nothing is signed without --sign KEY",
+            key="threshold",
+            value=threshold,
+        )
+    return None
+
+
+def signing_with(
+    paths: Sequence[Path], threshold: int | None = None, days: float = TIMESTAMP_DAYS
+) -> Signing:
+    """Read the keys to sign with."""
+    return Signing(tuple(read_private(path) for path in paths), threshold, days)
+
+
+@dataclass
+class SignedTree:
+    """The metadata of a registry on disk, all of it checked against its root."""
+
+    folder: Path
+    root: Metadata[Root]
+    targets: Metadata[Targets]
+    snapshot: Metadata[Snapshot]
+    timestamp: Metadata[Timestamp]
+    is_new: bool = False  # nothing of it was written before
+
+    @property
+    def known(self) -> set[str]:
+        """Key ids that have any role."""
+        return {keyid for role in self.root.signed.roles.values() for keyid in role.keyids}
+
+    def missing(self, role: str, keys: Iterable[str]) -> int:
+        """Return how many signatures of a role keys cannot give."""
+        needed = self.root.signed.roles[role]
+        return max(0, needed.threshold - len(set(needed.keyids) & set(keys)))
+
+    def is_signed(self, role: str) -> bool:
+        """Return whether the metadata of a role has the signatures that the root asks for."""
+        held: Metadata[Any] = getattr(self, role)
+        found = self.root.signed.get_verification_result(role, held.signed_bytes, held.signatures)
+        return bool(found)
+
+
+def is_signed(registry: Path) -> bool:
+    """Return whether a registry on disk has metadata."""
+    return (registry / METADATA).is_dir()
+
+
+def new_tree(registry: Path, signing: Signing) -> SignedTree:
+    """Return the metadata of a registry that has none; nothing is written yet.
+
+    Every key has every role.
+    """
+    root = Root(expires=signing.until(ROOT_DAYS), consistent_snapshot=True)
+    for signer in signing.signers.values():
+        for role in ROLES:
+            root.add_key(signer.public_key, role)
+    for role in ("root", "targets"):
+        set_threshold(root, role, signing.threshold or 1)
+    return SignedTree(
+        registry / METADATA,
+        Metadata(root),
+        Metadata(Targets(expires=signing.until(TARGETS_DAYS))),
+        Metadata(Snapshot(expires=signing.until(TARGETS_DAYS))),
+        Metadata(Timestamp(expires=signing.until(signing.days))),
+        is_new=True,
+    )
+
+
+def set_threshold(root: Root, role: str, threshold: int) -> None:
+    """Say how many signatures a role needs."""
+    has = len(root.roles[role].keyids)
+    if not 1 <= threshold <= has:
+        raise ConfigError(
+            f"{threshold} signatures of the role {role}, which has {has} keys: expected 1 to {has}",
+            key="threshold",
+            value=threshold,
+        )
+    root.roles[role].threshold = threshold
+
+
+def load_tree(registry: Path) -> SignedTree:
+    """Read the metadata of a registry on disk, and check every signature and digest.
+
+    Who signs must not sign what somebody else has put there.
+    """
+    folder = registry / METADATA
+    path = folder
+    try:
+        path, number = folder / "1.root.json", 1
+        root = _read(Root, path)
+        root.signed.verify_delegate("root", root.signed_bytes, root.signatures)
+        while (path := folder / f"{number + 1}.root.json").is_file():
+            newer, number = _read(Root, path), number + 1
+            for one in (root, newer):
+                one.signed.verify_delegate("root", newer.signed_bytes, newer.signatures)
+            root = newer
+        path = folder / "timestamp.json"
+        timestamp = _read(Timestamp, path)
+        path = folder / f"{timestamp.signed.snapshot_meta.version}.snapshot.json"
+        timestamp.signed.snapshot_meta.verify_length_and_hashes(path.read_bytes())
+        snapshot = _read(Snapshot, path)
+        meta = snapshot.signed.meta["targets.json"]
+        path = folder / f"{meta.version}.targets.json"
+        meta.verify_length_and_hashes(path.read_bytes())
+        tree = SignedTree(folder, root, _read(Targets, path), snapshot, timestamp)
+        for role in ROLES[1:]:
+            path, held = folder / f"{role}.json", getattr(tree, role)
+            root.signed.verify_delegate(role, held.signed_bytes, held.signatures)
+    except (RepositoryError, KeyError) as error:
+        raise _not_ours(path, f"{error}") from error
+    except OSError as error:
+        raise _not_ours(path, f"cannot be read ({reason(error)})") from error
+    return tree
+
+
+def _read(kind: type[T], path: Path) -> Metadata[T]:
+    held: Metadata[T] = Metadata.from_bytes(path.read_bytes())
+    if held.signed.type != kind.type:
+        raise RepositoryError(f"of the role {held.signed.type}")
+    return held
+
+
+def _not_ours(path: Path, what: str) -> ProductError:
+    return ProductError(
+        f"{path}: {what}. What is signed in this registry was changed by somebody, and is not "
+        "signed again: restore it from a copy, and find out who can write there",
+        path=path,
+    )
+
+
+def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None:
+    """Refuse keys that do not count, or are too few."""
+    registry, signers = tree.folder.parent, signing.signers
+    for keyid, signer in signers.items():
+        if keyid not in tree.known:
+            raise unknown_key(tree, signer)
+    for role in roles:
+        if lacking := tree.missing(role, signers):
+            needed = tree.root.signed.roles[role].threshold
+            raise ConfigError(
+                f"{registry}: signatures of the role {role} that are needed: {needed}, by the keys "
+                f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}. Give "
+                "--sign for each key",
+                key="sign",
+            )
+
+
+def unknown_key(tree: SignedTree, signer: CryptoSigner) -> ConfigError:
+    """Return the error about a key that has no role."""
+    name = signer.public_key.keyval["public"][:16]
+    return ConfigError(
+        f"the key {name} is none of those that {tree.folder.parent} is signed with: "
+        f"{', '.join(sorted(names_of(tree, 'targets')))}; 'starcat keys roles' can make it one",
+        key="sign",
+        value=name,
+    )
+
+
+def names_of(tree: SignedTree, role: str) -> list[str]:
+    """Return the keys of a role, as messages call them."""
+    root = tree.root.signed
+    return [root.keys[keyid].keyval["public"][:16] for keyid in root.roles[role].keyids]
+
+
+def sign_tree(
+    tree: SignedTree, signing: Signing, roles: Sequence[str], before: Metadata[Root] | None = None
+) -> None:
+    """Sign roles anew and write them, the timestamp last.
+
+    ``roles`` are in the order of `ROLES`; whatever names another that is signed is among them. A
+    root is signed with the keys of the one ``before``, too.
+    """
+    written: dict[str, bytes] = {}
+    for role in roles:
+        held: Metadata[Any] = getattr(tree, role)
+        _renew(held, role, signing, tree.is_new)
+        keys = set(tree.root.signed.roles[role].keyids)
+        if role == "root" and before is not None:
+            keys |= set(before.signed.roles[role].keyids)
+        for keyid, signer in signing.signers.items():
+            if keyid in keys:
+                held.sign(signer, append=True)
+        data = held.to_bytes()
+        version = held.signed.version
+        written["timestamp.json" if role == "timestamp" else f"{version}.{role}.json"] = data
+        if role == "root":
+            written["root.json"] = data
+        elif role == "targets":
+            tree.snapshot.signed.meta["targets.json"] = _meta(version, data)
+        elif role == "snapshot":
+            tree.timestamp.signed.snapshot_meta = _meta(version, data)
+    _write(tree.folder, written)
+
+
+def _renew(held: Metadata[Any], role: str, signing: Signing, is_new: bool) -> None:
+    days = {"root": ROOT_DAYS, "timestamp": signing.days}.get(role, TARGETS_DAYS)
+    held.signed.version += 0 if is_new else 1
+    held.signed.expires = signing.until(days)
+    held.signatures.clear()
+
+
+def _meta(version: int, data: bytes) -> MetaFile:
+    return MetaFile.from_data(version, data, ["sha256"])
+
+
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files that nothing names yet first, then a root, then what names them."""
+    beside = folder.parent / INCOMING
+    for needed in (folder, beside):
+        make_folder(needed)
+    order = ("targets", "snapshot", "root", "timestamp")
+    for name in sorted(files, key=lambda name: order.index(name.split(".")[-2])):
+        replace_file(folder / name, files[name], beside)

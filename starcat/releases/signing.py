@@ -1,0 +1,200 @@
+"""Signing a registry on disk: its releases, the roles of keys, and how long all of it holds."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from securesystemslib.signer import SSlibKey
+from tuf.api.metadata import Root, TargetFile
+
+from starcat.errors import ConfigError
+from starcat.releases.metadata import (
+    ROLES,
+    TARGETS_DAYS,
+    SignedTree,
+    Signing,
+    check_keys,
+    is_signed,
+    load_tree,
+    names_of,
+    new_tree,
+    set_threshold,
+    sign_tree,
+    unknown_key,
+)
+from starcat.releases.tree import LOCK, METADATA, Listed, release_bytes
+from starcat.storage.atomic import writing
+from starcat.storage.locks import locked
+
+PUBLISHING = ROLES[1:]
+"""The roles that sign when something is published."""
+
+
+@dataclass(frozen=True)
+class RoleFacts:
+    """Who may sign what in a registry."""
+
+    role: str
+    keys: tuple[str, ...]  # how their public keys begin
+    threshold: int  # signatures that it needs
+    version: int
+    until: str  # when its signatures end
+
+    @property
+    def listed(self) -> str:
+        """The keys in one text."""
+        return ", ".join(self.keys)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {**vars(self), "keys": list(self.keys)}
+
+
+def check_can_sign(registry: Path, signing: Signing | None) -> None:
+    """Refuse to publish what could not be signed, before anything is written."""
+    if not is_signed(registry):
+        if signing is not None:
+            new_tree(registry, signing)
+        return
+    if signing is None:
+        raise ConfigError(
+            f"{registry}: is signed, and who pulls with --trust would be refused what is not; "
+            "publish with --sign KEY",
+            key="sign",
+        )
+    tree = load_tree(registry)
+    if signing.threshold not in (None, tree.root.signed.roles["targets"].threshold):
+        raise ConfigError(
+            f"--threshold {signing.threshold}: {registry} is signed already; 'starcat keys roles' "
+            "changes what it needs",
+            key="threshold",
+            value=signing.threshold,
+        )
+    check_keys(tree, signing, PUBLISHING)
+
+
+def sign_release(registry: Path, release: Listed, signing: Signing) -> None:
+    """Sign a release that is in a registry, unless it is signed."""
+    with locked(registry / LOCK):
+        tree = load_tree(registry) if is_signed(registry) else new_tree(registry, signing)
+        check_keys(tree, signing, PUBLISHING)
+        target = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
+        signed = tree.targets.signed.targets
+        if signed.get(release.path) != target:
+            signed[release.path] = target
+            sign_tree(tree, signing, ROLES if tree.is_new else PUBLISHING)
+
+
+def renew(registry: Path, signing: Signing) -> tuple[RoleFacts, ...]:
+    """Have the newest state of a registry hold longer; what is old is signed again with it."""
+    with writing(registry, "sign where the registry can be written"), locked(registry / LOCK):
+        tree = _signed(registry)
+        limit = signing.until(TARGETS_DAYS) - timedelta(days=TARGETS_DAYS / 2)
+        old = [role for role in ROLES[1:3] if getattr(tree, role).signed.expires < limit]
+        first = old[0] if old else "timestamp"
+        roles = ROLES[ROLES.index(first) :]
+        check_keys(tree, signing, roles)
+        sign_tree(tree, signing, roles)
+    return _facts(tree)
+
+
+def change_roles(
+    registry: Path,
+    signing: Signing,
+    keys: Mapping[str, Sequence[Ed25519PublicKey]],
+    thresholds: Mapping[str, int],
+) -> tuple[RoleFacts, ...]:
+    """Say which keys count from now on: a new root, signed with keys of this and of the last one.
+
+    ``keys`` and ``thresholds`` are by role, ``root``, ``targets`` or ``timestamp``; a role that is
+    not there keeps its keys. Keys of ``targets`` sign snapshots and timestamps too.
+    """
+    with writing(registry, "sign where the registry can be written"), locked(registry / LOCK):
+        tree = load_tree(registry) if is_signed(registry) else new_tree(registry, signing)
+        before = None if tree.is_new else copy.deepcopy(tree.root)
+        _set_roles(tree.root.signed, keys, thresholds)
+        last = tree if before is None else dataclasses.replace(tree, root=before)
+        for keyid, signer in signing.signers.items():
+            if keyid not in tree.known | last.known:
+                raise unknown_key(tree, signer)
+        check_keys(last, _those_of(last, signing), ["root"])
+        unsigned = [role for role in PUBLISHING if not tree.is_signed(role)]
+        roles = ROLES[ROLES.index(unsigned[0]) :] if unsigned else ()
+        check_keys(tree, _those_of(tree, signing), ["root", *roles])
+        sign_tree(tree, signing, ["root", *roles], before)
+    return _facts(tree)
+
+
+def roles_of(registry: Path) -> tuple[RoleFacts, ...]:
+    """Return who may sign what, after checking that all of it was signed."""
+    return _facts(_signed(registry))
+
+
+def _signed(registry: Path) -> SignedTree:
+    if not is_signed(registry):
+        raise ConfigError(
+            f"{registry}: nothing is signed there, as it has no {METADATA}/; "
+            "'starcat publish --sign KEY' signs what it publishes",
+            key="registry",
+            value=str(registry),
+        )
+    return load_tree(registry)
+
+
+def _facts(tree: SignedTree) -> tuple[RoleFacts, ...]:
+    roles = tree.root.signed.roles
+    return tuple(
+        RoleFacts(
+            role,
+            tuple(names_of(tree, role)),
+            roles[role].threshold,
+            getattr(tree, role).signed.version,
+            f"{getattr(tree, role).signed.expires:%Y-%m-%d}",
+        )
+        for role in ROLES
+    )
+
+
+def _those_of(tree: SignedTree, signing: Signing) -> Signing:
+    """Return the keys that a root knows: of two roots each may know some."""
+    ids = [SSlibKey.from_crypto(key.public_key()).keyid for key in signing.keys]
+    keys = [key for key, keyid in zip(signing.keys, ids, strict=True) if keyid in tree.known]
+    return dataclasses.replace(signing, keys=tuple(keys))
+
+
+def _set_roles(
+    root: Root, keys: Mapping[str, Sequence[Ed25519PublicKey]], thresholds: Mapping[str, int]
+) -> None:
+    given = {role: [SSlibKey.from_crypto(key) for key in some] for role, some in keys.items()}
+    held = {role: [root.keys[one] for one in root.roles[role].keyids] for role in ROLES}
+    targets = given.get("targets") or held["targets"]
+    others = [key for key in held["timestamp"] if key not in held["targets"]]
+    wanted = {
+        "root": given.get("root") or held["root"],
+        "targets": targets,
+        "snapshot": targets,
+        "timestamp": [*targets, *(given.get("timestamp") or others)],
+    }
+    for role, chosen in wanted.items():
+        _set_keys(root, role, chosen)
+        if role in ("root", "targets"):
+            held_threshold = min(root.roles[role].threshold, len(set(_ids(chosen))))
+            set_threshold(root, role, thresholds.get(role, held_threshold))
+
+
+def _set_keys(root: Root, role: str, keys: Sequence[Any]) -> None:
+    for key in keys:
+        root.add_key(key, role)
+    for keyid in set(root.roles[role].keyids) - set(_ids(keys)):
+        root.revoke_key(keyid, role)
+
+
+def _ids(keys: Iterable[Any]) -> list[str]:
+    return [key.keyid for key in keys]

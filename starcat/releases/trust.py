@@ -1,0 +1,258 @@
+"""Checking who signed a release, by the workflow of The Update Framework.
+
+What was seen of a registry is remembered in the user's state folder, so that nobody can show an
+older state of it afterwards. Every refusal says what was found, where, and what to do.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from securesystemslib.signer import SSlibKey
+from tuf.api import exceptions
+from tuf.api.metadata import Metadata, Root, Targets
+from tuf.api.serialization import DeserializationError
+from tuf.ngclient import Updater, UpdaterConfig
+from tuf.ngclient.fetcher import FetcherInterface
+
+from starcat.errors import ConfigError, FileMissing, ProductError, StarcatError
+from starcat.releases.registry import ANCHOR, Registry, remembered
+from starcat.releases.tree import (
+    MAX_METADATA_BYTES,
+    METADATA,
+    RELEASE_PATH,
+    Blob,
+    Listed,
+    Release,
+    choose,
+    parse,
+)
+from starcat.storage.atomic import make_folder, replace_file, writing
+from starcat.storage.download import NotFound
+from starcat.storage.keys import is_public_key, raw_public, read_public, short_name
+from starcat.storage.locks import locked
+
+_NOT_USED = "nothing of it is used"
+_SIGNED_BY = re.compile(r"was signed by (\d+)/(\d+) keys")
+_CONFIG = UpdaterConfig(prefix_targets_with_hash=False, targets_max_length=MAX_METADATA_BYTES)
+
+
+def signed_release(
+    registry: Registry,
+    name: str,
+    version: str | None,
+    trust: Path | None = None,
+    *,
+    with_index: bool = True,
+) -> Listed:
+    """Return a release that the trusted keys of a registry have signed.
+
+    ``trust`` is a public key or a root; without one, what was trusted before is trusted.
+    """
+    state = remembered(registry.address)
+    make_folder(state)
+    with writing(state, "make it writable"), locked(state):
+        anchor = _anchor(registry, state, trust)
+        targets = _updated(registry, state, anchor)
+        if not (state / ANCHOR).is_file() or (state / ANCHOR).read_bytes() != anchor:
+            replace_file(state / ANCHOR, anchor, state)
+    chosen = _choose(targets, name, version, registry.address)
+    path = f"versions/{chosen.name}/{chosen.version}.json"
+    data = _read_target(registry, targets, path)
+    release = parse(Listed, data, f"{registry.address}: {path}")
+    if release.path != path:
+        raise _refused(registry, path, f"is of {release.title}")
+    if with_index:
+        _check_index(registry, release, version)
+    return release
+
+
+def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
+    """Return the root to begin with: the given one, one that a given key signed, or the last."""
+    known = state / ANCHOR
+    if trust is None:
+        return known.read_bytes()
+    if not trust.is_file():
+        raise FileMissing(
+            f"{trust}: no such file; --trust takes a public key, NAME.pub, or the root.json of the "
+            "registry, from somebody you trust",
+            key="trust",
+            value=str(trust),
+        )
+    if not is_public_key(trust):
+        data = trust.read_bytes()
+        _check_root(data, trust)
+        return data
+    key = SSlibKey.from_crypto(read_public(trust))
+    if known.is_file() and _is_by(known.read_bytes(), key):
+        return known.read_bytes()
+    for path in (f"{METADATA}/root.json", f"{METADATA}/1.root.json"):
+        try:
+            data = registry.read(path, _CONFIG.root_max_length)
+        except NotFound as error:
+            raise _unsigned(registry, path) from error
+        if _is_by(data, key):
+            return data
+    name = short_name(raw_public(read_public(trust)))
+    raise _refused(registry, path, f"is not a root that the key {name} ({trust}) has signed")
+
+
+def _check_root(data: bytes, trust: Path) -> None:
+    try:
+        held = Metadata[Root].from_bytes(data)
+        if held.signed.type != Root.type:
+            raise DeserializationError(f"it is of the role {held.signed.type}")
+        held.signed.verify_delegate(Root.type, held.signed_bytes, held.signatures)
+    except exceptions.RepositoryError as error:
+        raise ConfigError(
+            f"{trust}: neither a public key nor a root that its keys have signed ({error}); "
+            "--trust takes NAME.pub, or metadata/root.json of the registry, from somebody you "
+            "trust",
+            key="trust",
+            value=str(trust),
+        ) from error
+
+
+def _is_by(data: bytes, key: SSlibKey) -> bool:
+    """Return whether a root names a key among its own and is signed by it."""
+    try:
+        held = Metadata[Root].from_bytes(data)
+        if held.signed.type != Root.type or key.keyid not in held.signed.roles["root"].keyids:
+            return False
+        return (
+            key.keyid
+            in held.signed.get_verification_result(
+                "root", held.signed_bytes, held.signatures
+            ).signed
+        )
+    except exceptions.RepositoryError:
+        return False
+
+
+@dataclass
+class _Fetcher(FetcherInterface):
+    """Reads metadata out of a registry, and keeps what came last, for messages."""
+
+    registry: Registry
+    last: str = ""
+    came: dict[str, bytes] = field(default_factory=dict)
+
+    def _fetch(self, url: str) -> Iterator[bytes]:
+        self.last = url
+        try:
+            data = self.registry.read(url, MAX_METADATA_BYTES)
+        except NotFound as error:
+            raise exceptions.DownloadHTTPError(str(error), 404) from error
+        self.came[url] = data
+        return iter([data])
+
+
+def _updated(registry: Registry, state: Path, anchor: bytes) -> Targets:
+    fetcher = _Fetcher(registry)
+    with _explained(registry, fetcher):
+        updater = Updater(
+            str(state), f"{METADATA}/", fetcher=fetcher, config=_CONFIG, bootstrap=anchor
+        )
+        updater.refresh()
+    return Metadata[Targets].from_bytes((state / "targets.json").read_bytes()).signed
+
+
+@contextmanager
+def _explained(registry: Registry, fetcher: _Fetcher) -> Iterator[None]:
+    """Say in a sentence what the library has refused."""
+    try:
+        yield
+    except exceptions.DownloadHTTPError as error:
+        raise _unsigned(registry, fetcher.last) from error
+    except exceptions.DownloadLengthMismatchError as error:
+        raise _refused(registry, fetcher.last, "is longer than any such file") from error
+    except exceptions.DownloadError as error:
+        if isinstance(error.__cause__, StarcatError):
+            raise error.__cause__ from error
+        raise _refused(registry, fetcher.last, f"cannot be read ({error})") from error
+    except exceptions.ExpiredMetadataError as error:
+        raise _expired(registry, fetcher, str(error)) from error
+    except exceptions.RepositoryError as error:
+        raise _refused(registry, fetcher.last, _what(error)) from error
+
+
+def _what(error: exceptions.RepositoryError) -> str:
+    if isinstance(error, exceptions.UnsignedMetadataError):
+        counted = _SIGNED_BY.search(str(error))
+        many = f"{counted[1]} of the {counted[2]}" if counted else "too few of the"
+        return f"is signed by {many} trusted keys that it needs"
+    if isinstance(error, exceptions.LengthOrHashMismatchError):
+        return "is not the file that was signed: changed, or of another state of the registry"
+    if isinstance(error, exceptions.BadVersionNumberError):
+        if ">=" in str(error) or "Expected targets.json" in str(error):
+            return f"is older than what was seen of this registry before ({error})"
+        return f"has another version than it was signed for ({error})"
+    if isinstance(error, DeserializationError):
+        return "is no metadata of a registry"
+    return f"is not as it was signed ({error})"
+
+
+def _refused(registry: Registry, path: str, what: str) -> ProductError:
+    return ProductError(
+        f"{registry.address}: {path} {what}; {_NOT_USED}. Ask who publishes there, by another way "
+        "than this registry"
+    )
+
+
+def _unsigned(registry: Registry, path: str) -> ProductError:
+    return ProductError(
+        f"{registry.address}: {path} is missing, so what is there is not signed; {_NOT_USED}. Ask "
+        "who publishes there to sign with 'starcat publish --sign KEY'"
+    )
+
+
+def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
+    """Say which file is out of date, and since when."""
+    role = next((one for one in ("timestamp", "snapshot", "targets") if one in text), "root")
+    named = [name for name in fetcher.came if name.endswith(f"{role}.json")]
+    until = ""
+    if named:
+        found = json.loads(fetcher.came[named[-1]])
+        until = f" on {str(found['signed']['expires'])[:10]}"
+    return ProductError(
+        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: somebody "
+        f"keeps newer ones back, or nobody renewed them; {_NOT_USED}. Who publishes there runs "
+        f"'starcat keys {'roles' if role == 'root' else 'renew'} REGISTRY --sign KEY'"
+    )
+
+
+def _choose(targets: Targets, name: str, version: str | None, address: str) -> Release:
+    """Choose among the signed releases by their paths."""
+    zeros = Blob(sha256="0" * 64, bytes=0)
+    found = [RELEASE_PATH.fullmatch(path) for path in targets.targets]
+    signed = [Release(name=m["name"], version=m["version"], manifest=zeros) for m in found if m]
+    return choose(signed, name, version, f"{address}, of what is signed,")
+
+
+def _read_target(registry: Registry, targets: Targets, path: str) -> bytes:
+    target = targets.targets[path]
+    try:
+        data = registry.read(path, target.length)
+        target.verify_length_and_hashes(data)
+    except (NotFound, ProductError, exceptions.LengthOrHashMismatchError) as error:
+        if isinstance(error, exceptions.LengthOrHashMismatchError):
+            raise _refused(registry, path, "is not the file that was signed") from error
+        raise _refused(registry, path, f"is not the file that was signed ({error})") from error
+    return data
+
+
+def _check_index(registry: Registry, release: Listed, version: str | None) -> None:
+    """Refuse an index that says something else than what is signed."""
+    listed = [one for one in registry.releases() if one.name == release.name]
+    wanted = [one for one in listed if version in (None, one.version)]
+    if not wanted or wanted[-1] != release:
+        there = wanted[-1].title if wanted else "no such release"
+        what = f"lists {there} with another content" if wanted else "does not list it"
+        if wanted and wanted[-1].version != release.version:
+            what = f"lists {there} as the latest"
+        raise _refused(registry, "index.json", f"{what}; signed is {release.title}")
