@@ -81,6 +81,11 @@ class Settings(BaseModel):
         description="Database, by id or title, for clients of nova.astrometry.net; by default the "
         "newest with levels, or else the newest.",
     )
+    signing_key: Path | None = Field(
+        None,
+        description="File of a key, outside of the root, that signs what is published: "
+        "docs/howto-release.md.",
+    )
     keep_jobs_days: float = Field(90.0, gt=0, description="Days until ended jobs are deleted.")
     keep_results_days: float = Field(
         7.0, gt=0, description="Days until results of TAP are deleted."
@@ -134,10 +139,27 @@ def read_settings(root: Path, **options: object) -> Settings:
             value=content["queue_url"],
         )
     try:
-        return Settings.model_validate({**content, "root": root.resolve()})
+        settings = Settings.model_validate({**content, "root": root.resolve()})
+        _check_key(path, settings)
+        return settings
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
         known = ", ".join(Settings.model_fields)
         hint = f"; {suggest(key, Settings.model_fields)}known: {known}"
         advice = "" if key.partition(".")[0] in Settings.model_fields else hint
         raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None
+
+
+def _check_key(path: Path, settings: Settings) -> None:
+    """Refuse a key that lies where the service writes, and where copies of its data have it."""
+    key = settings.signing_key
+    if key is None:
+        return
+    if not key.is_absolute() or key.resolve().is_relative_to(settings.root):
+        where = "lies in the root of the service" if key.is_absolute() else "is no full path"
+        raise ConfigError(
+            f"{path}: signing_key: {key} {where}; put the key where only the service may read it, "
+            f"outside of {settings.root}, and give its full path",
+            key="signing_key",
+            value=str(key),
+        )

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import TargetMissing
 from starcat.releases.publishing import publish_artifact, recorded
-from starcat.releases.tree import INDEX_NAME, RELEASE_PATH, Listed
+from starcat.releases.tree import INDEX_NAME, METADATA, RELEASE_PATH, Listed
 from starcat.service.access import Publisher, Reader
 from starcat.service.problems import REFUSALS
 from starcat.service.records import Records
@@ -24,6 +24,11 @@ router = APIRouter(prefix="/releases", tags=["releases"])
 registry_router = APIRouter(prefix="/registry", tags=["releases"], responses=REFUSALS)
 
 BLOB = re.compile(r"blobs/sha256/(?P<two>[0-9a-f]{2})/(?P<digest>(?P=two)[0-9a-f]{62})", re.ASCII)
+
+SIGNED = re.compile(
+    rf"{METADATA}/(timestamp|root|(?P<version>[1-9][0-9]{{0,8}})\.(root|snapshot|targets))\.json",
+    re.ASCII,
+)
 
 MAX_NOTE = 4000
 
@@ -130,7 +135,9 @@ def publish(
 
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
     database = service.library.database(wanted.database)
-    published = publish_artifact(database.folder, str(service.paths.registry))
+    published = publish_artifact(
+        database.folder, str(service.paths.registry), signing=service.signing
+    )
     release = published.release
     with service.records.writing() as connection:  # one that is known keeps its first note
         connection.execute(
@@ -174,7 +181,10 @@ def registry_file(
     service: TheService,
     reader: Reader,
 ) -> Response:
-    """Return ``index.json``, ``versions/NAME/VERSION.json`` or ``blobs/sha256/AB/ABCD...``.
+    """Return a file by its path in the registry.
+
+    ``index.json``, ``versions/NAME/VERSION.json``, ``blobs/sha256/AB/ABCD...``, or what is signed:
+    ``metadata/timestamp.json``, ``metadata/root.json`` and ``metadata/N.ROLE.json``.
 
     ``starcat pull NAME --registry http://HOST:PORT/registry`` reads these.
     """
@@ -182,7 +192,9 @@ def registry_file(
     # A name is of one of the forms that the tree has, or there is no such file: no other text
     # becomes part of a path.
     blob = BLOB.fullmatch(path)
-    if blob is None and path != INDEX_NAME and RELEASE_PATH.fullmatch(path) is None:
+    signed = SIGNED.fullmatch(path)
+    is_release = RELEASE_PATH.fullmatch(path) is not None
+    if blob is None and path != INDEX_NAME and not is_release and signed is None:
         raise _no_file(path)
     found = root / path
     if found.is_symlink() or not found.is_file():
@@ -195,7 +207,8 @@ def registry_file(
     # Both are small and replaced as a whole: what is read is what the digest is of.
     content = found.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
-    cache = REVALIDATED if path == INDEX_NAME else IMMUTABLE
+    is_replaced = path == INDEX_NAME or (signed is not None and signed["version"] is None)
+    cache = REVALIDATED if is_replaced else IMMUTABLE
     headers = {"ETag": f'"{digest}"', "Cache-Control": cache}
     if has_already(request, digest):
         return Response(status_code=304, headers=headers)
