@@ -14,19 +14,16 @@ import pytest
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.x448 import X448PrivateKey
 from registry_files import edit_index, serving, write
-from services import DATABASE, add_database, client_of, token_of
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
 from starcat.errors import ConfigError, StarcatError
 from starcat.releases.lockfile import pull_pinned, pull_wanted
-from starcat.releases.metadata import Signing, signing_with
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import remembered
-from starcat.releases.signing import change_roles, renew, renew_if_old
+from starcat.releases.signing import change_roles, renew, renew_if_old, roles_of
 from starcat.releases.tree import MAX_INDEX_BYTES
-from starcat.service.settings import read_settings
 from starcat.storage.download import DownloadOptions
-from starcat.storage.keys import new_key, public_pem, read_private
+from starcat.storage.keys import public_pem
 
 ONCE = DownloadOptions(retries=0, timeout_s=5.0, backoff_s=0.0)
 LONG_AGO = datetime(2020, 1, 1, tzinfo=UTC)
@@ -593,38 +590,7 @@ def pem_of(kind: str, passphrase: bytes | None) -> bytes:
     return key.private_bytes(serialization.Encoding.PEM, form, hidden)
 
 
-@pytest.mark.slow
-def test_a_service_signs_with_a_key_outside_of_its_root(small_artifact, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    private, public = new_key(tmp_path / "service")
-    root = tmp_path / "root"
-    add_database(root, small_artifact)
-    token = token_of(root, "anna")
-    with client_of(root, signing_key=private, anonymous="reader") as client:
-        client.headers["Authorization"] = f"Bearer {token}"
-        answer = client.post("/api/v1/releases", json={"database": DATABASE})
-        assert (answer.status_code, answer.json()["outcome"]) == (201, "published")
-        for name in ("timestamp", "root", "1.root", "1.snapshot", "1.targets"):
-            answer = client.get(f"/registry/metadata/{name}.json")
-            kept = (root / "registry/metadata" / f"{name}.json").read_bytes()
-            assert (answer.status_code, answer.content) == (200, kept)
-            assert ("immutable" in answer.headers["Cache-Control"]) == name[0].isdigit()
-        for name in ("2.root", "1.timestamp", "01.root", "..%2Findex", "targets"):
-            assert client.get(f"/registry/metadata/{name}.json").status_code == 404
-    assert pull(str(root / "registry"), trust=public).signed == "checked"
-    registry = root / "registry"
-    assert not renew_if_old(registry, signing_with([private]))
-    soon = Signing((read_private(private),), now=datetime.now(UTC) + timedelta(days=50))
-    assert renew_if_old(registry, soon)
-
-
-@pytest.mark.parametrize("place", ["root/service.key", "root/keys/../service.key", "linked.key"])
-def test_a_service_takes_no_key_from_its_root(place, tmp_path):
-    (tmp_path / "root").mkdir()
-    (tmp_path / "linked.key").symlink_to(tmp_path / "root" / "service.key")
-    new_key(tmp_path / "root" / "service")
-    settings = f'signing_key = "{tmp_path / place}"'
-    (tmp_path / "root" / "service.toml").write_text(settings)
-    with pytest.raises(ConfigError, match="lies in the root of the service; put the key where"):
-        read_settings(tmp_path / "root")
+def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):
+    assert not renew_if_old(registry, signing("clock"))
+    assert renew_if_old(registry, signing("clock", now=datetime.now(UTC) + timedelta(days=50)))
+    assert roles_of(registry)[-1].version == Forger(registry).read("timestamp").signed.version == 4

@@ -78,10 +78,12 @@ async def keep_removing(service: Service) -> None:
 
 def _renew_signatures(service: Service) -> None:
     """Renew what the registry is signed with, in good time."""
-    if service.signing is not None:
+    key = service.settings.signing_key
+    if key is not None:
+        from starcat.releases.metadata import signing_with
         from starcat.releases.signing import renew_if_old
 
-        if renew_if_old(service.paths.registry, service.signing):
+        if renew_if_old(service.paths.registry, signing_with([key])):
             _logger.info("renewed the signatures of the registry")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from fastapi import Depends, Request
 
@@ -17,9 +17,6 @@ from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
 from starcat.service.vo.tap_jobs import QueryJobs
 from starcat.service.vo.tap_queries import Tap
-
-if TYPE_CHECKING:  # the libraries behind it are for services that sign
-    from starcat.releases.metadata import Signing
 
 GIB = 2**30
 
@@ -41,7 +38,6 @@ class Service:
         self.query_jobs = QueryJobs(self.records, self.paths, self.tap, self.wake_slots)
         self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
         self.stopping = threading.Event()
-        self.signing = _signing(settings)
 
     def wake_slots(self) -> None:
         """Have an idle slot look for jobs now."""
@@ -54,15 +50,6 @@ class Service:
         self.query_pool.close()
         self.sandbox.close()
         self.records.close()
-
-
-def _signing(settings: Settings) -> Signing | None:
-    """Return the key that signs what is published; read once, so that a wrong one is told."""
-    if settings.signing_key is None:
-        return None
-    from starcat.releases.metadata import signing_with
-
-    return signing_with([settings.signing_key])
 
 
 def service_of(request: Request) -> Service:

@@ -83,8 +83,8 @@ class Settings(BaseModel):
     )
     signing_key: Path | None = Field(
         None,
-        description="File of a key, outside of the root, that signs what is published: "
-        "docs/howto-release.md.",
+        description="File of the key, of 'starcat keys new', that publications are signed with; "
+        "outside of the root.",
     )
     keep_jobs_days: float = Field(90.0, gt=0, description="Days until ended jobs are deleted.")
     keep_results_days: float = Field(
@@ -140,26 +140,27 @@ def read_settings(root: Path, **options: object) -> Settings:
         )
     try:
         settings = Settings.model_validate({**content, "root": root.resolve()})
-        _check_key(path, settings)
-        return settings
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
         known = ", ".join(Settings.model_fields)
         hint = f"; {suggest(key, Settings.model_fields)}known: {known}"
         advice = "" if key.partition(".")[0] in Settings.model_fields else hint
         raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None
+    _check_signing_key(settings, path)
+    return settings
 
 
-def _check_key(path: Path, settings: Settings) -> None:
-    """Refuse a key that lies where the service writes, and where copies of its data have it."""
-    key = settings.signing_key
-    if key is None:
+def _check_signing_key(settings: Settings, path: Path) -> None:
+    """Refuse a key that lies among what the service writes, or is none."""
+    if settings.signing_key is None:
         return
-    if not key.is_absolute() or key.resolve().is_relative_to(settings.root):
-        where = "lies in the root of the service" if key.is_absolute() else "is no full path"
+    from starcat.storage.keys import read_private
+
+    if settings.signing_key.resolve().is_relative_to(settings.root):
         raise ConfigError(
-            f"{path}: signing_key: {key} {where}; put the key where only the service may read it, "
-            f"outside of {settings.root}, and give its full path",
+            f"{path}: signing_key: {settings.signing_key} is in the root, whose copies would "
+            "have it too; move the key to a folder that only the service can read",
             key="signing_key",
-            value=str(key),
+            value=str(settings.signing_key),
         )
+    read_private(settings.signing_key)
