@@ -43,6 +43,14 @@ def excerpts_folder() -> Path:
     return Path(os.environ.get("STARCAT_CATALOGS") or beside)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Remember what commands remember apart from what the user's own commands do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_given_maps() -> Iterator[None]:
     """Forget the maps of tables that a test gives, as a process does when its command ends."""

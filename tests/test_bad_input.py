@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,12 @@ import pyarrow.parquet as pq
 import pytest
 from artifact_copies import copied
 from astropy.io import fits
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from folder_bytes import bytes_of
 from genuine_records import PSC
 from hats_stores import write_catalog, write_facts
 from registry_files import blob_of, manifest_of, put_manifest
+from signed_registry import Forger, key_of, signing
 
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
@@ -48,12 +51,14 @@ from starcat.matcher.matcher import Matcher
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import check_blocks
 from starcat.onboard.reading import read_image
+from starcat.releases.publishing import publish_artifact
 from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.security.tokens import TokenStore
 from starcat.service.settings import Role
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
+from starcat.storage.keys import public_pem
 from starcat.store.ingest import ingest_to_store
 from starcat.store.pixels import Pixel
 
@@ -1062,6 +1067,73 @@ def other_content(place: Place) -> None:
     edit(place.registry / "versions/small/1.0.0.json", manifest_of(place.registry).name, "0" * 64)
 
 
+def team(place: Place, name: str = "team") -> None:
+    """Write the two files of a key."""
+    key = key_of(name)
+    forms = (Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    place.write(f"{name}.key", key.private_bytes(*forms))
+    place.write(f"{name}.pub", public_pem(key.public_key()))
+
+
+def signed(
+    command: str, change: Callable[[Place], object] | None = None, **options: Any
+) -> Callable[[Place], Call]:
+    """Run a command on a registry that the key of the team has signed."""
+
+    def prepare(place: Place) -> None:
+        for name in ("team", "other"):
+            team(place, name)
+        publish_artifact(place.artifact, str(place.registry), signing=signing("team", **options))
+        if change is not None:
+            change(place)
+
+    return run(command, prepare)
+
+
+TRUSTING = PULL.format("small", "--trust {folder}/team.pub")
+PUBLISH = "publish {artifact} {registry}"
+
+SIGNATURES: Cases = {
+    "registry without signatures, to who trusts a key": run(TRUSTING, team),
+    "key to trust that is missing": pull("small", "--trust {folder}/team.pub"),
+    "root to trust that is none": run(
+        PULL.format("small", "--trust {folder}/root.json"), {"root.json": "{}"}
+    ),
+    "registry that another key has signed": signed(
+        PULL.format("small", "--trust {folder}/other.pub")
+    ),
+    "release changed after it was signed": signed(
+        TRUSTING, lambda place: flip(place.registry / "versions/small/1.0.0.json")
+    ),
+    "index that says something else than what was signed": signed(
+        TRUSTING,
+        lambda place: edit(place.registry / "index.json", '"version": "1.0', '"version": "1.1'),
+    ),
+    "signatures that have ended": signed(TRUSTING, now=datetime(2020, 1, 1, tzinfo=UTC)),
+    "signatures by too few keys": signed(
+        TRUSTING,
+        lambda place: Forger(place.registry).edit_json(
+            "timestamp", lambda content: content.update(signatures=[])
+        ),
+    ),
+    "publishing without a key where all is signed": signed(PUBLISH),
+    "publishing with a key that does not count": signed(f"{PUBLISH} --sign {{folder}}/other.key"),
+    "publishing where somebody has changed what is signed": signed(
+        f"{PUBLISH} --sign {{folder}}/team.key",
+        lambda place: (place.registry / "metadata/1.targets.json").unlink(),
+    ),
+    "threshold without keys": run(f"{PUBLISH} --threshold 2"),
+    "threshold above the number of keys": run(
+        f"{PUBLISH} --sign {{folder}}/team.key --threshold 2", team
+    ),
+    "key that is missing": run(f"{PUBLISH} --sign {{folder}}/team.key"),
+    "public key to sign with": run(f"{PUBLISH} --sign {{folder}}/team.pub", team),
+    "key that is none": run(f"{PUBLISH} --sign {{file}}"),
+    "new key of a name that is taken": run("keys new {folder}/team", team),
+    "roles of a registry without signatures": run("keys show {registry}"),
+}
+
+
 REGISTRIES: Cases = {
     "publishing to an address": run("publish {artifact} https://example.org/registry"),
     "registry at another kind of address": run("releases ftp://example.org/registry"),
@@ -1099,6 +1171,7 @@ REGISTRIES: Cases = {
     "manifest with a path that leads elsewhere": other_manifest(
         rb'"pairs.parquet": \{', rb'"../../pairs.parquet": {'
     ),
+    **SIGNATURES,
 }
 
 

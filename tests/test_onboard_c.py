@@ -255,7 +255,7 @@ def test_every_loop_has_its_longest_count(folder, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_no_call_takes_longer_than_its_bound(folder):
     said = make(folder, "wcet", "WCET_FRAMES=400", "BUILD=build-wcet")
     assert "Cortex-M7" in said

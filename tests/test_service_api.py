@@ -13,9 +13,14 @@ from fastapi.testclient import TestClient
 from services import DATABASE, add_database, client_of, waiting_build
 
 from starcat.artifact.verify import verify_artifact
+from starcat.errors import ConfigError
+from starcat.releases.lockfile import pull_wanted
 from starcat.releases.pulling import pull_release
 from starcat.releases.registry import FolderRegistry
 from starcat.service.jobs.cluster import unpack
+from starcat.service.settings import read_settings
+from starcat.storage.download import DownloadOptions
+from starcat.storage.keys import new_key
 
 SETTINGS = {"anonymous": "publisher"}
 OTHER = "fedcba9876543210"
@@ -213,6 +218,38 @@ def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
     assert release.title == "small-1.0.0"
     pull_release(FolderRegistry(own_root / "registry"), release, tmp_path / "out")
     assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+
+
+def test_what_the_service_publishes_is_signed_with_its_operators_key(
+    own_root, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    private, public = new_key(tmp_path / "service")
+    with client_of(own_root, **SETTINGS, signing_key=private) as client:
+        ran = client.post("/api/v1/releases", json={"database": DATABASE})
+        assert ran.status_code == 201
+        timestamp = client.get("/registry/metadata/timestamp.json")
+        assert "no-cache" in timestamp.headers["cache-control"]
+        assert client.get("/registry/metadata/1.targets.json").status_code == 200
+        for path in ("1.snapshots.json", "../service.toml", "0.root.json", "root.json.key", ""):
+            assert client.get(f"/registry/metadata/{path}").status_code == 404
+    places = {"output": tmp_path / "out", "lock": tmp_path / "lock"}
+    registry = str(own_root / "registry")
+    one = pull_wanted("small", registry, options=DownloadOptions(), trust=public, **places)
+    assert (one.folder.name, one.signed) == ("small-1.0.0", "checked")
+    with client_of(own_root, **SETTINGS) as client:
+        ran = client.post("/api/v1/releases", json={"database": DATABASE})
+        assert ran.status_code == 422
+        assert "its operator sets signing_key in service.toml" in ran.json()["detail"]
+
+
+def test_a_key_among_the_files_of_the_service_is_refused(tmp_path):
+    (tmp_path / "root").mkdir()
+    private, public = new_key(tmp_path / "root" / "service")
+    with pytest.raises(ConfigError, match=r"signing_key: .* is in the root"):
+        read_settings(tmp_path / "root", signing_key=private)
+    with pytest.raises(ConfigError, match="a public key, which only checks"):
+        read_settings(tmp_path / "other", signing_key=public)
 
 
 def test_another_content_under_a_published_version_is_refused(

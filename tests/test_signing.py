@@ -20,7 +20,7 @@ from starcat.errors import ConfigError, StarcatError
 from starcat.releases.lockfile import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import remembered
-from starcat.releases.signing import change_roles, renew
+from starcat.releases.signing import change_roles, renew, renew_if_old, roles_of
 from starcat.releases.tree import MAX_INDEX_BYTES
 from starcat.storage.download import DownloadOptions
 from starcat.storage.keys import public_pem
@@ -588,3 +588,9 @@ def pem_of(kind: str, passphrase: bytes | None) -> bytes:
         hidden = serialization.BestAvailableEncryption(passphrase)
     form = serialization.PrivateFormat.PKCS8
     return key.private_bytes(serialization.Encoding.PEM, form, hidden)
+
+
+def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):
+    assert not renew_if_old(registry, signing("clock"))
+    assert renew_if_old(registry, signing("clock", now=datetime.now(UTC) + timedelta(days=50)))
+    assert roles_of(registry)[-1].version == Forger(registry).read("timestamp").signed.version == 4

@@ -98,6 +98,9 @@ def check(source: Source) -> list[str]:
     found = [(loop.file, loop.function, loop.head) for loop in source.loops]
     wrong = [f"not in loops.md: {' '.join(loop)}" for loop in found if loop not in listed]
     wrong += [f"only in loops.md: {' '.join(row)}" for row in listed if row not in found]
+    functions = {(row[0], row[1]) for row in rows_of("Functions")}
+    gone = sorted(functions - set(source.functions))
+    wrong += [f"only in loops.md: {' '.join(function)}" for function in gone]
     if wrong:
         return wrong
     if listed != found:

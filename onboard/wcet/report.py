@@ -158,6 +158,7 @@ def report(target: Target) -> list[str]:
     """Print what was found of a target; returns what is beyond the bound."""
     beyond = [call for call in target.calls if target.share(call) > 1.0]
     worst = max(target.calls, key=target.share)
+    of_image = target.image_rows()
     for line in [
         f"\n{target.name}\n",
         "| call | frames | worst observed, at steps | worst constructed, at steps "
@@ -165,7 +166,7 @@ def report(target: Target) -> list[str]:
         "|---|---|---|---|---|---|---|---|",
         *target.rows(),
         "",
-        *target.image_rows(),
+        *of_image,
         f"instructions for a step: {target.events()}",
         f"{len(target.calls):,} frames, {len(beyond)} beyond the bound; the nearest is "
         f"{100.0 * target.share(worst):.0f} % of it: {worst.instructions:,} instructions, "
@@ -173,7 +174,7 @@ def report(target: Target) -> list[str]:
     ]:
         print(line)
     found = [f"{target.name}: beyond the bound: {call}" for call in beyond[:5]]
-    return found + [line for line in target.image_rows() if line.startswith("BEYOND")]
+    return found + [line for line in of_image if line.startswith("BEYOND")]
 
 
 def main() -> int:

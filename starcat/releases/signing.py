@@ -105,6 +105,17 @@ def renew(registry: Path, signing: Signing) -> tuple[RoleFacts, ...]:
     return _facts(tree)
 
 
+def renew_if_old(registry: Path, signing: Signing) -> bool:
+    """Renew a registry of which more than half of the time has passed; return whether it was."""
+    if not is_signed(registry):
+        return False
+    half = signing.until(signing.days / 2)
+    is_old = load_tree(registry).timestamp.signed.expires < half
+    if is_old:
+        renew(registry, signing)
+    return is_old
+
+
 def change_roles(
     registry: Path,
     signing: Signing,

@@ -37,12 +37,17 @@ METADATA = "metadata"
 """Folder with what is signed, as The Update Framework has it."""
 
 MAX_METADATA_BYTES = 5_000_000
-"""More than a file of metadata has: a thousand releases take 250 kB."""
+"""More than a file of metadata has: a thousand releases take 140 kB."""
 
 RELEASE_PATH = re.compile(
     rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json", re.ASCII
 )
 """Path of the file of a release."""
+
+METADATA_PATH = re.compile(
+    rf"{METADATA}/(root|timestamp|[1-9][0-9]{{0,8}}\.(root|targets|snapshot))\.json", re.ASCII
+)
+"""Path of a file of metadata."""
 
 _STEP = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}"
 _FILE_NAME = re.compile(rf"{_STEP}(/{_STEP}){{0,7}}")

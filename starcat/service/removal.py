@@ -1,5 +1,7 @@
 """What is removed: databases by people; jobs, results, uploads and sign-ins when they are old.
 
+The signatures of the registry, which end too, are renewed at the same times.
+
 Databases and releases stay until somebody removes them, and so does every file that this module
 has no rule for.
 """
@@ -67,7 +69,22 @@ async def keep_removing(service: Service) -> None:
             await asyncio.to_thread(remove_old, service, time.time())
         except Exception:
             _logger.exception("what is old could not be removed")
+        try:
+            await asyncio.to_thread(_renew_signatures, service)
+        except Exception:
+            _logger.exception("the signatures of the registry could not be renewed")
         await asyncio.sleep(EVERY_S)
+
+
+def _renew_signatures(service: Service) -> None:
+    """Renew what the registry is signed with, in good time."""
+    key = service.settings.signing_key
+    if key is not None:
+        from starcat.releases.metadata import signing_with
+        from starcat.releases.signing import renew_if_old
+
+        if renew_if_old(service.paths.registry, signing_with([key])):
+            _logger.info("renewed the signatures of the registry")
 
 
 def _remove_jobs(service: Service, before_s: float) -> int:

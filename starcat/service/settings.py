@@ -81,6 +81,11 @@ class Settings(BaseModel):
         description="Database, by id or title, for clients of nova.astrometry.net; by default the "
         "newest with levels, or else the newest.",
     )
+    signing_key: Path | None = Field(
+        None,
+        description="File of the key, of 'starcat keys new', that publications are signed with; "
+        "outside of the root.",
+    )
     keep_jobs_days: float = Field(90.0, gt=0, description="Days until ended jobs are deleted.")
     keep_results_days: float = Field(
         7.0, gt=0, description="Days until results of TAP are deleted."
@@ -134,10 +139,28 @@ def read_settings(root: Path, **options: object) -> Settings:
             value=content["queue_url"],
         )
     try:
-        return Settings.model_validate({**content, "root": root.resolve()})
+        settings = Settings.model_validate({**content, "root": root.resolve()})
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
         known = ", ".join(Settings.model_fields)
         hint = f"; {suggest(key, Settings.model_fields)}known: {known}"
         advice = "" if key.partition(".")[0] in Settings.model_fields else hint
         raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None
+    _check_signing_key(settings, path)
+    return settings
+
+
+def _check_signing_key(settings: Settings, path: Path) -> None:
+    """Refuse a key that lies among what the service writes, or is none."""
+    if settings.signing_key is None:
+        return
+    from starcat.storage.keys import read_private
+
+    if settings.signing_key.resolve().is_relative_to(settings.root):
+        raise ConfigError(
+            f"{path}: signing_key: {settings.signing_key} is in the root, whose copies would "
+            "have it too; move the key to a folder that only the service can read",
+            key="signing_key",
+            value=str(settings.signing_key),
+        )
+    read_private(settings.signing_key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import pathlib
 import re
 import time
 from typing import Annotated, Any, Literal
@@ -11,9 +12,9 @@ from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.errors import TargetMissing
-from starcat.releases.publishing import publish_artifact, recorded
-from starcat.releases.tree import INDEX_NAME, RELEASE_PATH, Listed
+from starcat.errors import ConfigError, TargetMissing
+from starcat.releases.publishing import Published, publish_artifact, recorded
+from starcat.releases.tree import INDEX_NAME, METADATA, METADATA_PATH, RELEASE_PATH, Listed
 from starcat.service.access import Publisher, Reader
 from starcat.service.problems import REFUSALS
 from starcat.service.records import Records
@@ -130,7 +131,7 @@ def publish(
 
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
     database = service.library.database(wanted.database)
-    published = publish_artifact(database.folder, str(service.paths.registry))
+    published = _signed(service, database.folder)
     release = published.release
     with service.records.writing() as connection:  # one that is known keeps its first note
         connection.execute(
@@ -145,6 +146,21 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
         new_blobs=published.new_blobs,
         new_bytes=published.new_bytes,
     )
+
+
+def _signed(service: Service, folder: pathlib.Path) -> Published:
+    """Publish, signed with the operator's key if there is one."""
+    registry, key = service.paths.registry, service.settings.signing_key
+    if key is None:
+        if (registry / METADATA).is_dir():
+            raise ConfigError(
+                "the registry of this service is signed, and the service has no key: its operator "
+                "sets signing_key in service.toml"
+            )
+        return publish_artifact(folder, str(registry))
+    from starcat.releases.metadata import signing_with
+
+    return publish_artifact(folder, str(registry), signing=signing_with([key]))
 
 
 def _facts(
@@ -176,13 +192,15 @@ def registry_file(
 ) -> Response:
     """Return ``index.json``, ``versions/NAME/VERSION.json`` or ``blobs/sha256/AB/ABCD...``.
 
-    ``starcat pull NAME --registry http://HOST:PORT/registry`` reads these.
+    Also ``metadata/*.json`` where releases are signed. ``starcat pull NAME --registry
+    http://HOST:PORT/registry`` reads these.
     """
     root = service.paths.registry
     # A name is of one of the forms that the tree has, or there is no such file: no other text
     # becomes part of a path.
     blob = BLOB.fullmatch(path)
-    if blob is None and path != INDEX_NAME and RELEASE_PATH.fullmatch(path) is None:
+    small = (RELEASE_PATH, METADATA_PATH)
+    if blob is None and path != INDEX_NAME and not any(one.fullmatch(path) for one in small):
         raise _no_file(path)
     found = root / path
     if found.is_symlink() or not found.is_file():
@@ -192,10 +210,11 @@ def registry_file(
         return file_answer(
             request, found, digest, file_name=digest, content_type="application/octet-stream"
         )
-    # Both are small and replaced as a whole: what is read is what the digest is of.
+    # All are small and replaced as a whole: what is read is what the digest is of.
     content = found.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
-    cache = REVALIDATED if path == INDEX_NAME else IMMUTABLE
+    is_replaced = path in (INDEX_NAME, f"{METADATA}/root.json", f"{METADATA}/timestamp.json")
+    cache = REVALIDATED if is_replaced else IMMUTABLE
     headers = {"ETag": f'"{digest}"', "Cache-Control": cache}
     if has_already(request, digest):
         return Response(status_code=304, headers=headers)
