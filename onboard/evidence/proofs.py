@@ -2,10 +2,10 @@
 
     proofs.py FOLDER
 
-Each file states its claim and its preconditions at its head. Alarms are reads and writes outside of
-memory, memory that was not set, overflows of signed integers, shifts, divisions by 0 and conversions
-that do not fit; floats may be infinite or NaN. Writes proofs.html; fails on any alarm, on a
-precondition that is not proven, and where a function that is claimed is not reached.
+Each file states its claim and its preconditions at its head. Alarms are reads and writes outside
+of memory, memory that was not set, overflows of signed integers, shifts, divisions by 0 and
+conversions that do not fit; floats may be infinite or NaN. Writes proofs.html; fails on any alarm,
+on a precondition that is not proven, and where a function that is claimed is not reached.
 """
 
 from __future__ import annotations
