@@ -236,6 +236,37 @@ def test_tools_find_nothing(folder, target):
         assert len(re.findall(r"stack of starcat_\w+: \d+ bytes", said)) == 5
 
 
+def test_every_requirement_has_its_tests(folder, tmp_path):
+    """And every function of the unit test a requirement; the bill of materials has every file."""
+    matrix = [sys.executable, "-B", "evidence/matrix.py", str(tmp_path)]
+    said = subprocess.run(matrix, cwd=ONBOARD, capture_output=True, text=True, check=True).stdout
+    assert said.rstrip().endswith(" 0 missing")
+    test = folder / "tests" / "test_unnamed.c"
+    test.write_text("static void check_unnamed(void) {\n}\n", encoding="utf-8")
+    ran = subprocess.run(matrix, cwd=folder, capture_output=True, text=True, check=False)
+    bills = []
+    for name in ("with.json", "again.json", "without.json"):
+        if name == "without.json":
+            test.unlink()
+        bill = [sys.executable, "-B", "evidence/sbom.py", str(tmp_path / name)]
+        subprocess.run(bill, cwd=folder, capture_output=True, check=True)
+        bills.append((tmp_path / name).read_bytes())
+    assert ran.returncode == 1
+    assert "test_unnamed.c check_unnamed: named by no requirement" in ran.stdout
+    assert bills[0] == bills[1]
+    assert b"./tests/test_unnamed.c" in bills[0]
+    assert b"./tests/test_unnamed.c" not in bills[2]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_evidence_is_complete(folder):
+    said = make(folder, "evidence", "SEU_FLIPS=40000", "BUILD=build-evidence")
+    assert "0 wrong, 0 crash" in said
+    assert "fail" not in said
+    assert (folder / "build-evidence" / "evidence" / "index.html").exists()
+
+
 def test_every_loop_has_its_longest_count(folder, tmp_path):
     """``loops.md`` has every loop; one that is added to the source is named."""
     compare = [sys.executable, "-B", "wcet/loops.py"]

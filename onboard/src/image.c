@@ -120,10 +120,8 @@ starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uin
   }
   const uint32_t data = u32_at(image, 24);
   const uint32_t blocks = u32_at(image, 20) / STARCAT_BLOCK_BYTES;
-  const uint32_t end = (count == 0u) || (count > blocks - (first < blocks ? first : blocks))
-                           ? blocks
-                           : first + count;
-  for (uint32_t block = first; block < end; block++) {
+  const uint32_t most = count == 0u ? blocks : count;
+  for (uint32_t block = first; (block < blocks) && (block - first < most); block++) {
     if (!starcat_block_is_sound(image, data, block)) {
       *bad_block = block;
       return STARCAT_E_CRC;
@@ -140,12 +138,12 @@ typedef struct {
 
 static int find_sections(const uint8_t *image, uint32_t data, sections *found) {
   const uint32_t count = u32_at(image, 60);
-  if (count > N_SECTIONS) {
-    return 0;
-  }
   for (uint32_t kind = 0; kind < N_KINDS; kind++) {
     found->at[kind] = NULL;
     found->bytes[kind] = 0;
+  }
+  if (count > N_SECTIONS) {
+    return 0;
   }
   for (uint32_t n = 0; n < count; n++) {
     const size_t entry = SECTION_TABLE + 16u * (size_t)n;
