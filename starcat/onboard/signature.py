@@ -1,9 +1,9 @@
 """Ed25519 signatures within an onboard image: a section after all others, which it covers.
 
 What is signed is ``IMAGE_PREFIX`` and the SHA-512 of the image up to that section: header, section
-table, stars and features. Before it there may be a section with the signatures of the database's
-manifest, ``MANIFEST_PREFIX`` and its SHA-256, which the header has. Blocks that check or repair
-come after the data and are covered by nothing: whoever repairs a block checks the signature then.
+table, stars and features, and with the header the SHA-256 of the database's manifest. Blocks that
+check or repair come after the data and are covered by nothing: whoever repairs a block checks the
+signature then.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from starcat.onboard.layout import ByteOrder, check_blocks, in_order, rounded_up
 from starcat.onboard.reading import OnboardImage
 from starcat.storage.keys import raw_public, short_name
 
-IMAGE_KIND, MANIFEST_KIND = 9, 10
-"""Kinds of sections: signatures of the image, and of the manifest."""
+IMAGE_KIND = 9
+"""Kind of the section."""
 
-IMAGE_PREFIX, MANIFEST_PREFIX = b"starcat-image-1\0", b"starcat-manifest-1\0"
+IMAGE_PREFIX = b"starcat-image-1\0"
 """What a signed message begins with, so that no signature can be taken for another."""
 
 RECORD_BYTES = 96
@@ -62,80 +62,55 @@ def signed(message: bytes, key: Ed25519PrivateKey) -> Signature:
     return Signature(raw_public(key.public_key()), key.sign(message))
 
 
-def manifest_message(manifest_sha256: bytes) -> bytes:
-    """Return what is signed of a manifest."""
-    return MANIFEST_PREFIX + manifest_sha256
-
-
-def sign_image(
-    data: bytes,
-    byte_order: ByteOrder,
-    keys: Sequence[Ed25519PrivateKey],
-    of_manifest: Sequence[Signature] = (),
-) -> bytes:
+def sign_image(data: bytes, byte_order: ByteOrder, keys: Sequence[Ed25519PrivateKey]) -> bytes:
     """Return an unsigned image with signatures in it; without any it stays as it is."""
-    if not keys and not of_manifest:
+    if not keys:
         return data
-    for held in (keys, of_manifest):
-        if len(held) > MAX_SIGNATURES:
-            raise ConfigError(
-                f"{len(held)} signatures; an image has room for {MAX_SIGNATURES}: sign with fewer "
-                "keys",
-                key="sign",
-                value=len(held),
-            )
+    if len(keys) > MAX_SIGNATURES:
+        raise ConfigError(
+            f"{len(keys)} signatures; an image has room for {MAX_SIGNATURES}: sign with fewer keys",
+            key="sign",
+            value=len(keys),
+        )
     header = np.frombuffer(data, in_order(layout.HEADER, byte_order), 1).copy()
     before = int(header["data_bytes"][0])
     table, count = _table(data, byte_order).copy(), int(header["n_sections"][0])
     end = int((table["offset"] + table["bytes"]).max())
-    for kind, records in ((MANIFEST_KIND, len(of_manifest)), (IMAGE_KIND, len(keys))):
-        if records:
-            start = rounded_up(end, layout.SECTION_ALIGNMENT)
-            table[count] = (kind, start, RECORD_BYTES * records, RECORD_BYTES)
-            end = start + RECORD_BYTES * records
-            count += 1
-    size = rounded_up(end, layout.BLOCK_BYTES)
-    header["n_sections"], header["version_minor"] = count, _MINOR_VERSION
+    start, room = rounded_up(end, layout.SECTION_ALIGNMENT), RECORD_BYTES * len(keys)
+    table[count] = (IMAGE_KIND, start, room, RECORD_BYTES)
+    size = rounded_up(start + room, layout.BLOCK_BYTES)
+    header["n_sections"], header["version_minor"] = count + 1, _MINOR_VERSION
     header["data_bytes"], header["total_bytes"] = size, size + layout.check_bytes(size)
     whole = bytearray(data[:before].ljust(size, b"\0"))
     head = header.tobytes() + table.tobytes()
     whole[: len(head)] = head
-    if of_manifest:
-        _put(whole, table, MANIFEST_KIND, of_manifest)
-    if keys:
-        message = image_message(bytes(whole), byte_order)
-        _put(whole, table, IMAGE_KIND, [signed(message, key) for key in keys])
+    message = image_message(bytes(whole), byte_order)
+    made = [signed(message, key) for key in keys]
+    whole[start : start + room] = b"".join(one.public_key + one.signature for one in made)
     done = bytes(whole)
     return done + check_blocks(done, byte_order)
 
 
 def image_message(data: bytes, byte_order: ByteOrder) -> bytes:
     """Return what is signed of an image that has a section for it."""
-    end, _ = _place(_table(data, byte_order), IMAGE_KIND)
+    end, _ = _place(_table(data, byte_order))
     return IMAGE_PREFIX + hashlib.sha512(data[:end]).digest()
 
 
 def image_signatures(data: bytes, byte_order: ByteOrder) -> list[Signature]:
     """Return the signatures of an image that was read without complaint, unchecked."""
-    return _read(data, byte_order, IMAGE_KIND)
-
-
-def manifest_signatures(data: bytes, byte_order: ByteOrder) -> list[Signature]:
-    """Return the signatures of the manifest that an image carries, unchecked."""
-    return _read(data, byte_order, MANIFEST_KIND)
+    start, size = _place(_table(data, byte_order))
+    records = [data[n : n + RECORD_BYTES] for n in range(start, start + size, RECORD_BYTES)]
+    return [Signature(one[:32], one[32:]) for one in records if len(one) == RECORD_BYTES]
 
 
 def signature_problems(image: OnboardImage, trusted: bytes | None = None) -> Iterator[str]:
     """Yield what is wrong with the signatures of an image, one of which has to be of a key."""
     message = image_message(image.data, image.byte_order)
     signatures = image_signatures(image.data, image.byte_order)
-    checked = [("the image", one, message) for one in signatures]
-    of_manifest = manifest_message(bytes.fromhex(image.manifest_sha256))
-    carried = manifest_signatures(image.data, image.byte_order)
-    checked += [("its manifest", one, of_manifest) for one in carried]
-    for what, one, signed_message in checked:
-        if not one.is_of(signed_message):
-            yield f"the signature of {what} by the key {short_name(one.public_key)} does not fit"
+    for one in signatures:
+        if not one.is_of(message):
+            yield f"the signature of the image by the key {short_name(one.public_key)} does not fit"
     if trusted is not None and trusted not in {one.public_key for one in signatures}:
         signers = ", ".join(short_name(one.public_key) for one in signatures) or "nobody"
         yield f"signed by {signers}, not by the key {short_name(trusted)}"
@@ -146,19 +121,8 @@ def _table(data: bytes, byte_order: ByteOrder) -> NDArray[Any]:
     return np.frombuffer(data, entry, layout.MAX_SECTIONS, layout.HEADER.itemsize)
 
 
-def _place(table: NDArray[Any], kind: int) -> tuple[int, int]:
+def _place(table: NDArray[Any]) -> tuple[int, int]:
     for entry in table:
-        if entry["kind"] == kind:
+        if entry["kind"] == IMAGE_KIND:
             return int(entry["offset"]), int(entry["bytes"])
     return 0, 0
-
-
-def _read(data: bytes, byte_order: ByteOrder, kind: int) -> list[Signature]:
-    start, size = _place(_table(data, byte_order), kind)
-    records = [data[n : n + RECORD_BYTES] for n in range(start, start + size, RECORD_BYTES)]
-    return [Signature(one[:32], one[32:]) for one in records if len(one) == RECORD_BYTES]
-
-
-def _put(whole: bytearray, table: NDArray[Any], kind: int, signatures: Sequence[Signature]) -> None:
-    start, size = _place(table, kind)
-    whole[start : start + size] = b"".join(one.public_key + one.signature for one in signatures)
