@@ -56,7 +56,8 @@ def main(folder: Path) -> int:
     for line in (folder / "steps.txt").read_text(encoding="utf-8").splitlines():
         name, result, command, title = line.split("\t")
         log = (folder / f"{name}.log").read_text(encoding="utf-8", errors="replace").strip()
-        figure = log.splitlines()[-1] if log else "nothing was printed"
+        lines = log.splitlines() or ["nothing was printed"]
+        figure = lines[0 if name == "size" else -1]
         links = [page for page in PAGES.get(name, []) if (folder / page).exists()]
         rows.append([title, result, figure, command, " ".join(map(link, [*links, f"{name}.log"]))])
         failed += result != "pass"

@@ -60,7 +60,9 @@ def describe() -> dict[str, object]:
     paths = [path for path in ONBOARD.rglob("*") if path.is_file() and not path.is_symlink()]
     names = {path.relative_to(ONBOARD).as_posix(): path for path in paths}
     files, sha1s = [], []
-    for name in sorted(name for name in names if not NOT_OURS & set(name.split("/"))):
+    for name in sorted(names):
+        if any(part in NOT_OURS or part.startswith("build-") for part in name.split("/")):
+            continue
         data = names[name].read_bytes()
         sha1s.append(hashlib.sha1(data).hexdigest())
         sums = [("SHA1", sha1s[-1]), ("SHA256", hashlib.sha256(data).hexdigest())]
