@@ -48,7 +48,7 @@ def raw_public(key: Ed25519PublicKey) -> bytes:
 
 
 def short_name(raw: bytes) -> str:
-    """Return what messages call a key: the first half of its 32 public bytes would be too long."""
+    """Return the first eight bytes of a public key in hexadecimal, by which messages name it."""
     return raw.hex()[:16]
 
 
