@@ -164,7 +164,8 @@ starcat_status starcat_end(starcat_call *call, const starcat_options *options,
   starcat_workspace *w = call->work;
   result->steps = options->max_steps - call->own->steps_left;
   result->n_tried = call->own->n_tried;
-  if (!(w->best.log_chance <= call->log_limit) || !(w->best.log_bound <= call->log_limit)) {
+  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance <= call->log_limit) ||
+      !(w->best.log_bound <= call->log_limit)) {
     return refuse(call, result);
   }
   call->focal = R(0.0); /* so that the directions are worked out again */

@@ -246,6 +246,13 @@ static void check_chances(void) {
     unit_scratch.options.log_chance = (starcat_real)chances[n];
     CHECK_IS(unit_identify(&unit_scratch, &truth), n < 3u ? STARCAT_IDENTIFIED : STARCAT_NO_MATCH);
   }
+  /* And anything: what the workspace still holds of the frame before is no answer. */
+  unit_scratch.options.log_chance = (starcat_real)-18.4;
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_IDENTIFIED);
+  unit_scratch.options.log_chance = (starcat_real)0.0;
+  unit_scratch.options.tolerance_px = (starcat_real)1e5;
+  unit_scratch.options.max_steps = 1;
+  CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_BUDGET);
 }
 
 /* Lenses that put nothing at a centroid, though all corners have a direction; and one whose fold
