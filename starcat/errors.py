@@ -7,8 +7,9 @@ expected and what to do next. ``exit_code`` is what the command line returns for
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import InitVar, dataclass
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import InitVar, dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -52,8 +53,10 @@ def quoted(text: bytes | str, most: int = 60) -> str:
     return f"{words[:most]!r} (the first {most} of {len(words):,} characters)"
 
 
-def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatError | None:
-    """Return an error that another process told of.
+def error_of_kind(
+    kind: str, words: str, *, key: str | None = None, fields: Sequence[str] = ()
+) -> StarcatError | None:
+    """Return the error that another process has reported.
 
     Examples
     --------
@@ -66,8 +69,26 @@ def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatEr
     if not (isinstance(found, type) and issubclass(found, StarcatError)):
         return None
     if issubclass(found, ConfigError):
-        return found(words, key=key)
-    return None if issubclass(found, OnboardSizeError) else found(words)
+        return found(words, key=key, fields=tuple(fields))
+    return None if issubclass(found, OnboardSizeError) else found(words, fields=tuple(fields))
+
+
+def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
+    """Return the message of an error in the terms of an interface.
+
+    The library names the parameters of its functions, such as ``time_limit_s``. An interface
+    gives the name that its users know: the command line an option, a page the label of a field.
+
+    Examples
+    --------
+    >>> error = QueryError("allow more with time_limit_s", fields=("time_limit_s",))
+    >>> worded(error, lambda field: "--" + field.replace("_", "-"))
+    'allow more with --time-limit-s'
+    """
+    text = str(error)
+    for field_name in error.fields:
+        text = re.sub(rf"(?<![\w-]){re.escape(field_name)}(?!\w)", name_of(field_name), text)
+    return text
 
 
 @dataclass(eq=False, repr=False)
@@ -75,6 +96,7 @@ class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
     message: InitVar[str]  # ``args``, as every exception has it
+    fields: tuple[str, ...] = field(default=(), kw_only=True)  # parameters that the message names
     exit_code = 1
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
-from starcat.errors import StarcatError, reason
+from starcat.errors import StarcatError, reason, worded
 from starcat.version import lacking
 
 DEFECT = 70
@@ -54,7 +54,7 @@ def failure_of(error: Exception, doing: str) -> Failure:
         error = error.__cause__  # an EOFError of a library, which typer takes for Ctrl-D
     kind = type(error).__name__
     if isinstance(error, StarcatError):
-        message = shown(str(error), MAX_MESSAGE)
+        message = shown(worded(error, option_of), MAX_MESSAGE)
         return Failure(error.exit_code, kind, message, hint_in(message))
     if isinstance(error, TyperException):
         return Failure(
@@ -74,6 +74,17 @@ def failure_of(error: Exception, doing: str) -> Failure:
     text = shown(str(error), MAX_FOREIGN) or "no message"
     what = f"this is a defect of starcat: '{doing}'{_stage_of(error)} ended with {kind}: {text}"
     return Failure(DEFECT, kind, f"{what}; {hint}", hint)
+
+
+def option_of(field: str) -> str:
+    """Return the option of the command line for a parameter of a function.
+
+    Examples
+    --------
+    >>> option_of("time_limit_s")
+    '--time-limit-s'
+    """
+    return f"--{field.replace('_', '-')}"
 
 
 def _is_outsider(name: str | None) -> bool:

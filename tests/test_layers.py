@@ -244,17 +244,7 @@ def test_a_server_starts_without_what_only_some_requests_need():
     assert not found & {*parts, "astropy", "duckdb"}
 
 
-MAX_MODULE_LINES, MAX_FUNCTION_LINES, MAX_DOCSTRING_SHARE = 500, 60, 0.22
-SECTION = re.compile(r"^ *(Parameters|Returns|Raises|Yields)\n *-{3,}$", re.MULTILINE)
-ROOMS_OF_ARRAYS = {"bands", "geometry", "products", "matcher"}
-MODULES_OF_ARRAYS = {"starcat.evaluation.bare_methods"}
-
-
-def public_modules() -> set[str]:
-    """Return the modules of what docs/python.md prints, and of what `import starcat` names."""
-    page = (HOUSE.parent / "python.md").read_text(encoding="utf-8")
-    printed = {name.rsplit(".", 1)[0] for name in re.findall(r"auto\w+:: (\S+)", page)}
-    return printed | {home for home, _ in starcat._HOMES.values()} | {"starcat.client"}
+MAX_MODULE_LINES, MAX_FUNCTION_LINES = 800, 80
 
 
 def functions_of(tree: ast.Module) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
@@ -262,31 +252,10 @@ def functions_of(tree: ast.Module) -> list[ast.FunctionDef | ast.AsyncFunctionDe
     return [node for node in ast.walk(tree) if isinstance(node, kinds)]
 
 
-def docstring_lines(tree: ast.Module) -> int:
-    """Count the lines of all texts that stand alone: docstrings, and those behind constants."""
-    return sum(
-        node.value.end_lineno - node.value.lineno + 1
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
-
-
 @pytest.mark.parametrize("module", MODULES)
-def test_modules_and_functions_can_be_read_at_a_glance(module):
+def test_modules_and_functions_have_a_limited_size(module):
     source = MODULES[module].read_text(encoding="utf-8")
     assert source.count("\n") <= MAX_MODULE_LINES
     tree = ast.parse(source)
     sizes = {one.name: one.end_lineno - one.lineno + 1 for one in functions_of(tree)}
     assert not {name: size for name, size in sizes.items() if size > MAX_FUNCTION_LINES}
-    if room_of(module) in ROOMS_OF_ARRAYS or module in public_modules() | MODULES_OF_ARRAYS:
-        return
-    documented = [one for one in functions_of(tree) if SECTION.search(ast.get_docstring(one) or "")]
-    assert not [one.name for one in documented], "one line, or a type, says it"
-
-
-def test_docstrings_are_a_small_part_of_the_package():
-    sources = [path.read_text(encoding="utf-8") for path in MODULES.values()]
-    documented = sum(docstring_lines(ast.parse(source)) for source in sources)
-    assert documented <= MAX_DOCSTRING_SHARE * sum(source.count("\n") for source in sources)

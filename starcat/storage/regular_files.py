@@ -1,0 +1,58 @@
+"""Small files from outside: only regular files, only up to a stated size.
+
+A name can also lead to a device, a pipe or a socket. Reading one can block for ever, and some of
+them never end, so every reader of a small file reads it here.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from starcat.errors import FileMissing, SourceError, reason
+
+
+def read_regular_file(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; links are followed.
+    max_bytes : int
+        The largest size that is read, bytes.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    FileMissing
+        If there is no such file.
+    SourceError
+        If it is a folder, a device, a pipe or a socket, if it is larger than ``max_bytes``, or if
+        the system refuses to read it.
+    """
+    try:
+        # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except FileNotFoundError as error:
+        raise FileMissing(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        why = reason(error) if isinstance(error, OSError) else str(error)
+        raise SourceError(f"{path}: cannot be read ({why})", path=path) from error
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
+        raise SourceError(f"{path}: is {what}; give a file", path=path)
+    with os.fdopen(descriptor, "rb") as file:
+        # The size that the system states can be wrong, as in /proc: what arrives is counted.
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise SourceError(
+            f"{path}: has more than {max_bytes:,} bytes; a file of this kind is smaller", path=path
+        )
+    return content
