@@ -11,7 +11,7 @@ COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
-.PHONY: help serve install lock newest check format test test-all test-changed demo bench reproduction docs pictures golden release clean
+.PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reproduction docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -49,7 +49,7 @@ lock: $(READY) ## renew locks/: the newest versions within the bounds, with thei
 newest: ## test with the newest versions that the bounds allow, in an environment of its own
 	$(PYTHON) -m venv --clear .venv-newest
 	.venv-newest/bin/python -m pip install --quiet --editable '.[dev]'
-	.venv-newest/bin/python -m pytest -q -n 3 --dist loadfile -m 'not slow'
+	.venv-newest/bin/python -m pytest -q -n 3 --dist loadfile -m 'not slow and not real'
 
 install: $(READY) ## install starcat and its tools into .venv
 
@@ -62,10 +62,13 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff format --quiet .
 	$(BIN)/ruff check --quiet --fix .
 
-test: $(READY) ## the fast tests and the docstrings' examples
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'not slow'
+test: $(READY) ## the fast tests and the docstrings' examples; they need nothing but this folder
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'not slow and not real'
 
-test-all: $(READY) ## the fast tests and the sky-scale ones
+test-real: $(READY) ## the fast tests with real records and photographs, where their folders are
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'real and not slow'
+
+test-all: $(READY) ## all tests, sky-scale ones included; real data is used if its folders are there
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 BASE ?= HEAD~1
@@ -89,9 +92,6 @@ demo: $(RUNS) ## build a database from the embedded sky, check it, identify simu
 
 serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded sky
 	$(BIN)/starcat serve --root dist/service
-
-nights: $(READY) ## identify the photographs of ../shared/nights, or of $$STARCAT_NIGHTS
-	$(BIN)/python -m pytest -q tests/test_nights.py
 
 BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql votable
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -37,10 +37,25 @@ settings.load_profile("starcat")
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
 
 
-def excerpts_folder() -> Path:
-    """Where the catalog excerpts are, which are not part of the repository."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "catalogs"
-    return Path(os.environ.get("STARCAT_CATALOGS") or beside)
+def real_folder(variable: str, name: str) -> Path:
+    """Return a folder of real data, which is not part of the repository.
+
+    An environment variable names it. Without the variable it is searched in ``shared`` beside the
+    checkout.
+    """
+    beside = Path(__file__).resolve().parents[2] / "shared" / name
+    return Path(os.environ.get(variable) or beside)
+
+
+REAL_FIXTURES = {"excerpts", "nights"}
+"""Fixtures of real records and real photographs: tests that use one run with `make test-real`."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that need data from outside the repository."""
+    for item in items:
+        if REAL_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.real)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -60,21 +75,28 @@ def no_given_maps() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def has_excerpts() -> bool:
-    """Whether `catalogs` are the genuine excerpts, whose figures are known."""
-    return excerpts_folder().is_dir()
-
-
-@pytest.fixture(scope="session")
-def excerpts(has_excerpts: bool) -> Path:
-    """The folder of catalog excerpts, for what only genuine records can show."""
-    if not has_excerpts:
+def present(request: pytest.FixtureRequest, variable: str, name: str) -> Path:
+    """Return a folder of real data, or skip the test if the folder is absent."""
+    if "not real" in request.config.option.markexpr:
+        pytest.fail("this test uses real data: mark it with pytest.mark.real")
+    folder = real_folder(variable, name)
+    if not folder.is_dir():
         pytest.skip(
-            "genuine records are wanted and the folder of catalog excerpts is absent: set "
-            f"STARCAT_CATALOGS to it, or put it at {excerpts_folder()}"
+            f"this test needs real data: set {variable} to its folder, or put it at {folder}"
         )
-    return excerpts_folder()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def excerpts(request: pytest.FixtureRequest) -> Path:
+    """The folder of catalog excerpts with genuine records."""
+    return present(request, "STARCAT_CATALOGS", "catalogs")
+
+
+@pytest.fixture(scope="session")
+def nights(request: pytest.FixtureRequest) -> Path:
+    """The folder of real photographs."""
+    return present(request, "STARCAT_NIGHTS", "nights")
 
 
 @pytest.fixture(scope="session")
@@ -94,10 +116,20 @@ def made_catalogs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(
+    scope="session", params=["generated", pytest.param("genuine", marks=pytest.mark.real)]
+)
+def catalogs(request: pytest.FixtureRequest) -> Path:
+    """Archive files: generated ones, and with `make test-real` the genuine excerpts as well."""
+    fixtures = {"generated": "made_catalogs", "genuine": "excerpts"}
+    return Path(request.getfixturevalue(fixtures[request.param]))
+
+
 @pytest.fixture(scope="session")
-def catalogs(request: pytest.FixtureRequest, has_excerpts: bool) -> Path:
-    """The catalog excerpts where they are there, else files of the same names and layouts."""
-    return Path(request.getfixturevalue("excerpts" if has_excerpts else "made_catalogs"))
+def expected(catalogs: Path, made_catalogs: Path) -> Callable[..., Any]:
+    """Choose the expected value for `catalogs`: ``expected(generated=..., genuine=...)``."""
+    kind = "generated" if catalogs == made_catalogs else "genuine"
+    return lambda **values: values[kind]
 
 
 @pytest.fixture(scope="session")

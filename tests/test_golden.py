@@ -31,7 +31,7 @@ COUNTS = {
     ("name", "folder"),
     [
         pytest.param("gaia-12deg", "tmp_path", marks=pytest.mark.slow),
-        ("sao-12deg", "excerpts"),
+        pytest.param("sao-12deg", "excerpts", marks=pytest.mark.real),
         pytest.param(MADE, "made_catalogs", marks=pytest.mark.slow),
     ],
 )

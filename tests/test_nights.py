@@ -7,8 +7,6 @@ wide. Nothing says where they look to; one focal length has to fit them all.
 from __future__ import annotations
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,14 +14,6 @@ import pytest
 from starcat.pipeline.build import build
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import CameraSpec
-
-BESIDE = Path(__file__).resolve().parents[2] / "shared" / "nights"
-NIGHTS = Path(os.environ.get("STARCAT_NIGHTS") or BESIDE)
-
-pytestmark = pytest.mark.skipif(
-    not (NIGHTS / "spel").is_dir(),
-    reason=f"no photographs: set STARCAT_NIGHTS to their folder, or put it at {BESIDE}",
-)
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +32,15 @@ def answers(starcat, database, paths):
     return [json.loads(line) for line in run.out.splitlines()]
 
 
-def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, database):
-    paths = [NIGHTS / "spel" / f"img_{number}.jpg" for number in (1, 26, 31)]
+def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, nights, database):
+    paths = [nights / "spel" / f"img_{number}.jpg" for number in (1, 26, 31)]
     found = answers(starcat, database, paths)
     assert [one["status"] for one in found] == 3 * ["identified"]
 
 
 @pytest.mark.slow
-def test_all_photographs_are_identified_and_of_one_focal_length(starcat, database):
-    found = answers(starcat, database, [NIGHTS / "spel"])
+def test_all_photographs_are_identified_and_of_one_focal_length(starcat, nights, database):
+    found = answers(starcat, database, [nights / "spel"])
     assert [one["status"] for one in found] == 50 * ["identified"]
     focal_px = np.array([one["focal_length_px"] for one in found])
     assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015

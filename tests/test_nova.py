@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -28,9 +27,6 @@ from starcat.pipeline.starter import starter_spec
 from starcat.service.api.nova import calibration_of
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.build_spec import CameraSpec
-
-BESIDE = Path(__file__).resolve().parents[2] / "shared" / "nights"
-NIGHTS = Path(os.environ.get("STARCAT_NIGHTS") or BESIDE)
 
 
 def sent(client, address, given, **files):
@@ -167,8 +163,7 @@ def test_where_tokens_are_needed_the_key_is_one(small_artifact, tmp_path, frame)
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
-@pytest.mark.skipif(not (NIGHTS / "spel").is_dir(), reason=f"no photographs at {NIGHTS}")
-def test_astroquery_solves_photographs(tmp_path):
+def test_astroquery_solves_photographs(tmp_path, nights):
     """Twenty photographs, blind among fields of 20 to 60 deg, with only another address."""
     from astroquery.astrometry_net import AstrometryNet
 
@@ -183,7 +178,7 @@ def test_astroquery_solves_photographs(tmp_path):
     with serve(root, tmp_path / "log.txt") as served:
         client = AstrometryNet()
         client.URL, client.API_URL, client.api_key = served.address, f"{served.address}/api", "any"
-        for path in sorted((NIGHTS / "spel").iterdir())[:20]:
+        for path in sorted((nights / "spel").iterdir())[:20]:
             found = client.solve_from_image(path, verbose=False)
             wcs = WCS(found, naxis=2)
             width = found["IMAGEW"]

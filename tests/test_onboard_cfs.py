@@ -18,6 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 CFS = Path(os.environ.get("STARCAT_CFS", ROOT / "../shared/flight/cfs.tar.xz"))
+needs_cfs = pytest.mark.real  # the source of cFS is not part of the repository
 
 
 def icd_of(folder: Path) -> ModuleType:
@@ -75,6 +76,7 @@ def make(folder: Path, target: str) -> str:
     return ran.stdout
 
 
+@needs_cfs
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_thousand_frames_over_the_bus_are_right(folder):
@@ -85,6 +87,7 @@ def test_a_thousand_frames_over_the_bus_are_right(folder):
     assert re.search(r"warnings of the build +0\n", said)
 
 
+@needs_cfs
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_unit_tests_execute_every_line(folder):
