@@ -230,6 +230,8 @@ import os, sys
 sys.modules["fcntl"] = sys.modules["resource"] = None
 for name in ("O_NOFOLLOW", "O_NONBLOCK", "pread", "pwrite"):
     delattr(os, name)
+import shutil
+shutil._use_fd_functions = False  # as it is there
 from pathlib import Path
 from starcat.releases.lockfile import pull_wanted
 from starcat.releases.publishing import publish_artifact

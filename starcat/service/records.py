@@ -135,6 +135,16 @@ WAIT_S = 20.0
 """Seconds that a writer waits for another."""
 
 
+class _Opened:
+    """A connection that is closed when the thread that opened it has ended."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self.connection = connection
+
+    def __del__(self) -> None:
+        self.connection.close()
+
+
 class Records:
     """The SQLite file, opened once by each thread."""
 
@@ -161,22 +171,26 @@ class Records:
 
     def close(self) -> None:
         """Close the connection of this thread."""
-        connection = getattr(self._of_thread, "connection", None)
-        if connection is not None:
-            connection.close()
-            self._of_thread.connection = None
+        self._of_thread.opened = None
 
     def connection(self) -> sqlite3.Connection:
         """Return the connection of this thread."""
-        connection: sqlite3.Connection | None = getattr(self._of_thread, "connection", None)
-        if connection is None:
-            connection = sqlite3.connect(self.path, timeout=WAIT_S, isolation_level=None)
-            connection.row_factory = sqlite3.Row
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")
-            connection.execute("PRAGMA foreign_keys = ON")
-            self._of_thread.connection = connection
-        return connection
+        opened: _Opened | None = getattr(self._of_thread, "opened", None)
+        if opened is None:
+            # The last reference to a connection can be dropped by any thread, which then closes it.
+            connection = sqlite3.connect(
+                self.path, timeout=WAIT_S, isolation_level=None, check_same_thread=False
+            )
+            try:
+                connection.row_factory = sqlite3.Row
+                connection.execute("PRAGMA journal_mode = WAL")
+                connection.execute("PRAGMA synchronous = FULL")
+                connection.execute("PRAGMA foreign_keys = ON")
+            except BaseException:
+                connection.close()
+                raise
+            opened = self._of_thread.opened = _Opened(connection)
+        return opened.connection
 
     def check(self) -> None:
         """Look whether the file is whole and can be written; `sqlite3.Error` where it is not."""
