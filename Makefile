@@ -16,24 +16,26 @@ SERVED := $(VENV)/.served
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-$(RUNS): pyproject.toml locks/run.txt
+$(RUNS): pyproject.toml packages/lab/pyproject.toml locks/run.txt
 	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
 	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --require-hashes --no-deps --requirement locks/run.txt
-	@$(PIP) --no-deps --no-build-isolation --editable .
+	@$(PIP) --no-deps --no-build-isolation --editable . --editable packages/lab
 	@$(COMPILE)
 	@touch $(RUNS)
 
-$(SERVED): $(RUNS) locks/service.txt
+$(SERVED): $(RUNS) packages/service/pyproject.toml locks/service.txt
 	@echo "installing what the service needs into $(VENV) (30 MB)"
 	@$(PIP) --require-hashes --no-deps --requirement locks/service.txt
+	@$(PIP) --no-deps --no-build-isolation --editable packages/service
 	@$(COMPILE)
 	@touch $(SERVED)
 
-$(READY): $(RUNS) locks/dev.txt
+$(READY): $(RUNS) packages/service/pyproject.toml locks/dev.txt
 	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
 	@$(PIP) --require-hashes --no-deps --requirement locks/dev.txt
+	@$(PIP) --no-deps --no-build-isolation --editable packages/service
 	@$(COMPILE)
 	@touch $(READY)
 

@@ -52,15 +52,15 @@ from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import check_blocks
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
-from starcat.service.paths import ServicePaths
-from starcat.service.records import Records
-from starcat.service.security.tokens import TokenStore
-from starcat.service.settings import Role
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
 from starcat.storage.keys import public_pem
 from starcat.store.ingest import ingest_to_store
 from starcat.store.pixels import Pixel
+from starcat_service.paths import ServicePaths
+from starcat_service.records import Records
+from starcat_service.security.tokens import TokenStore
+from starcat_service.settings import Role
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "errors.md"

@@ -34,7 +34,6 @@ from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.catalog.stars import table_from_columns
 from starcat.cli.specs import with_sensor
 from starcat.errors import ConfigError, FileMissing
-from starcat.evaluation.ecss.sensor import example_toml
 from starcat.images.render import Optics, star_electrons
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
@@ -44,6 +43,7 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_file import read_camera
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import read_spec, spec_from_dict
+from starcat.specs.star_sensor import example_toml
 from starcat.storage.parquet import read_parquet
 
 CATALOGS = Path(

@@ -15,13 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skies import CAMERA, frame_centred_on, set_sky
 
-from starcat.evaluation import bare_methods
-from starcat.evaluation.bare_methods import (
-    name_by_points,
-    name_by_separations,
-    rank_by_full_differences,
-    rank_by_ratios,
-)
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
@@ -42,6 +35,13 @@ from starcat.matcher.methods.hausdorff import (
 )
 from starcat.matcher.observation import Observation
 from starcat.simulation.simulate import Noise
+from starcat_lab import bare_methods
+from starcat_lab.bare_methods import (
+    name_by_points,
+    name_by_separations,
+    rank_by_full_differences,
+    rank_by_ratios,
+)
 
 FOCAL_PX = CAMERA.focal_length_px
 TURNING = ("hausdorff_angular", "hausdorff_l2")

@@ -15,6 +15,11 @@ import pytest
 import starcat
 
 PACKAGE = Path(starcat.__file__).parent
+PACKAGES = {
+    "starcat_lab": PACKAGE.parent / "packages" / "lab" / "starcat_lab",
+    "starcat_service": PACKAGE.parent / "packages" / "service" / "starcat_service",
+}
+"""Packages beside starcat, in the order in which one can import another; they import starcat."""
 
 HOUSE = Path(__file__).parents[1] / "docs" / "house.md"
 
@@ -45,15 +50,22 @@ LIGHT = {
 """What a small machine carries along with the matcher."""
 
 
-def module_name(path: Path) -> str:
-    parts = ["starcat", *path.relative_to(PACKAGE).with_suffix("").parts]
+def module_name(path: Path, package: Path) -> str:
+    parts = path.relative_to(package.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+MODULES = {
+    module_name(path, package): path
+    for package in (PACKAGE, *PACKAGES.values())
+    for path in sorted(package.rglob("*.py"))
+}
 
 
 def room_of(module: str) -> str:
+    """Return the room of a module of starcat, or the package beside starcat."""
+    if module.partition(".")[0] in PACKAGES:
+        return module.partition(".")[0]
     first = module.split(".")[1] if "." in module else ""
     if (PACKAGE / first / "__init__.py").is_file() and first:
         return first
@@ -75,12 +87,12 @@ def imports_of(module: str) -> set[str]:
 
 
 def of_starcat(names: set[str]) -> set[str]:
-    return {name for name in names if name.split(".")[0] == "starcat"}
+    return {name for name in names if name.split(".")[0] in ("starcat", *PACKAGES)}
 
 
 def outsiders(names: set[str]) -> set[str]:
     tops = {name.split(".")[0] for name in names}
-    return tops - set(sys.stdlib_module_names) - {"starcat"}
+    return tops - set(sys.stdlib_module_names) - {"starcat", *PACKAGES}
 
 
 def loaded_by(code: str, depth: int = 1) -> set[str]:
@@ -102,8 +114,9 @@ def test_the_house_has_few_rooms_and_each_is_a_place():
 
 @pytest.mark.parametrize("module", MODULES)
 def test_no_import_leads_upwards(module):
-    assert room_of(module) in ROOMS, f"{module}: say in {HOUSE.name} where it belongs"
-    allowed = ROOMS[: ROOMS.index(room_of(module)) + 1]
+    places = [*ROOMS, *PACKAGES]
+    assert room_of(module) in places, f"{module}: say in {HOUSE.name} where it belongs"
+    allowed = places[: places.index(room_of(module)) + 1]
     upward = {name for name in of_starcat(imports_of(module)) if room_of(name) not in allowed}
     assert not upward, f"{module} imports {', '.join(sorted(upward))} from a later room"
 
@@ -164,7 +177,7 @@ sys.exit(", ".join(failed) or 0)
 def test_the_modules_of_every_room_import_by_themselves():
     rooms = [
         [room, *(n for n in MODULES if room_of(n) == room and n != "starcat.__main__")]
-        for room in ROOMS
+        for room in [*ROOMS, *PACKAGES]
     ]
     assert all(names for _, *names in rooms)
     ran = subprocess.run(
@@ -238,7 +251,7 @@ def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():
 @pytest.mark.slow
 def test_a_server_starts_without_what_only_some_requests_need():
     """``import scipy`` loads a part when it is first used; ``from scipy.x import`` at once."""
-    found = loaded_by("import starcat.service.server", depth=2)
+    found = loaded_by("import starcat_service.server", depth=2)
     assert "fastapi" in {name.partition(".")[0] for name in found}
     parts = {f"scipy.{part}" for part in ("ndimage", "optimize", "sparse", "spatial", "special")}
     assert not found & {*parts, "astropy", "duckdb"}

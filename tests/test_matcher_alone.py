@@ -60,7 +60,7 @@ def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_fil
     site = Path(run(python, "-c", "import site; print(site.getsitepackages()[0])").stdout.strip())
     before = {path.name for path in site.iterdir()}
     told = run(
-        python, "-m", "pip", "install", "--disable-pip-version-check", ROOT / "packaging/matcher"
+        python, "-m", "pip", "install", "--disable-pip-version-check", ROOT / "packages/matcher"
     )
     assert "ERROR" not in told.stdout + told.stderr
     assert "No broken requirements" in run(python, "-m", "pip", "check").stdout

@@ -11,10 +11,10 @@ from frames import observe, with_selection
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.evaluation.papers.s3 import optimised_triangle
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.triangle import is_well_shaped, select_triangles
 from starcat.matcher.observation import Observation
+from starcat_lab.papers.s3 import optimised_triangle
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 

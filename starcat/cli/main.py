@@ -24,7 +24,6 @@ from starcat.cli import (
     bands,
     builds,
     catalogs,
-    evaluation,
     exchange,
     fetching,
     interrupts,
@@ -32,10 +31,10 @@ from starcat.cli import (
     learning,
     matching,
     releases,
-    serving,
     specs,
     sql,
 )
+from starcat.cli.packages import add_commands
 from starcat.cli.panels import WholeSummaries
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
@@ -56,9 +55,10 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, fetching, bands, specs, builds, artifacts, sql, exchange),
-    *(releases, keys, matching, learning, evaluation, serving),
+    *(releases, keys, matching, learning),
 ):
     app.add_typer(part.app)
+add_commands(app)
 
 
 def _version(wanted: bool) -> None:

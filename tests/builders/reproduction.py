@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.evaluation.report.files import RESULTS, write_reproduction
+from starcat_lab.report.files import RESULTS, write_reproduction
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 from artifact_copies import copied
 from fastapi.testclient import TestClient
 
-from starcat.service.app import make_app
-from starcat.service.jobs.submission import submit
-from starcat.service.records import Records
-from starcat.service.security.tokens import TokenStore
-from starcat.service.settings import Role, Settings
+from starcat_service.app import make_app
+from starcat_service.jobs.submission import submit
+from starcat_service.records import Records
+from starcat_service.security.tokens import TokenStore
+from starcat_service.settings import Role, Settings
 
 if TYPE_CHECKING:
-    from starcat.service.jobs.job import Job
-    from starcat.service.service import Service
+    from starcat_service.jobs.job import Job
+    from starcat_service.service import Service
 
 DATABASE = "0123456789abcdef"
 LOCAL = "http://127.0.0.1:8000"

@@ -17,7 +17,7 @@ nominal scale.
 A reference set is a set of numbers for every star. The directed, averaged Hausdorff distance from
 observed numbers to it is the mean of their smallest differences from its members.
 
-The papers' answers without a verification are in `starcat.evaluation.bare_methods`.
+The papers' answers without a verification are in `starcat_lab.bare_methods`.
 """
 
 from __future__ import annotations

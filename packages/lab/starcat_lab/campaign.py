@@ -1,0 +1,199 @@
+"""Running all experiments of a paper, and what came of them.
+
+Experiments run side by side, one process each. One that is finished is never run again, so a
+campaign that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from starcat.errors import StarcatError
+from starcat.progress import Progress, no_progress
+from starcat_lab.experiment import Experiment, Paper, Row, Statistic, frame_count, run_experiment
+from starcat_lab.rates import ExperimentRates, Share, failures_of, rates_of
+from starcat_lab.sweep import axis_label
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class MeasuredRow:
+    """A row of a paper and what was measured."""
+
+    row: Row  # the paper's
+    rates: ExperimentRates  # rates of the row's experiment
+    # frames without success by the row's rule, by cause
+    failures: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def is_goal_reached(self) -> bool | None:
+        """Whether rate and mean time are what starcat wants; None where it wants nothing."""
+        row, rates = self.row, self.rates
+        if row.goal_percent is None and row.goal_ms is None:
+            return None
+        share = rates.by_rule if row.goal_over == "all" else rates.by_rule_enough
+        is_often = row.goal_percent is None or share.percent >= row.goal_percent
+        return is_often and (row.goal_ms is None or rates.mean_ms <= row.goal_ms)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as plain values."""
+        rates = {
+            name: value.as_dict() if isinstance(value, Share) else round(value, 4)
+            for name, value in vars(self.rates).items()
+        }
+        return {
+            # results.json has called an experiment a trial since its first version
+            **{"trial" if k == "experiment" else k: v for k, v in _plain(asdict(self.row)).items()},
+            **rates,
+            "frames": self.rates.by_rule.count,
+            "failures": self.failures,
+            "is_goal_reached": self.is_goal_reached,
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured of a paper."""
+
+    paper: Paper  # what it prints
+    is_quick: bool  # whether fewer frames were tried than the paper's
+    rows: tuple[MeasuredRow, ...]  # the measured rows, in the paper's order
+    statistics: tuple[Statistic, ...]  # numbers that need no experiment
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as plain values."""
+        labels = {one.row.group: self._axis(one.row.group) for one in self.rows}
+        return {
+            "name": self.paper.name,
+            "title": self.paper.title,
+            "citation": self.paper.citation,
+            "deviations": list(self.paper.deviations),
+            "is_quick": self.is_quick,
+            "rows": [one.as_dict() | {"axis": labels[one.row.group]} for one in self.rows],
+            "statistics": [
+                asdict(one) | {"is_goal_reached": is_goal_reached(one)} for one in self.statistics
+            ],
+        }
+
+    def _axis(self, group: str) -> str:
+        rows = [one.row for one in self.rows if one.row.group == group]
+        points = [(row.experiment, row.x) for row in rows if row.x is not None]
+        return axis_label([experiment for experiment, _ in points], [x for _, x in points])
+
+
+def is_goal_reached(statistic: Statistic) -> bool | None:
+    """Return whether a number is what starcat wants."""
+    measured, goal = statistic.measured, statistic.goal
+    if goal is None:
+        return None
+    if statistic.is_lower_better is None:
+        return abs(measured - goal) <= 0.01 * abs(goal)
+    return measured <= goal if statistic.is_lower_better else measured >= goal
+
+
+def run_paper(
+    paper: Paper,
+    artifacts: Mapping[str, Path],
+    folder: Path,
+    *,
+    quick: bool = False,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Outcome:
+    """Run all experiments of a paper, but those whose records are there."""
+    rows = paper.rows(quick)
+    tasks = _tasks(rows, artifacts)
+    place = folder / (f"{paper.name}-quick" if quick else paper.name)
+    total = sum(frame_count(experiment) for experiment, _ in tasks)
+    done = 0
+    progress(paper.name, done, total)
+    calls = [(experiment, artifact, place) for experiment, artifact in tasks]
+    with side_by_side(_run, calls, workers) as finished:
+        for experiment in finished:
+            done += frame_count(experiment)
+            progress(paper.name, done, total)
+    measured = tuple(_measured(row, place / f"{row.experiment.name}.parquet") for row in rows)
+    return Outcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
+
+
+def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Experiment, Path]]:
+    """Return each experiment once: rows may share one. The longest go first."""
+    tasks: dict[str, tuple[Experiment, Path]] = {}
+    for row in rows:
+        task = row.experiment, artifacts[row.preset]
+        if tasks.setdefault(row.experiment.name, task) != task:
+            raise ValueError(f"two different experiments are named {row.experiment.name!r}")
+    return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
+
+
+def _measured(row: Row, records: Path) -> MeasuredRow:
+    rates = rates_of(records, row.rule, row.experiment.attitude_limit_px)
+    return MeasuredRow(row, rates, failures_of(records, row.rule, row.experiment.attitude_limit_px))
+
+
+@contextmanager
+def side_by_side(
+    work: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: int
+) -> Iterator[Iterator[Result]]:
+    """Yield what calls return as they end; leaving the block early drops the others."""
+    if workers == 1:
+        yield (work(*call) for call in calls)
+        return
+    # Processes are spawned: a forked one inherits locks that the threads of libraries hold, and
+    # waits for them without end.
+    context, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
+    try:
+        futures = [pool.submit(work, *call) for call in calls]
+        yield (future.result() for future in as_completed(futures))
+    except BrokenProcessPool as error:
+        raise StarcatError(
+            "the system ended a process, perhaps for want of memory; what is finished is kept: "
+            "run again, with --workers 1"
+        ) from error
+    except BaseException:
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _run(experiment: Experiment, artifact: Path, folder: Path) -> Experiment:
+    run_experiment(experiment, artifact, folder)
+    return experiment
+
+
+def _end_with_parent() -> None:
+    """Let a process end quietly with Ctrl-C, and when the one that began it is no more."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without the numbers that JSON has no word for."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

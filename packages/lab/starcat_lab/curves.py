@@ -1,0 +1,47 @@
+"""How often a database identifies as frames get worse: a few points along a few quantities.
+
+A sweep (`starcat_lab.sweep`) is a whole report; this is what a page shows of one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from starcat.progress import Progress, no_progress
+from starcat_lab.experiment import run_experiment
+from starcat_lab.rates import rates_of
+from starcat_lab.sweep import NOISE_PX, PARAMETERS, plan_sweep, sweep_paper
+
+QUANTITIES = ("noise_px", "false_stars", "drop_probability")
+"""Quantities of the curves, each with its usual values."""
+
+STAGE = "curves"
+
+
+def measure_curves(
+    artifact: Path, folder: Path, frames: int, seed: int, progress: Progress = no_progress
+) -> list[dict[str, Any]]:
+    """Return a curve for each quantity: shares of all pointings with Wilson's interval of 95 %.
+
+    ``folder`` gets the records of the experiments.
+    """
+    values = {name: PARAMETERS[name].usual for name in QUANTITIES}
+    sweep = plan_sweep(artifact, values, frames=frames, seed=seed)
+    rows = sweep_paper(sweep).rows(False)
+    curves = {PARAMETERS[name].label: _empty(name) for name in QUANTITIES}
+    for number, row in enumerate(rows):
+        progress(STAGE, number, len(rows))
+        experiment = replace(row.experiment, engine="auto")
+        records = run_experiment(experiment, artifact, folder)
+        rates = rates_of(records, row.rule, experiment.attitude_limit_px)
+        point = {"x": row.x, **rates.by_rule.as_dict(), "wrong": rates.wrong}
+        curves[row.group]["points"].append(point)
+    progress(STAGE, len(rows), len(rows))
+    return list(curves.values())
+
+
+def _empty(name: str) -> dict[str, Any]:
+    held = "" if name == "noise_px" else f"position noise {NOISE_PX:g} px"
+    return {"quantity": name, "label": PARAMETERS[name].label, "held": held, "points": []}

@@ -1,0 +1,254 @@
+"""The trials of a star sensor: many pointings of one kind, and stars of one magnitude."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from starcat.arrays import Array, Matrix, Pixels
+from starcat.errors import ConfigError
+from starcat.geometry.attitude import matrix_from_radec_roll, random_attitudes
+from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.stars import ARCSEC
+from starcat.progress import Progress
+from starcat.specs.star_sensor import Sensor
+from starcat_lab.campaign import side_by_side
+from starcat_lab.ecss.bench import (
+    Bench,
+    Condition,
+    answer_of,
+    cached_bench,
+    planet_in_field,
+    random_day,
+)
+from starcat_lab.ecss.errors import attitude_variance, centroid_noise_px, contributions
+
+BORESIGHTS = 2000
+"""Directions all over the sky, of which the worst hundredth is tried."""
+
+_CHUNK = 5  # pointings that a process takes at once
+_FEWEST_SPOTS = 1800  # stars of a magnitude that are measured at least
+_PITCH_PX = 24.0  # and how far apart, so that none is in another's window
+_REACH_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Pointings of one kind."""
+
+    name: str
+    condition: Condition
+    pointings: int
+    frames: int  # of each pointing, one after the other
+    with_contributions: bool = False
+    boresights: tuple[tuple[float, float], ...] = ()  # right ascension and declination, degrees
+
+
+def trials_of(bench: Bench, pointings: int) -> list[Trial]:
+    """Return all trials of a sensor, the nominal one first and the worst of the sky last."""
+    sensor = bench.sensor
+    _check_trails(bench)
+    conditions = {
+        **{f"{r:g} deg/s": Condition(rate_deg_s=r) for r in sensor.rates_deg_s if r},
+        **{f"{n} false stars": Condition(false_stars=n) for n in sensor.false_stars},
+        **{f"{s:.3g} of the stars missing": Condition(missing_share=s)
+           for s in sensor.missing_shares},
+        **{f"{f:,g} particles/cm2/s": Condition(radiation_cm2_s=f)
+           for f in sensor.radiation_cm2_s},
+        **({"hot pixels at end of life": Condition(is_old=True)} if sensor.hot_pixel_share else {}),
+        "a planet in the field": Condition(has_planet=True),
+    }  # fmt: skip
+    worst = worst_boresights(bench)
+    return [
+        Trial(NOMINAL, Condition(), pointings, 3, with_contributions=True),
+        *(Trial(n, c, pointings, 2 if c.rate_deg_s else 1) for n, c in conditions.items()),
+        Trial(WORST, Condition(), pointings, 2, boresights=worst),
+    ]
+
+
+def _check_trails(bench: Bench) -> None:
+    most_px = 0.5 * min(bench.shape) - _PITCH_PX
+    for rate in (0.0, *bench.sensor.rates_deg_s):
+        if (smear_px := bench.smear_px(rate)) > most_px:
+            text = (
+                f"rates_deg_s: {rate:g} deg/s draws trails of {smear_px:.0f} px in "
+                f"{bench.sensor.exposure_s:g} s; expected at most {most_px:.0f} px on this "
+                "detector: state slower rates or a shorter exposure"
+            )
+            raise ConfigError(text, key="rates_deg_s", value=rate)
+
+
+NOMINAL, WORST = "nominal", "worst 1 % of the sky"
+
+
+def point(bench: Bench, trial: Trial, number: int) -> dict[str, Any]:
+    """Take the frames of one pointing and return what came of them, as plain values."""
+    name = zlib.crc32(trial.name.encode())
+    generator = np.random.default_rng([bench.seed, name, number])
+    observer = random_day(generator) if trial.condition.has_planet else None
+    if observer is not None:
+        truth = planet_in_field(bench, observer, generator)
+    elif trial.boresights:
+        ra_deg, dec_deg = trial.boresights[number % len(trial.boresights)]
+        truth = matrix_from_radec_roll(ra_deg, dec_deg, 360.0 * generator.random())
+    else:
+        truth = random_attitudes(1, generator)[0]
+    mounted = bench.mounted(truth)
+    frames = bench.exposures(mounted, trial.condition, generator, trial.frames, observer)
+    answers = [answer_of(bench, image, truth) for image in frames]
+    record: dict[str, Any] = {
+        "acquired": [one.is_acquired for one in answers],
+        "right": [one.is_right for one in answers],
+        "chance": [one.chance for one in answers if one.is_acquired],
+        "error": [one.error.tolist() for one in answers],
+        "guide_stars": guide_stars(bench, mounted)[1].size,
+    }
+    right = next((one for one in answers if one.is_right), None)
+    if trial.with_contributions and right is not None:
+        found = contributions(bench, mounted, right.star_index, generator)
+        record["contributions"] = {name: e.tolist() for name, e in found.errors.items()}
+        record["noise_variance"] = found.noise_variance.tolist()
+    return record
+
+
+def guide_stars(bench: Bench, matrix: Matrix) -> tuple[Pixels, Array]:
+    """Return the guide stars of a field, bright enough and the brightest first: places and mag."""
+    rows, places = bench.in_field(matrix)
+    mag = bench.sky.mag[rows]
+    kept = np.flatnonzero((bench.sky.star_index[rows] >= 0) & (mag <= bench.limit_mag))
+    kept = kept[np.argsort(mag[kept], kind="stable")][: bench.sensor.most_spots]
+    return places[kept], mag[kept]
+
+
+def expected_noise(bench: Bench) -> dict[str, Any]:
+    """Return stars and noise of fields all over the sky, in closed form."""
+    boresights = np.column_stack(radec_from_directions(saff_kuijlaars(BORESIGHTS)))
+    rolls = np.random.default_rng([bench.seed, 4]).random(BORESIGHTS) * 360.0
+    stars, sigma = np.empty(BORESIGHTS, dtype=np.int64), np.full((BORESIGHTS, 3), np.inf)
+    for k, ((ra_deg, dec_deg), roll) in enumerate(zip(boresights, rolls, strict=True)):
+        places, mag = guide_stars(bench, matrix_from_radec_roll(ra_deg, dec_deg, roll))
+        stars[k] = len(mag)
+        if len(mag) >= MIN_STARS:
+            sigma[k] = np.sqrt(attitude_variance(bench, places, centroid_noise_px(bench, mag)))
+    return {"boresights": boresights, "stars": stars, "sigma": sigma}
+
+
+def worst_boresights(bench: Bench) -> tuple[tuple[float, float], ...]:
+    """Return the hundredth of the sky where the noise is expected to be largest."""
+    found = expected_noise(bench)
+    across = np.hypot(found["sigma"][:, 0], found["sigma"][:, 1])
+    order = np.lexsort((found["stars"], -across))[: BORESIGHTS // 100]
+    return tuple((float(ra), float(dec)) for ra, dec in found["boresights"][order])
+
+
+def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
+    """Measure the centroids of many stars of one magnitude, twice each.
+
+    The noise is that of the difference, so that nothing else is in it: neither the sampling of the
+    spot nor how the pixels differ.
+    """
+    key = zlib.crc32(f"{mag:g} {rate_deg_s:g}".encode())
+    generator = np.random.default_rng([bench.seed, key])
+    smear_px = bench.smear_px(rate_deg_s)
+    reach = _REACH_PX + 0.5 * smear_px
+    grid = [
+        np.arange(0.5, size / (_PITCH_PX + smear_px) - 0.5) * (_PITCH_PX + smear_px)
+        for size in (bench.camera.width_px, bench.camera.height_px)
+    ]
+    places = np.stack(np.meshgrid(*grid), axis=-1).reshape(-1, 2)
+    differences, found, tried = [], 0, 0
+    while tried < _FEWEST_SPOTS:
+        lit = places + generator.random(places.shape) + 0.25 * _PITCH_PX
+        pair = [
+            _nearest(image, lit, reach) for image in _twice(bench, lit, mag, rate_deg_s, generator)
+        ]
+        both = np.isfinite(pair[0][:, 0]) & np.isfinite(pair[1][:, 0])
+        differences.append((pair[0] - pair[1])[both])
+        found += sum(int(np.isfinite(one[:, 0]).sum()) for one in pair)
+        tried += len(lit)
+    apart = np.concatenate(differences)
+    noise_px = float(np.sqrt(0.5 * (apart**2).mean())) if len(apart) else math.nan
+    return {
+        "mag": mag,
+        "rate_deg_s": rate_deg_s,
+        "found": found,
+        "count": 2 * tried,
+        "numbers": 2 * len(apart),
+        "noise_arcsec": noise_px / bench.camera.focal_length_px * ARCSEC,
+        "closed_form_arcsec": float(centroid_noise_px(bench, np.array(mag)))
+        / bench.camera.focal_length_px * ARCSEC,
+    }  # fmt: skip
+
+
+def _twice(
+    bench: Bench, places: Pixels, mag: float, rate_deg_s: float, generator: np.random.Generator
+) -> list[Pixels]:
+    """Return the spots of two frames of the same stars, on pixels that are all alike."""
+    moved, fainter = bench.trail_px(rate_deg_s, generator)
+    lit = (places[None] + moved[:, None]).reshape(-1, 2)
+    mean = bench.light(lit, np.full(len(lit), mag + fainter)) + bench.sensor.background_e
+    return [bench.centroids(bench.recorded(mean, generator)) for _ in range(2)]
+
+
+def _nearest(spots: Pixels, places: Pixels, reach_px: float) -> Pixels:
+    """Return the spot next to each place; NaN where there is none within reach."""
+    if not len(spots):
+        return np.full(places.shape, np.nan)
+    distance, row = cKDTree(spots).query(places)
+    found = spots[np.asarray(row)].copy()
+    found[np.asarray(distance) > reach_px] = np.nan
+    return found
+
+
+def _task(
+    artifact: Path, sensor: Sensor, seed: int, method: str | None, work: tuple[Any, ...]
+) -> tuple[Any, Any]:
+    """Do one piece of work: pointings of a trial, or a magnitude at a rate."""
+    bench = cached_bench(artifact, sensor, seed, method)
+    if isinstance(work[0], Trial):
+        trial, first, last = work
+        return (trial.name, first), [point(bench, trial, k) for k in range(first, last)]
+    return work, star_noise(bench, *work)
+
+
+def run_trials(
+    artifact: Path,
+    sensor: Sensor,
+    seed: int,
+    method: str | None,
+    trials: Sequence[Trial],
+    stars: Sequence[tuple[float, float]],
+    workers: int,
+    progress: Progress,
+) -> tuple[dict[str, list[dict[str, Any]]], list[dict[str, float]]]:
+    """Run all trials; return the records of each by its name, and the noise of single stars."""
+    chunks = [
+        (trial, first, min(first + _CHUNK, trial.pointings))
+        for trial in trials
+        for first in range(0, trial.pointings, _CHUNK)
+    ]
+    calls = [(artifact, sensor, seed, method, work) for work in [*chunks, *stars]]
+    done: dict[Any, Any] = {}
+    progress("frames", 0, len(calls))
+    with side_by_side(_task, calls, workers) as finished:
+        for key, value in finished:
+            done[key] = value
+            progress("frames", len(done), len(calls))
+    return _by_trial(trials, chunks, done), [done[one] for one in stars]
+
+
+def _by_trial(
+    trials: Sequence[Trial], chunks: Sequence[tuple[Trial, int, int]], done: Mapping[Any, Any]
+) -> dict[str, list[dict[str, Any]]]:
+    records: dict[str, list[dict[str, Any]]] = {trial.name: [] for trial in trials}
+    for trial, first, _ in chunks:
+        records[trial.name] += done[trial.name, first]
+    return records

@@ -1,0 +1,182 @@
+"""The work of ``starcat evaluate``: databases, experiments, report.
+
+An output folder holds ``artifacts/``, ``records/`` with a Parquet file for each experiment, and a
+folder for each report, named after the papers or the database. Sweeps of one database into the same
+folder stand beside each other; a point that is measured again takes the place of the old one, as
+its record does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.manifest import read_manifest
+from starcat.errors import ConfigError
+from starcat.pipeline.build import Inputs, build
+from starcat.progress import Progress, no_progress
+from starcat.specs.reading import preset
+from starcat.version import __version__
+from starcat_lab.campaign import run_paper
+from starcat_lab.experiment import Paper, code_sha256
+from starcat_lab.papers import s1, s2, s3, s4, s5
+from starcat_lab.report.files import RESULTS, write_evaluation
+from starcat_lab.sweep import Sweep, sweep_paper
+
+PAPERS: dict[str, Paper] = {
+    paper.name: paper for paper in (s1.PAPER, s2.PAPER, s3.PAPER, s4.PAPER, s5.PAPER)
+}
+"""``S1`` to ``S5``, each from its own module of ``starcat_lab.papers``."""
+
+
+def papers_named(name: str) -> list[Paper]:
+    """Return the papers that a user asks for."""
+    if name.lower() == "all":
+        return [PAPERS[known] for known in sorted(PAPERS)]
+    try:
+        return [PAPERS[name.upper()]]
+    except KeyError:
+        known = ", ".join([*sorted(PAPERS), "all"])
+        raise ConfigError(f"paper {name!r} is unknown; choose one of {known}", value=name) from None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What was measured, and where it is written down."""
+
+    contents: tuple[dict[str, Any], ...]  # `Outcome.as_dict` of each paper or sweep
+    page: Path  # the report, ``index.html``; its tables and curves are beside it
+
+
+def prepare_artifacts(
+    presets: Iterable[str],
+    inputs: Inputs,
+    folder: Path,
+    *,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> dict[str, Path]:
+    """Build the databases that papers need."""
+    artifacts = {}
+    for name in dict.fromkeys(presets):
+
+        def forward(stage: str, done: int, total: int | None, name: str = name) -> None:
+            progress(f"build {name}", done, total)
+
+        spec = preset(name)
+        given = {source: paths for source, paths in inputs.items() if source in spec.sources}
+        built = build(spec, given, folder, replace=True, workers=workers, progress=forward)
+        artifacts[name] = built.folder
+    return artifacts
+
+
+def evaluate_papers(
+    name: str,
+    inputs: Inputs,
+    output: Path,
+    *,
+    quick: bool = False,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Evaluation:
+    """Measure what papers print, and write the report."""
+    papers = papers_named(name)
+    presets = [preset for paper in papers for preset in paper.presets]
+    artifacts = prepare_artifacts(
+        presets, inputs, output / "artifacts", workers=workers, progress=progress
+    )
+    outcomes = [
+        run_paper(
+            paper, artifacts, output / "records", quick=quick, workers=workers, progress=progress
+        )
+        for paper in papers
+    ]
+    folder = "all" if name.lower() == "all" else papers[0].name
+    contents = tuple(outcome.as_dict() for outcome in outcomes)
+    place, title = output / _quick(folder, quick), "The papers, reproduced"
+    return Evaluation(contents, write_evaluation(place, title, contents, _machine()))
+
+
+def evaluate_artifact(
+    sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
+) -> Evaluation:
+    """Measure how often a database identifies, and add it to the report."""
+    paper = sweep_paper(sweep)
+    outcome = run_paper(
+        paper,
+        {paper.name: sweep.artifact},
+        output / "records",
+        quick=sweep.is_quick,
+        workers=workers,
+        progress=progress,
+    )
+    folder = output / _quick(paper.name, sweep.is_quick)
+    content = outcome.as_dict()
+    contents = with_earlier(folder / RESULTS, content, sweep.artifact)
+    page = write_evaluation(folder, f"{paper.name}, evaluated", contents, _machine())
+    return Evaluation((content,), page)
+
+
+def _quick(name: str, is_quick: bool) -> str:
+    return f"{name}-quick" if is_quick else name
+
+
+def _machine() -> str:
+    return (
+        f"mean over the frames, processors: {os.cpu_count()} ({platform.machine()}), "
+        f"starcat {__version__}, Python {platform.python_version()}"
+    )
+
+
+Content = Mapping[str, Any]
+
+
+def with_earlier(results: Path, content: Content, artifact: Path) -> list[dict[str, Any]]:
+    """Return a sweep together with those that were made before it."""
+    basis = {
+        "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
+        "code_sha256": code_sha256(),
+    }
+    new = json.loads(json.dumps({**content, "measured_with": basis}))
+    contents = [old for old in _stored(results) if old["measured_with"] == basis]
+    for number, old in enumerate(contents):
+        if _camera(old) == _camera(new):
+            contents[number] = {**new, "name": old["name"], "rows": _merged(old, new)}
+            return contents
+    taken = {old["name"] for old in contents}
+    names = (f"{new['name']}{end}" for end in ("", *(f"-camera-{n}" for n in range(2, 10**6))))
+    return [*contents, {**new, "name": next(name for name in names if name not in taken)}]
+
+
+def _stored(results: Path) -> list[dict[str, Any]]:
+    try:
+        stored = json.loads(results.read_bytes())["evaluations"]
+        return [old for old in stored if {"measured_with", "name", "rows"} <= set(old)]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []  # there is none, or none of this starcat: it is written anew
+
+
+def _camera(content: Content) -> Any:
+    """Return the camera that the matcher took the frames to be from, the same for all rows."""
+    return content["rows"][0]["trial"]["assumed"]
+
+
+def _merged(old: Content, new: Content) -> list[dict[str, Any]]:
+    """Return the rows of both, a new one in place of the old one of its name, group by group."""
+    again = {row["trial"]["name"] for row in new["rows"]}
+    rows = [row for row in old["rows"] if row["trial"]["name"] not in again] + [*new["rows"]]
+    groups = list(dict.fromkeys(row["group"] for row in (*old["rows"], *new["rows"])))
+    methods = list(dict.fromkeys(row["trial"]["method"] for row in rows))
+    return sorted(
+        rows,
+        key=lambda row: (
+            groups.index(row["group"]),
+            methods.index(row["trial"]["method"]),
+            row["x"] if row["x"] is not None else 0.0,
+        ),
+    )

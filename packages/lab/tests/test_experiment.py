@@ -1,0 +1,67 @@
+"""Trials: what the matcher is told, and which stars noise hides."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from starcat.geometry.camera import Camera
+from starcat.matcher.c_engine import library_version
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat_lab.experiment import Attitudes, Experiment, description, run_experiment
+from starcat_lab.papers import s2, s4
+
+CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
+
+LIMITED = Noise(noise_mag=1.0, limit_mag=6.0)
+
+
+def seen(u: np.ndarray, noise: Noise) -> Frame:
+    sky = Sky(u, np.linspace(3.0, 9.0, len(u)), np.arange(len(u)))
+    return simulate_frame(sky, CAMERA, np.eye(3), noise, np.random.default_rng(3))
+
+
+def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_directions):
+    u = random_directions(60_000, 4)
+    true = set(seen(u, replace(LIMITED, noise_mag=0.0)).star_index.tolist())
+    unhidden = seen(u, replace(LIMITED, is_limit_true=True))
+    assert len(true) > 20
+    assert set(unhidden.star_index.tolist()) == true
+    assert unhidden.mag.max() > 6.0  # what is measured is noisy all the same
+    hidden = seen(u, LIMITED)
+    assert hidden.mag.max() <= 6.0
+    assert len(true - set(hidden.star_index.tolist())) > 3
+    assert len(set(hidden.star_index.tolist()) - true) > 3
+
+
+def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
+    return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
+
+
+def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
+    numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
+    installed = replace(numpy, name="installed", engine="auto")
+    found = [
+        pq.read_table(run_experiment(experiment, small_artifact, tmp_path))
+        for experiment in (numpy, installed)
+    ]
+    for column in ("status", "n_named", "n_right", "n_wrong"):
+        assert found[0][column].to_pylist() == found[1][column].to_pylist()
+    facts = json.loads(description(installed, small_artifact))
+    assert facts["c_library"] == library_version()
+    assert "c_library" not in json.loads(description(numpy, small_artifact))
+
+
+def test_noise_of_a_magnitude_is_read_in_every_way():
+    rows = {row.experiment.name: row for paper in (s2, s4) for row in paper.rows(quick=True)}
+    one = rows["s2-magnitude-noise-1-dynamic_angle"]
+    for name in ("guides", "seen"):
+        other = rows[f"s2-{name}-magnitude-1-dynamic_angle"]
+        assert other.published_percent == one.published_percent == 98.84
+        assert other.experiment != one.experiment
+    assert rows["s4-seen-magnitude-1-triangle"].experiment.noise.is_limit_true
+    assert rows["s4-mixed-installed-triangle"].experiment.engine == "auto"

@@ -1,0 +1,251 @@
+"""Who asks, what they may do, and how often they may ask.
+
+A request has one principal: that of the token in its header, of the sign-in of its cookie, or the
+one that everybody has without. `Authentication` finds it out for every request; handlers say which
+role they need.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import ipaddress
+import time
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from fastapi import Depends, Request
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+from starcat_service.problems import Problem
+from starcat_service.records import Records
+from starcat_service.sandbox.places import asker
+from starcat_service.security.request_limits import Buckets, address_of, later
+from starcat_service.security.tokens import SessionStore, Token, TokenStore, digest_of
+from starcat_service.settings import Role, Settings
+
+VOSI = ("/tap/availability", "/tap/capabilities")
+"""What clients look at before they know that a token is needed (VOSI 1.1)."""
+
+NOVA = (
+    *("/api/login", "/api/upload", "/api/url_upload"),
+    *("/api/submissions/", "/api/jobs/", "/wcs_file/"),
+)
+"""Whose clients send no header: a session is in their JSON, a number in their addresses."""
+
+OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
+"""What everybody may see, also where a token is needed for all else."""
+
+CHALLENGED = ("/tap", "/scs", "/registry")
+"""Paths whose programs send a name and a password only when they are asked for them."""
+
+BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
+
+KNOWN_S = 5.0
+"""Seconds that a secret is believed without looking it up; a revoked token ends within them."""
+
+MOST_KNOWN = 1_000
+
+GUESSES_PER_MINUTE = 10
+"""Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
+not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who asks."""
+
+    name: str  # name of the token; ``anonymous`` without one
+    role: Role  # what they may do
+
+
+def principal_of(request: Request) -> Principal:
+    """Return who asks."""
+    found: Principal = request.state.principal
+    return found
+
+
+def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
+    """Return a dependency that refuses whoever has not a role."""
+
+    async def check(request: Request) -> Principal:  # plain functions are sent to a thread
+        principal = principal_of(request)
+        if principal.role >= role:
+            return principal
+        name = role.name.lower()
+        if principal.name == "anonymous":
+            raise Problem(
+                401,
+                f"this needs a token with the role {name}; send it as 'Authorization: Bearer "
+                "TOKEN', or sign in on the page",
+                headers={"WWW-Authenticate": BEARER},
+            )
+        raise Problem(
+            403,
+            f"the token {principal.name!r} has the role {principal.role.name.lower()}, and this "
+            f"needs {name}; ask the operator for another ('starcat token create')",
+        )
+
+    return check
+
+
+Reader = Annotated[Principal, Depends(needs(Role.READER))]
+Builder = Annotated[Principal, Depends(needs(Role.BUILDER))]
+Publisher = Annotated[Principal, Depends(needs(Role.PUBLISHER))]
+
+
+class Identities:
+    """Who there is: tokens and sign-ins."""
+
+    def __init__(self, records: Records, settings: Settings) -> None:
+        self.tokens = TokenStore(records)
+        self.sessions = SessionStore(records, settings.session_hours)
+        self.guessed = Buckets(GUESSES_PER_MINUTE)
+        self._known: OrderedDict[str, tuple[Token, float]] = OrderedDict()
+
+    def of_token(self, text: str) -> Token | None:
+        """Return the token of a text; None where there is no valid one."""
+        return self._lookup(self.tokens, text)
+
+    def of_session(self, secret: str) -> Token | None:
+        """Return the token that a session was begun with; None where there is no valid one."""
+        return self._lookup(self.sessions, secret)
+
+    def sign_out(self, secret: str) -> None:
+        """End a session at once."""
+        self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
+        self.sessions.close(secret)
+
+    def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
+        key, now_s = f"{type(store).__name__} {digest_of(secret)}", time.monotonic()
+        known = self._known.get(key)
+        if known is not None and known[1] > now_s:
+            return known[0]
+        # One look-up by an index in a file that is in memory: less than handing it to a thread.
+        token = store.find(secret)
+        if token is None:
+            self._known.pop(key, None)
+            return None
+        self._known[key] = token, now_s + KNOWN_S
+        if len(self._known) > MOST_KNOWN:
+            self._known.popitem(last=False)
+        return token
+
+
+class Authentication:
+    """Finds the principal of each request, and refuses those who may not ask, or not so often."""
+
+    def __init__(self, settings: Settings, identities: Identities) -> None:
+        self._settings = settings
+        self._identities = identities
+        self._anonymous = Principal("anonymous", settings.anonymous_role)
+        self._asked = Buckets(settings.requests_per_minute)
+
+    def check(self, scope: Scope) -> None:
+        """Give a request its principal, or refuse it."""
+        address = network_of(address_of(scope))
+        found = self._found(Headers(scope=scope), address)
+        who = address if found is None else f"token {found.name}"
+        asker.set(who)
+        path = scope["path"]
+        if path != "/healthz":
+            wait_s = self._asked.take(who)
+            if wait_s:
+                raise Problem(
+                    429,
+                    f"more than {self._settings.requests_per_minute} requests in a minute; ask "
+                    "again later, and less often",
+                    headers=later(wait_s),
+                )
+        principal = self._anonymous if found is None else Principal(found.name, found.role)
+        if principal.role == Role.NONE and not path.startswith(OPEN_PATHS):
+            raise self._unknown(scope)
+        scope.setdefault("state", {})["principal"] = principal
+
+    def _found(self, headers: Headers, address: str) -> Token | None:
+        given = headers.get("authorization")
+        if given is not None:
+            text = token_in(given)
+            token = None if text is None else self._identities.of_token(text)
+            if token is None:
+                wait_s = self._identities.guessed.take(address)
+                raise Problem(
+                    429 if wait_s else 401,
+                    "this token is not valid: unknown, expired or revoked; ask the operator for "
+                    "another ('starcat token create')",
+                    headers={"WWW-Authenticate": BEARER} | dict(later(wait_s) if wait_s else {}),
+                )
+            return token
+        secret = session_in(headers.get("cookie", ""), self._settings)
+        return None if secret is None else self._identities.of_session(secret)
+
+    def _unknown(self, scope: Scope) -> Problem:
+        path = scope["path"]
+        if scope["method"] == "GET" and "text/html" in Headers(scope=scope).get("accept", ""):
+            return Problem(
+                303, "sign in first", headers={"Location": f"/sign-in?next={quote(path)}"}
+            )
+        return Problem(
+            401,
+            "this needs a token; send it as 'Authorization: Bearer TOKEN', or sign in on the page",
+            headers={"WWW-Authenticate": BASIC if path.startswith(CHALLENGED) else BEARER},
+        )
+
+
+def token_in(authorization: str) -> str | None:
+    """Return the token of a header.
+
+    Examples
+    --------
+    >>> token_in("Bearer starcat_x"), token_in("Basic bWU6c3RhcmNhdF94"), token_in("Digest x")
+    ('starcat_x', 'starcat_x', None)
+    """
+    scheme, _, rest = authorization.strip().partition(" ")
+    if scheme.lower() == "bearer":
+        return rest.strip()
+    if scheme.lower() != "basic":
+        return None
+    try:
+        _, _, password = base64.b64decode(rest, validate=True).decode().partition(":")
+    except (binascii.Error, UnicodeDecodeError):
+        return None
+    return password
+
+
+def network_of(address: str) -> str:
+    """Return what is counted as one address: of IPv6 the network that one household has.
+
+    Examples
+    --------
+    >>> network_of("2001:db8::1"), network_of("192.0.2.1"), network_of("unknown")
+    ('2001:db8::', '192.0.2.1', 'unknown')
+    """
+    try:
+        found: Any = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    if found.version == 4:
+        return address
+    return str(ipaddress.ip_network(f"{found}/64", strict=False).network_address)
+
+
+def cookie_name(settings: Settings) -> str:
+    """Return the name of the cookie; behind https one that only this very host can set."""
+    return "__Host-starcat" if settings.is_secure else "starcat"
+
+
+def session_in(cookies: str, settings: Settings) -> str | None:
+    """Return the secret of a session."""
+    name = cookie_name(settings)
+    if name not in cookies:
+        return None
+    try:
+        found = SimpleCookie(cookies).get(name)
+    except CookieError:
+        return None
+    return found.value or None if found is not None else None

@@ -1,0 +1,303 @@
+"""Databases: what there is, what they hold, their files."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Request
+from fastapi import Path as PathParameter
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+from pydantic import BaseModel, Field
+
+from starcat.artifact.diff import Difference, diff_artifacts
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.reader import Artifact
+from starcat.errors import ProductError, TargetMissing
+from starcat.releases.tree import Blob
+from starcat.report.coverage_map import Fields
+from starcat_service.access import Publisher, Reader
+from starcat_service.library import Database
+from starcat_service.problems import Problem
+from starcat_service.removal import remove_database
+from starcat_service.service import Service, TheService
+from starcat_service.transfers import (
+    FILE,
+    REVALIDATED,
+    archive_bytes,
+    archive_chunks,
+    file_answer,
+    has_already,
+    type_of,
+)
+
+router = APIRouter(prefix="/databases", tags=["databases"])
+
+DatabaseId = Annotated[
+    str, PathParameter(description="Sixteen hexadecimal digits.", examples=["0123456789abcdef"])
+]
+
+REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report/coverage.csv"
+
+SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
+
+
+class DatabaseFacts(BaseModel):
+    """What a database was made from, and what it holds."""
+
+    id: str = Field(
+        description="First digits of the digest of its inputs and spec.",
+        examples=["0123456789abcdef"],
+    )
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    title: str = Field(description="Name of its folder.", examples=["gaia-12deg-1.0.0"])
+    description: str = Field(description="Description from the spec.")
+    frame: str = Field(description="Axes of all positions.", examples=["ICRS"])
+    epoch_jyear: float = Field(description="Epoch of all positions, Julian year.")
+    catalog: str = Field(description="The star catalog.", examples=["gaia"])
+    stars: int = Field(description="Guide stars.")
+    bytes: int = Field(description="Size of all files together, without the manifest.")
+    products: dict[str, int] = Field(description="Rows of each product.")
+    manifest_sha256: str = Field(description="Digest that the manifest carries of itself.")
+    spec: dict[str, Any] = Field(description="The spec, with all defaults.")
+    software: dict[str, str] = Field(description="Versions of what built it.")
+
+
+class Databases(BaseModel):
+    """All databases there are."""
+
+    databases: list[DatabaseFacts]
+
+
+class DatabaseFile(BaseModel):
+    """A file of a database."""
+
+    path: str = Field(description="Within its folder.", examples=["stars.parquet"])
+    bytes: int = Field(description="Size.")
+    sha256: str = Field(description="Digest of the content; also its ETag.")
+    content_type: str = Field(examples=["application/vnd.apache.parquet"])
+
+
+class CoverageFields(BaseModel):
+    """Stars, pairs and triangles by field: lists of the same length."""
+
+    boresight: list[int] = Field(description="Number of the boresight.")
+    ra_deg: list[float] = Field(description="Right ascension of the boresight, degrees.")
+    dec_deg: list[float] = Field(description="Declination, degrees.")
+    stars: list[int]
+    pairs: list[int]
+    triangles: list[int]
+
+
+class CoverageAnswer(BaseModel):
+    """How many stars, pairs and triangles the fields of a database hold."""
+
+    summary: dict[str, Any] = Field(description="As 'starcat coverage --json' prints it.")
+    fields: CoverageFields
+
+
+def facts_of(database: Database) -> DatabaseFacts:
+    """Return what is said of a database."""
+    manifest, spec = database.manifest, database.spec
+    return DatabaseFacts(
+        id=database.id,
+        name=database.name,
+        version=database.version,
+        title=database.title,
+        description=database.description,
+        frame=manifest["frame"],
+        epoch_jyear=manifest["epoch_jyear"],
+        catalog=spec["catalog"]["source"],
+        stars=database.products.get("stars", 0),
+        bytes=database.bytes,
+        products=database.products,
+        manifest_sha256=str(manifest.get("manifest_sha256", "")),
+        spec=spec,
+        software=manifest["software"],
+    )
+
+
+@router.get("", summary="All databases")
+def all_databases(service: TheService, reader: Reader) -> Databases:
+    """Return what databases there are, by name and version."""
+    return Databases(databases=[facts_of(one) for one in service.library.databases()])
+
+
+@router.get("/{database}", summary="One database")
+def one_database(database: DatabaseId, service: TheService, reader: Reader) -> DatabaseFacts:
+    """Return what a database was made from, and what it holds."""
+    return facts_of(service.library.database(database))
+
+
+@router.get("/{database}/manifest", summary="Manifest", responses=SAME)
+def manifest(
+    database: DatabaseId, request: Request, service: TheService, reader: Reader
+) -> Response:
+    """Return the manifest as its file has it; its SHA-256 is the ETag."""
+    return _file(service, database, MANIFEST_NAME, request, REVALIDATED)
+
+
+@router.get("/{database}/report", summary="Report", responses=SAME)
+def report(database: DatabaseId, request: Request, service: TheService, reader: Reader) -> Response:
+    """Return the report of the build: counts, coverage, magnitudes, rates of the self-test."""
+    return _file(service, database, REPORT, request, REVALIDATED)
+
+
+@router.get("/{database}/coverage", summary="Coverage", response_model=CoverageAnswer)
+def coverage(
+    database: DatabaseId, request: Request, service: TheService, reader: Reader
+) -> Response:
+    """Return stars, pairs and triangles by field, and their summary."""
+    found = service.library.database(database)
+    digest = _listed(found, FIELDS).sha256
+    headers = {"ETag": f'"{digest}"', "Cache-Control": REVALIDATED}
+    if has_already(request, digest):
+        return Response(status_code=304, headers=headers)
+    summary = json.loads((found.folder / COVERAGE).read_bytes())
+    fields = {name: column.tolist() for name, column in vars(fields_of(found)).items()}
+    fields = {"boresight": list(range(len(fields["stars"]))), **fields}
+    return JSONResponse({"summary": summary, "fields": fields}, headers=headers)
+
+
+@router.get("/{database}/diff/{other}", summary="Difference of two databases")
+async def difference(
+    database: DatabaseId,
+    other: DatabaseId,
+    service: TheService,
+    reader: Reader,
+    most: Annotated[
+        int, Query(ge=0, le=10_000, description="Stars of each kind to list at most.")
+    ] = 1000,
+) -> dict[str, Any]:
+    """Return what differs: spec, sources, software, stars and why, products.
+
+    ``counts`` says how many stars were added, removed and moved, however many are listed.
+    """
+    return await service.query_pool.run(_difference, service, database, other, most)
+
+
+def fields_of(database: Database) -> Fields:
+    """Read the fields of a database."""
+    path = database.folder / FIELDS
+    try:
+        return _read_fields(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError) as error:
+        raise ProductError(
+            f"{database.title}: {FIELDS} cannot be read ({type(error).__name__}); build the "
+            "database again",
+            path=path,
+        ) from error
+
+
+@lru_cache(maxsize=16)
+def _read_fields(path: Path, changed_ns: int) -> Fields:
+    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, usecols=range(1, 6))
+    ra_deg, dec_deg, *counts = table.T
+    return Fields(ra_deg, dec_deg, *(one.astype(np.int64) for one in counts))
+
+
+def difference_of(service: Service, database: str, other: str) -> Difference:
+    """Return what differs between two databases."""
+    sides = (service.library.database(one) for one in (database, other))
+    return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
+
+
+def _difference(service: Service, database: str, other: str, most: int) -> dict[str, Any]:
+    content = difference_of(service, database, other).as_dict()
+    stars = ("came", "went", "moved")
+    counts = {name: len(content[name]) for name in stars}
+    return {**content, **{name: content[name][:most] for name in stars}, "counts": counts}
+
+
+@router.get("/{database}/files", summary="Files")
+def files(database: DatabaseId, service: TheService, reader: Reader) -> list[DatabaseFile]:
+    """Return the files of a database with sizes and digests, the manifest first."""
+    found = service.library.database(database)
+    return [
+        DatabaseFile(path=name, content_type=type_of(name), **blob.model_dump())
+        for name, blob in found.files.items()
+    ]
+
+
+@router.get(
+    "/{database}/files/{path:path}", summary="A file", response_class=Response, responses=FILE
+)
+def file(
+    database: DatabaseId,
+    path: Annotated[str, PathParameter(examples=["stars.parquet"])],
+    request: Request,
+    service: TheService,
+    reader: Reader,
+) -> Response:
+    """Return a file that the manifest lists, or a range of it; its SHA-256 is the ETag."""
+    return _file(service, database, path, request)
+
+
+router.head("/{database}/files/{path:path}", include_in_schema=False)(file)
+
+
+@router.get(
+    "/{database}/archive",
+    summary="All files in one",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"application/x-tar": {}}, "description": "A tar archive."}},
+)
+def archive(database: DatabaseId, service: TheService, reader: Reader) -> StreamingResponse:
+    """Return the folder of a database as a tar archive, the same bytes each time."""
+    found = service.library.database(database)
+    contents = found.files
+    for name, blob in contents.items():
+        size = _path_in(found, name).stat().st_size
+        if size != blob.bytes:
+            raise ProductError(
+                f"{found.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}; "
+                "build the database again",
+                path=found.folder / name,
+            )
+    return StreamingResponse(
+        archive_chunks(found.folder, contents),
+        media_type="application/x-tar",
+        headers={
+            "Content-Length": str(archive_bytes(found.folder.name, contents)),
+            "Content-Disposition": f'attachment; filename="{found.title}.tar"',
+        },
+    )
+
+
+@router.delete("/{database}", status_code=204, summary="Remove a database")
+def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
+    """Remove a database from the service; what was published of it stays published."""
+    remove_database(service, database)
+
+
+def _listed(database: Database, name: str) -> Blob:
+    found = database.files.get(name)
+    if found is None:
+        raise TargetMissing(
+            f"{database.title} has no file {name[:80]!r}; "
+            f"/api/v1/databases/{database.id}/files lists what it has"
+        )
+    return found
+
+
+def _file(
+    service: Service, database: str, name: str, request: Request, cache: str | None = None
+) -> Response:
+    found = service.library.database(database)
+    blob = _listed(found, name)
+    path = _path_in(found, name)
+    options = {} if cache is None else {"cache": cache}
+    return file_answer(request, path, blob.sha256, file_name=path.name, **options)
+
+
+def _path_in(found: Database, name: str) -> Path:
+    """Return where a file of a database is, which no link leads out of."""
+    path = found.folder / name
+    is_own = path.resolve().is_relative_to(found.folder.resolve())
+    if path.is_symlink() or not is_own or not path.is_file():
+        raise Problem(404, f"{found.title} has no file {name[:80]!r}")
+    return path

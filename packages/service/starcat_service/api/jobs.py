@@ -1,0 +1,351 @@
+"""Jobs over the REST interface: asking for them, watching them, ending them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+import anyio
+from anyio import to_thread
+from fastapi import APIRouter, Body, Depends, Header, Query, Response
+from fastapi import Path as InPath
+from fastapi.responses import PlainTextResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import BaseModel, ConfigDict, Field
+
+from starcat.errors import ConfigError
+from starcat.specs.build_spec import SOURCE_NAME, BuildSpec
+from starcat_service.access import Builder, Reader
+from starcat_service.api.specs import GivenSpec
+from starcat_service.jobs.job import Event, Job, Kind, State
+from starcat_service.jobs.submission import (
+    Submitted,
+    cancel_job,
+    retry_job,
+    submit_build,
+    submit_evaluation,
+    submit_ingest,
+)
+from starcat_service.service import Service, TheService
+
+router = APIRouter(prefix="/jobs", tags=["jobs"])
+
+LOOK_S = 0.25
+"""How often it is looked whether something has happened to a job that somebody watches."""
+
+NUMBER = re.compile("[0-9]{1,15}")
+
+JobId = Annotated[
+    str,
+    InPath(
+        description="Id of a job: thirty-two hexadecimal digits.",
+        examples=["0123456789abcdef0123456789abcdef"],
+    ),
+]
+Text = Annotated[str, Field(max_length=2000)]
+
+
+class Wish(BaseModel):
+    """What requests for jobs have in common."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class BuildWish(Wish):
+    """A database to be built: a spec, or a preset; and what is to be changed of it."""
+
+    kind: Literal["build"]
+    spec: Annotated[str, Field(max_length=200_000)] | dict[str, Any] | None = Field(
+        None, description="A build spec: the text of its TOML file, or the same keys as JSON."
+    )
+    preset: Annotated[str, Field(max_length=100)] | None = Field(
+        None, description="Name of a spec that ships with starcat, instead."
+    )
+    changes: dict[Text, Text] = Field(
+        default_factory=dict,
+        max_length=200,
+        description="With a preset: values that replace its own, by dotted key, in TOML; an empty "
+        "text removes the key.",
+    )
+
+
+class IngestWish(Wish):
+    """A catalog to be read."""
+
+    kind: Literal["ingest"]
+    source: str = Field(
+        pattern=SOURCE_NAME, description="A star catalog, as 'starcat sources' lists."
+    )
+    band: str | None = Field(None, max_length=20, description="Band of the magnitudes.")
+    epoch_jyear: float | None = Field(
+        None, ge=1800, le=2200, description="Julian year to move positions to; else its own."
+    )
+    read_limit_mag: float | None = Field(
+        None, ge=-30, le=40, description="Fainter records are counted and left out."
+    )
+    to: Literal["parquet", "hats"] = Field(
+        "parquet", description="One file, or a store of any size, written by Dask."
+    )
+
+
+class EvaluateWish(Wish):
+    """A database whose rates are to be measured with simulated frames."""
+
+    kind: Literal["evaluate"]
+    database: str = Field(max_length=100, description="Id of the database.")
+    frames: int = Field(500, ge=1, le=20_000, description="Frames of each kind.")
+    noise_px: float | None = Field(
+        None, ge=0, le=50, description="Noise of a centroid, each axis; else that of its spec."
+    )
+    noise_mag: float | None = Field(
+        None, ge=0, le=10, description="Noise of a magnitude; else that of its spec."
+    )
+    seed: int | None = Field(
+        None, ge=0, le=2**63 - 1, description="Same seed, same frames; else that of its spec."
+    )
+
+
+AnyWish = Annotated[BuildWish | IngestWish | EvaluateWish, Field(discriminator="kind")]
+
+EXAMPLES: dict[str, Any] = {
+    "preset": {
+        "summary": "A preset with another camera",
+        "value": {
+            "kind": "build",
+            "preset": "gaia-12deg",
+            "changes": {"name": '"wide"', "camera.fov_x_deg": "16"},
+        },
+    },
+    "toml": {
+        "summary": "A spec as TOML",
+        "value": {
+            "kind": "build",
+            "spec": 'name = "small"\nversion = "1.0.0"\nepoch_jyear = 2026.0\n'
+            'catalog.source = "gaia"\nselection.faint_limit_mag = 5.0\n'
+            "camera = { width_px = 512, height_px = 512, fov_x_deg = 30.0 }\n",
+        },
+    },
+    "ingest": {
+        "summary": "A catalog as one file",
+        "value": {"kind": "ingest", "source": "gaia", "epoch_jyear": 2026.0},
+    },
+    "evaluate": {
+        "summary": "Rates of a database",
+        "value": {"kind": "evaluate", "database": "0123456789abcdef", "frames": 200},
+    },
+}
+
+
+class JobView(BaseModel):
+    """A job."""
+
+    id: str = Field(description="Thirty-two hexadecimal digits.")
+    kind: Kind = Field(description="Kind of work.")
+    key: str = Field(description="SHA-256 of all that the result depends on.")
+    owner: str = Field(description="User who requested it.")
+    title: str = Field(description="For people.")
+    state: State = Field(description="How far it is.")
+    request: dict[str, Any] = Field(description="The request.")
+    created_s: float = Field(description="Seconds since 1970.")
+    started_s: float | None = Field(None, description="When the last attempt began.")
+    ended_s: float | None = Field(None, description="When it ended.")
+    attempt: int = Field(description="How often it was begun.")
+    stage: str | None = Field(None, description="The stage that it is in.")
+    done: int | None = Field(None, description="How much of the stage is done.")
+    total: int | None = Field(None, description="Of how much, where that is known.")
+    error: dict[str, Any] | None = Field(None, description="Problem details, where it failed.")
+    result: dict[str, Any] | None = Field(
+        None, description="Result: the id of a database, a catalog, or rates."
+    )
+
+
+class JobPage(BaseModel):
+    """Some of the jobs, the newest first."""
+
+    jobs: list[JobView] = Field(description="The jobs.")
+    total: int = Field(description="Total number of jobs that match.")
+
+
+class EventView(BaseModel):
+    """Something that happened to a job."""
+
+    number: int = Field(
+        description="Number within its job, from 1; only the last stages are stored."
+    )
+    at_s: float = Field(description="Seconds since 1970.")
+    kind: Literal["state", "stage", "log"] = Field(description="What changed.")
+    data: dict[str, Any] = Field(
+        description="The state; the stage with 'done' and 'total'; or 'level' and 'text'."
+    )
+
+
+def view_of(job: Job) -> JobView:
+    """Return what is told of a job."""
+    return JobView.model_validate(job, from_attributes=True)
+
+
+def event_view(event: Event) -> EventView:
+    """Return what is told of an event."""
+    return EventView.model_validate(event, from_attributes=True)
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        200: {"model": JobView, "description": "A job was there that does the same."},
+        507: {"description": "The disk of the service is nearly full."},
+    },
+    summary="Request a job",
+)
+def submit_job(
+    wish: Annotated[AnyWish, Body(openapi_examples=EXAMPLES)],
+    response: Response,
+    service: TheService,
+    principal: Builder,
+) -> JobView:
+    """Have a database built, a catalog read, or rates measured.
+
+    The same request gives the same job while it waits, runs, or what it made is there.
+    """
+    submitted = _submitted(service, wish, principal.name)
+    response.status_code = 201 if submitted.is_new else 200
+    response.headers["Location"] = f"/api/v1/jobs/{submitted.job.id}"
+    return view_of(submitted.job)
+
+
+def _submitted(service: Service, wish: AnyWish, owner: str) -> Submitted:
+    if isinstance(wish, BuildWish):
+        return submit_build(service, _spec_of(wish), owner)
+    if isinstance(wish, IngestWish):
+        how = wish.model_dump(exclude={"kind", "source"})
+        return submit_ingest(service, wish.source, owner, **how)
+    how = wish.model_dump(exclude={"kind", "database"})
+    return submit_evaluation(service, wish.database, owner, **how)
+
+
+def _spec_of(wish: BuildWish) -> BuildSpec:
+    if (wish.spec is None) == (wish.preset is None):
+        raise ConfigError("say what to build: give either spec or preset", key="spec")
+    if wish.preset is None and wish.changes:
+        raise ConfigError("changes go with a preset; change the spec itself", key="changes")
+    toml, keys = (wish.spec, None) if isinstance(wish.spec, str) else (None, wish.spec)
+    given = GivenSpec.model_construct(
+        toml=toml, spec=keys, preset=wish.preset, changes=wish.changes
+    )
+    return given.checked()
+
+
+@router.get("", summary="List jobs")
+def list_jobs(
+    service: TheService,
+    principal: Reader,
+    state: Annotated[State | None, Query(description="Only those in it.")] = None,
+    kind: Annotated[Kind | None, Query(description="Only those of it.")] = None,
+    owner: Annotated[str | None, Query(max_length=200, description="Only theirs.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000, description="So many at most.")] = 100,
+    offset: Annotated[int, Query(ge=0, le=10**9, description="Leave out so many.")] = 0,
+) -> JobPage:
+    """Return jobs, the newest first."""
+    jobs = service.jobs.all(state=state, kind=kind, owner=owner, most=limit, skip=offset)
+    total = service.jobs.count(state=state, kind=kind, owner=owner)
+    return JobPage(jobs=list(map(view_of, jobs)), total=total)
+
+
+@router.get("/{job_id}", summary="Look at a job")
+async def show_job(job_id: JobId, service: TheService, principal: Reader) -> JobView:
+    """Return a job as it is now."""  # asked most often, and quicker than the way to a thread
+    return view_of(service.jobs.get(job_id))
+
+
+After = Annotated[
+    int, Query(ge=0, le=2**53, description="Only later events than that of this number.")
+]
+
+
+@router.get("/{job_id}/events.json", summary="What happened to a job")
+def list_events(
+    job_id: JobId, service: TheService, principal: Reader, after: After = 0
+) -> list[EventView]:
+    """Return what happened to a job so far."""
+    service.jobs.get(job_id)
+    return [event_view(event) for event in service.jobs.events(job_id, after)]
+
+
+def _known_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
+    """Return the job that is watched, or refuse before anything is sent."""
+    return service.jobs.get(job_id)
+
+
+@router.get("/{job_id}/events", response_class=EventSourceResponse, summary="Watch a job")
+async def watch_job(
+    job: Annotated[Job, Depends(_known_job)],
+    service: TheService,
+    after: After = 0,
+    last_event_id: Annotated[
+        str | None,
+        Header(description="Number of the last event that was seen, as browsers send it."),
+    ] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """Return what happens to a job as server-sent events, until it has ended.
+
+    The kind of an event is ``state``, ``stage`` or ``log``; its data are those of events.json,
+    with ``at_s``. A watcher that comes back goes on where it was.
+    """
+    last_seen = NUMBER.fullmatch(last_event_id or "")
+    seen = int(last_seen[0]) if last_seen else after
+    while not service.stopping.is_set():
+        has_ended, events = await to_thread.run_sync(_news, service, job.id, seen)
+        for event in events:
+            seen = event.number
+            data = {"at_s": event.at_s, **event.data}
+            yield ServerSentEvent(data=data, event=event.kind, id=str(event.number))
+        if has_ended:
+            return
+        await anyio.sleep(LOOK_S)
+
+
+def _news(service: Service, job_id: str, seen: int) -> tuple[bool, list[Event]]:
+    """Return whether a job had ended, and what happened by then and since."""
+    has_ended = service.jobs.get(job_id).has_ended
+    return has_ended, service.jobs.events(job_id, seen)
+
+
+@router.get("/{job_id}/log", response_class=PlainTextResponse, summary="Log of a job")
+def show_log(job_id: JobId, service: TheService, principal: Reader) -> PlainTextResponse:
+    """Return the log of a job as text: a line each, with its time (UTC)."""
+    service.jobs.get(job_id)
+    lines = map(_log_line, service.jobs.events(job_id))
+    return PlainTextResponse("".join(f"{line}\n" for line in lines))
+
+
+def _log_line(event: Event) -> str:
+    at = datetime.fromtimestamp(event.at_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    data = event.data
+    if event.kind == "log":
+        text = f"{data['level']}: {data['text']}"
+    elif event.kind == "stage":
+        much = "" if data["total"] is None else f" {data['done']:,} of {data['total']:,}"
+        text = f"{data['stage']}{much}"
+    else:
+        error = data.get("error") or {}
+        text = f"{data['state']}" + (f": {error['detail']}" if "detail" in error else "")
+    return f"{at} {' '.join(text.splitlines())}"
+
+
+@router.post("/{job_id}/cancel", summary="End a job")
+def end_job(job_id: JobId, service: TheService, principal: Builder) -> JobView:
+    """End a job that waits or runs; what it has begun to make is removed."""
+    return view_of(cancel_job(service, job_id, principal))
+
+
+@router.post(
+    "/{job_id}/retry",
+    responses={507: {"description": "The disk of the service is nearly full."}},
+    summary="Try a job again",
+)
+def try_again(job_id: JobId, service: TheService, principal: Builder) -> JobView:
+    """Have a job that failed or was cancelled done once more."""
+    return view_of(retry_job(service, job_id, principal))

@@ -1,0 +1,341 @@
+"""The interface of nova.astrometry.net, so that its clients have their pictures solved here.
+
+A picture is solved while it is uploaded. What was found is kept in memory for an hour, under a
+number that cannot be guessed and is submission, image and job at once: who knows it may read it.
+A session is what a sign-in on the page has, and travels in the JSON of a request.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import secrets
+from dataclasses import dataclass, field
+from typing import Any
+
+from cachetools import TTLCache
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, Response
+from starlette.datastructures import FormData, UploadFile
+
+from starcat.errors import StarcatError, TargetMissing
+from starcat.images.identify_options import IdentifyOptions
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
+from starcat_service.access import Identities, network_of, principal_of
+from starcat_service.api.identify import FrameUpload, identify_upload
+from starcat_service.library import Database
+from starcat_service.problems import Problem, problem_of
+from starcat_service.security.request_limits import address_of
+from starcat_service.service import Service, TheService
+from starcat_service.settings import Role
+
+router = APIRouter(include_in_schema=False)
+
+_MOST, _KEPT_S = 2_000, 3_600.0
+_ANONYMOUS = "anonymous"
+_DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
+"""Units of a scale that are of the width of a picture, degrees."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What was found for a picture."""
+
+    file: str
+    wcs: str  # a FITS header; empty where nothing was found
+    frame: dict[str, Any]  # as 'starcat identify --json' prints it
+
+    @property
+    def status(self) -> str:
+        """Outcome in nova's words."""
+        return "success" if self.wcs else "failure"
+
+
+@dataclass(frozen=True)
+class Solutions:
+    """What was found in the last hour."""
+
+    known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
+
+    def add(self, solution: Solution) -> int:
+        """Keep a solution and return its number."""
+        number = secrets.randbits(52)  # JSON's numbers are exact so far
+        self.known[number] = solution
+        return number
+
+
+def solution_of(request: Request, number: int) -> Solution:
+    """Return what was found under a number."""
+    solutions: Solutions = request.app.state.solutions
+    found = solutions.known.get(number)
+    if found is None:
+        raise Problem(404, f"no job {number}: results are kept for an hour, until a restart")
+    return found
+
+
+@router.post("/api/login")
+async def login(request: Request) -> Response:
+    """Begin a session: the key is a token of this service, anything where none is needed."""
+    async with request.form(max_files=0, max_fields=2) as form:
+        key = str(_given(form).get("apikey") or "")
+    identities: Identities = request.app.state.identities
+    token = identities.of_token(key.strip())
+    if token is not None:
+        return JSONResponse({"status": "success", "session": identities.sessions.open(token)})
+    if principal_of(request).role >= Role.READER:
+        return JSONResponse({"status": "success", "session": _ANONYMOUS})
+    wait_s = identities.guessed.take(network_of(address_of(request.scope)))
+    return _error(
+        429 if wait_s else 401, "bad apikey: give a token of this service ('starcat token create')"
+    )
+
+
+@router.post("/api/upload")
+async def upload(request: Request, service: TheService) -> Response:
+    """Solve a picture, and return the number of its submission."""
+    try:
+        async with request.form(max_files=1, max_fields=4) as form:
+            given, file = _given(form), form.get("file")
+            _check_session(request, given)
+            if isinstance(file, UploadFile):
+                frames = FrameUpload.of_form(file, service.settings.upload_mib)
+            else:
+                frames = _centroids(given)
+            solution = await service.sandbox.run(_solve, service, frames, given)
+    except (Problem, StarcatError) as error:
+        problem = problem_of(error)
+        return _error(problem.status, problem.detail)
+    number = request.app.state.solutions.add(solution)
+    return JSONResponse({"status": "success", "subid": number, "hash": f"{number:013x}"})
+
+
+@router.post("/api/url_upload")
+def url_upload() -> Response:
+    """Refuse to fetch what lies elsewhere."""
+    return _error(422, "this service fetches nothing from addresses; upload the picture")
+
+
+@router.get("/api/submissions/{number}")
+def submission(number: int, request: Request) -> Response:
+    """Return the jobs of a submission: the one that is done."""
+    found = solution_of(request, number)
+    return JSONResponse(
+        {
+            "user_images": [number],
+            "images": [number],
+            "jobs": [number],
+            "job_calibrations": [[number, number]] if found.wcs else [],
+        }
+    )
+
+
+@router.get("/api/jobs/{number}")
+def job(number: int, request: Request) -> Response:
+    """Return whether a picture was solved."""
+    return JSONResponse({"status": solution_of(request, number).status})
+
+
+@router.get("/api/jobs/{number}/calibration")
+@router.get("/api/jobs/{number}/calibration/")
+def calibration(number: int, request: Request) -> Response:
+    """Return where the picture is in the sky."""
+    found = solution_of(request, number)
+    return JSONResponse(calibration_of(found.wcs)) if found.wcs else _unsolved(found)
+
+
+@router.get("/api/jobs/{number}/info")
+@router.get("/api/jobs/{number}/info/")
+def info(number: int, request: Request) -> Response:
+    """Return all that is known of a job."""
+    found = solution_of(request, number)
+    told: dict[str, Any] = {
+        "status": found.status,
+        "original_filename": found.file,
+        "objects_in_field": _names(found),
+        "machine_tags": _names(found),
+        "tags": _names(found),
+    }
+    if found.wcs:
+        told["calibration"] = calibration_of(found.wcs)
+    return JSONResponse(told)
+
+
+@router.get("/api/jobs/{number}/objects_in_field")
+@router.get("/api/jobs/{number}/objects_in_field/")
+def objects_in_field(number: int, request: Request) -> Response:
+    """Return the names of the stars."""
+    return JSONResponse({"objects_in_field": _names(solution_of(request, number))})
+
+
+@router.get("/api/jobs/{number}/annotations")
+@router.get("/api/jobs/{number}/annotations/")
+def places_of_stars(number: int, request: Request) -> Response:
+    """Return the stars with their places in the picture."""
+    stars = [star for star in solution_of(request, number).frame["stars"] if star["star"]]
+    told = [
+        {
+            "type": "star",
+            "names": [star["star"]],
+            "pixelx": star["x_px"] + 0.5,  # nova's first pixel has its middle at 1
+            "pixely": star["y_px"] + 0.5,
+            "radius": 0.0,
+        }
+        for star in stars
+    ]
+    return JSONResponse({"annotations": told})
+
+
+@router.get("/wcs_file/{number}")
+def wcs_file(number: int, request: Request) -> Response:
+    """Return the FITS header of a picture that was solved."""
+    found = solution_of(request, number)
+    if not found.wcs:
+        return _unsolved(found)
+    name = {"Content-Disposition": 'attachment; filename="wcs.fits"'}
+    return Response(found.wcs.encode("ascii"), media_type="application/fits", headers=name)
+
+
+def calibration_of(wcs: str) -> dict[str, float]:
+    """Return centre, size and turn of a picture as nova says them.
+
+    ``orientation`` is how far up is turned from north to east, degrees; ``parity`` is 1 where east
+    is left of north when up is north, in rows from the bottom.
+    """
+    from astropy.io import fits
+    from astropy.wcs import WCS
+
+    header = fits.Header.fromstring(wcs)
+    width, height = float(header["IMAGEW"]), float(header["IMAGEH"])
+    found = WCS(header, naxis=2)
+    middle = [[0.5 * width + 0.5, 0.5 * height + 0.5]]
+    ra_deg, dec_deg = found.all_pix2world(middle, 1)[0]
+    (a, b), (c, d) = found.pixel_scale_matrix
+    parity = 1.0 if a * d - b * c >= 0.0 else -1.0
+    pixscale = 3600.0 * math.sqrt(abs(a * d - b * c))
+    turn = math.degrees(math.atan2(parity * c - b, parity * a + d))
+    return {
+        "ra": float(ra_deg),
+        "dec": float(dec_deg),
+        "radius": 0.5 * pixscale * math.hypot(width, height) / 3600.0,
+        "pixscale": pixscale,
+        "orientation": -turn,
+        "parity": parity,
+        "width_arcsec": pixscale * width,
+        "height_arcsec": pixscale * height,
+    }
+
+
+def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
+    database = _database(service)
+    fov_deg = _fields_of(database, given)
+    options = IdentifyOptions(fov_deg=fov_deg, size_px=None if fov_deg is None else _size_of(given))
+    found, _ = identify_upload(
+        service, database.id, frames, options, None, for_page=True, either_way=True
+    )
+    return Solution(frames.name, found["more"][0]["wcs"] or "", found["frames"][0])
+
+
+def _centroids(given: dict[str, Any]) -> FrameUpload:
+    """Return the frame of those who have found the stars themselves."""
+    x, y = given.get("x"), given.get("y")
+    if not (isinstance(x, list) and isinstance(y, list) and len(x) == len(y)):
+        raise Problem(
+            422, "send a picture as 'file', or centroids as lists 'x' and 'y' of a length"
+        )
+    try:  # the first pixel has its middle at 1
+        centroids = [[float(a) - 0.5, float(b) - 0.5] for a, b in zip(x, y, strict=True)]
+    except (TypeError, ValueError):
+        raise Problem(422, "x, y: expected numbers") from None
+    return FrameUpload("frame.json", io.BytesIO(json.dumps({"centroids_px": centroids}).encode()))
+
+
+def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the size of a picture whose centroids alone were sent."""
+    if "x" not in given:
+        return None
+    width, height = given.get("image_width"), given.get("image_height")
+    if not (isinstance(width, int) and isinstance(height, int)):
+        raise Problem(422, "image_width, image_height: expected whole numbers of pixels")
+    return width, height
+
+
+def _database(service: Service) -> Database:
+    """Return the database that pictures are solved with."""
+    if service.settings.plate_solver is not None:
+        return service.library.find(service.settings.plate_solver)
+    every = service.library.databases()
+    if not every:
+        raise TargetMissing("this service has no database to solve pictures with yet")
+    return max(
+        every,
+        key=lambda one: (_spec(one).products.levels.enabled, one.folder.stat().st_mtime_ns, one.id),
+    )
+
+
+def _spec(database: Database) -> BuildSpec:
+    return spec_from_dict(database.spec, database.title)
+
+
+def _fields_of(database: Database, given: dict[str, Any]) -> tuple[float, float] | None:
+    """Return the fields to try: those that were given, as far as the database has them."""
+    spec = _spec(database)
+    if not spec.products.levels.enabled:
+        return None
+    narrow, wide = known = spec.fields_deg
+    unit = _DEG.get(str(given.get("scale_units") or "degwidth"))
+    if unit is not None:
+        low, high = _scale(given)
+        narrow, wide = max(narrow, low * unit), min(wide, high * unit)
+    if narrow > wide:
+        raise Problem(
+            422,
+            f"no field of {database.title} is within the scale that was given; it has those from "
+            f"{known[0]:.4g} to {known[1]:.4g} deg",
+        )
+    return narrow, wide
+
+
+def _scale(given: dict[str, Any]) -> tuple[float, float]:
+    try:
+        if given.get("scale_type") == "ev" or given.get("scale_est") is not None:
+            about, percent = float(given["scale_est"]), float(given.get("scale_err") or 10.0)
+            return about * (1.0 - percent / 100.0), about * (1.0 + percent / 100.0)
+        return float(given.get("scale_lower") or 0.0), float(given.get("scale_upper") or math.inf)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise Problem(
+            422, "scale: expected scale_est and scale_err, or scale_lower and scale_upper, numbers"
+        ) from None
+
+
+def _given(form: FormData) -> dict[str, Any]:
+    try:
+        given = json.loads(str(form.get("request-json") or "{}"))
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        raise Problem(422, "request-json: expected an object as JSON")
+    return given
+
+
+def _check_session(request: Request, given: dict[str, Any]) -> None:
+    if principal_of(request).role >= Role.READER:
+        return
+    identities: Identities = request.app.state.identities
+    token = identities.of_session(str(given.get("session") or ""))
+    if token is None or token.role < Role.READER:
+        raise Problem(401, "no valid session: log in at /api/login first, with a token as apikey")
+
+
+def _names(solution: Solution) -> list[str]:
+    return [star["star"] for star in solution.frame["stars"] if star["star"]]
+
+
+def _error(status: int, text: str) -> Response:
+    return JSONResponse({"status": "error", "errormessage": text}, status_code=status)
+
+
+def _unsolved(solution: Solution) -> Response:
+    refusal = solution.frame.get("refusal") or {"words": solution.frame["status"]}
+    return _error(404, f"not solved: {refusal['words']}")

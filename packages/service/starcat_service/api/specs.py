@@ -1,0 +1,237 @@
+"""Specs: their keys, presets, checks, and estimates of what they will give.
+
+A request brings a spec as TOML, as JSON, or as a preset with changes.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Request, Response
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from starcat.errors import ConfigError
+from starcat.failures import validation_message
+from starcat.geometry.sphere import radec_from_directions
+from starcat.report.coverage_map import coverage_svg
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import (
+    MOST_CHARACTERS,
+    changed,
+    content_of_toml,
+    preset,
+    preset_names,
+    spec_from_dict,
+)
+from starcat_service.access import Reader
+from starcat_service.api.spec_models import (
+    CheckedSpec,
+    CoverageMap,
+    EstimateAnswer,
+    Presets,
+    StarterAnswer,
+    StarterRequest,
+    checked_spec,
+    coverage_answer,
+    estimate_answer,
+    preset_facts,
+    starter_answer,
+)
+from starcat_service.problems import Problem, refusals
+from starcat_service.service import TheService
+from starcat_service.transfers import body_type
+
+router = APIRouter(prefix="/specs", tags=["specs"])
+ORIGIN = "spec"  # what messages call the spec of a request
+TOML_TYPES = ("application/toml", "text/")
+
+MOST_BODY_BYTES = 4 * MOST_CHARACTERS
+"""Of a body: text of so many characters may be that long."""
+
+MOST_CHANGES = 200
+
+Change = Annotated[str, Field(max_length=2000)]
+Key = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class GivenSpec(BaseModel):
+    """A spec: as TOML, as JSON, or a preset that ships with starcat; with changes if wanted."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [{"preset": "gaia-12deg", "changes": {"selection.faint_limit_mag": "5.5"}}]
+        },
+    )
+
+    toml: str | None = Field(None, description="The text of a spec.")
+    spec: dict[str, Any] | None = Field(None, description="The keys of a spec.")
+    preset: str | None = Field(None, description="Name of a preset.", max_length=100)
+    changes: dict[Key, Change] = Field(
+        {},
+        max_length=MOST_CHANGES,
+        description="Values by dotted key, as ``--set`` of 'starcat build' takes them; an empty "
+        "one removes the key.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> GivenSpec:
+        if [self.toml, self.spec, self.preset].count(None) != 2:
+            raise ValueError("give one of toml, spec and preset")
+        return self
+
+    def checked(self) -> BuildSpec:
+        """Return the spec."""
+        if self.preset is not None:
+            return preset(self.preset, self.changes)
+        content = self.spec if self.toml is None else content_of_toml(self.toml, ORIGIN)
+        return spec_from_dict(changed(dict(content or {}), self.changes), ORIGIN)
+
+
+async def _body_of(request: Request) -> bytes:
+    found = bytearray()
+    async for part in request.stream():
+        found += part
+        if len(found) > MOST_BODY_BYTES:
+            raise Problem(
+                413,
+                f"the request has more than {MOST_BODY_BYTES:,} bytes; a spec with every key "
+                "explained has 12,000. Leave out what is no spec",
+            )
+    return bytes(found)
+
+
+def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
+    """Return the spec that a request brings, checked; in a thread of its own."""
+    kind = body_type(request)
+    if kind.startswith(TOML_TYPES):
+        return GivenSpec(toml=_text(body)).checked()
+    if kind != "application/json":
+        raise Problem(
+            415,
+            f"the request is of type {kind[:80]!r}; send a spec as application/toml, or as "
+            "application/json as /api/openapi.json says",
+        )
+    try:
+        given = GivenSpec.model_validate_json(body)
+    except ValidationError as error:
+        key, found = validation_message(error)
+        where = f"{key}: " if key else ""
+        raise ConfigError(
+            f"body: {where}{found[:500]}; give one of toml, spec and preset, and changes if wanted",
+            key=key or None,
+        ) from error
+    return given.checked()
+
+
+def _text(body: bytes) -> str:
+    try:
+        return body.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{ORIGIN}: not a readable TOML file: {error.reason}") from error
+
+
+SpecOfRequest = Annotated[BuildSpec, Depends(_spec_of)]  # the spec of a request's body
+
+TOML_EXAMPLE = """\
+name = "mycam"
+version = "1.0.0"
+epoch_jyear = 2016.0
+catalog.source = "gaia"
+selection.faint_limit_mag = 6.0
+camera = { width_px = 1024, height_px = 1024, fov_x_deg = 12.0 }
+"""
+
+SPEC_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "A spec: TOML as it is, or JSON.",
+        "content": {
+            "application/json": {"schema": GivenSpec.model_json_schema()},
+            "application/toml": {"schema": {"type": "string"}, "example": TOML_EXAMPLE},
+        },
+    }
+}
+"""``openapi_extra=`` of an operation with `SpecOfRequest`."""
+
+KIND = refusals({415: "Neither TOML nor JSON."})
+BUSY = refusals({503: "A catalog is being read; ``Retry-After`` says when to ask again."})
+SVG: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/svg+xml": {"schema": {"type": "string"}}}, "description": "The map."}
+}
+
+
+@router.get("/schema", summary="Keys of a spec")
+def schema(reader: Reader) -> dict[str, Any]:
+    """Return the keys of a spec as JSON Schema: types, ranges, defaults, meanings, examples."""
+    return BuildSpec.model_json_schema()
+
+
+@router.get("/presets", summary="Presets")
+def presets(reader: Reader) -> Presets:
+    """Return the specs that ship with starcat, the default first."""
+    return Presets(presets=[preset_facts(name) for name in preset_names()])
+
+
+@router.get("/presets/{name}", summary="A preset")
+def one_preset(
+    name: Annotated[str, Path(max_length=100, examples=["gaia-12deg"])], reader: Reader
+) -> CheckedSpec:
+    """Return a spec that ships with starcat: its keys, and the text that explains each."""
+    return checked_spec(preset(name))
+
+
+@router.post("/validate", summary="Check a spec", openapi_extra=SPEC_BODY, responses=KIND)
+def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
+    """Check a spec; what is wrong is told in the words of the command line, with the key."""
+    return checked_spec(spec)
+
+
+@router.post(
+    "/estimate",
+    summary="What a spec will give",
+    openapi_extra=SPEC_BODY,
+    responses={**KIND, **BUSY},
+)
+def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateAnswer:
+    """Return guide stars, to the last one, and fields, files, time and memory by estimate.
+
+    The first estimate from a catalog waits until it has been read.
+    """
+    return estimate_answer(service.catalogs.estimate(spec))
+
+
+@router.post(
+    "/coverage", summary="Guide stars by field", openapi_extra=SPEC_BODY, responses={**KIND, **BUSY}
+)
+def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> CoverageMap:
+    """Return the guide stars in each field that a spec will give."""
+    return coverage_answer(service.catalogs.estimate(spec))
+
+
+@router.post(
+    "/coverage.svg",
+    summary="Map of the guide stars by field",
+    openapi_extra=SPEC_BODY,
+    response_class=Response,
+    responses={**KIND, **BUSY, **SVG},
+)
+def coverage_picture(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
+    """Return a map of the whole sky; a pointer on a field says where it is and what it has."""
+    found = service.catalogs.estimate(spec)
+    picture = coverage_svg(
+        f"{spec.name}-{spec.version}",
+        found.cost.stars,
+        *radec_from_directions(found.fields.boresights),
+        found.fields.count,
+    )
+    return Response(picture, media_type="image/svg+xml")
+
+
+@router.post("/starter", summary="A first spec for a camera", responses=BUSY)
+def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterAnswer:
+    """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
+    found = service.catalogs.starter(
+        wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
+    )
+    return starter_answer(found)

@@ -1,0 +1,276 @@
+"""Questions in SQL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from starcat.errors import QueryError
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
+from starcat.query.gallery import gallery, macros, named_query
+from starcat.query.result import ResultTable
+from starcat.query.targets import View
+from starcat_service.access import Reader
+from starcat_service.problems import Problem
+from starcat_service.service import Service, TheService
+from starcat_service.transfers import chunks_of, scratch_folder, write_rows
+
+router = APIRouter(prefix="/sql", tags=["sql"])
+
+Form = Literal["rows", FileFormat]
+MAX_SHOWN = 100_000  # rows of an answer that is no file
+Plain = int | float | bool | str | None
+
+TargetName = Annotated[str, Field(max_length=200)]
+
+
+class SqlQuestion(BaseModel):
+    """What is asked, and how the answer is wanted."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "targets": ["0123456789abcdef"],
+                    "query": "SELECT designation, mag FROM cone($ra, $dec, 5) ORDER BY mag",
+                    "values": {"ra": 37.95, "dec": 89.26},
+                },
+                {"targets": ["gaia-12deg-1.0.0"], "named": "densest-fields", "format": "csv"},
+            ]
+        },
+    )
+
+    targets: Annotated[list[TargetName], Field(min_length=1, max_length=8)] = Field(
+        description="Ids or titles of databases, names of catalogs. One has its views in the main "
+        "schema; several have a schema each, and are a, b, c ... too."
+    )
+    query: str | None = Field(None, max_length=100_000, description="SQL, one that reads.")
+    named: str | None = Field(None, max_length=100, description="Instead: one of the gallery.")
+    values: dict[str, Plain] = Field(
+        default_factory=dict, description="The values of the $name in it."
+    )
+    format: Form = Field("rows", description="Rows as JSON lists, or a file.")
+    max_rows: int | None = Field(None, ge=1, description="Rows at most; by default 1000, or all.")
+    time_limit_s: float | None = Field(None, gt=0, description="Seconds that it may take.")
+
+
+class Column(BaseModel):
+    """A column of an answer."""
+
+    name: str
+    type: str = Field(description="As DuckDB calls it.", examples=["DOUBLE"])
+    unit: str = Field(examples=["deg"])
+    description: str
+
+
+class SqlRows(BaseModel):
+    """An answer in rows."""
+
+    columns: list[Column]
+    rows: list[list[Any]] = Field(
+        description="Integers beyond 2^53 are text; NaN and infinities are null."
+    )
+    is_cut: bool = Field(description="Whether there are more rows.")
+
+
+class GalleryValue(BaseModel):
+    """A value that a named query can be given."""
+
+    name: str
+    default: Plain
+    help: str
+
+
+class GalleryQuery(BaseModel):
+    """A query that people ask often."""
+
+    name: str
+    help: str = Field(description="Description.")
+    targets: int = Field(description="How many targets it is about.")
+    values: list[GalleryValue]
+    text: str = Field(description="SQL.")
+
+
+class MacroFacts(BaseModel):
+    """A function of queries."""
+
+    name: str
+    arguments: str
+    is_table: bool = Field(description="Whether it is a table macro, used after FROM.")
+    help: str
+    example: str
+
+
+class ViewColumn(BaseModel):
+    """A column of a view."""
+
+    name: str
+    dtype: str = Field(description="Empty where it is not known.")
+    unit: str
+    description: str
+
+
+class ViewFacts(BaseModel):
+    """A table that queries see."""
+
+    target: str = Field(description="Its schema, where there are several.")
+    view: str
+    description: str
+    columns: list[ViewColumn]
+
+
+@dataclass(frozen=True)
+class SqlQuery:
+    """A query and its limits."""
+
+    targets: Sequence[str]  # as `Library.target` takes them
+    text: str
+    values: Mapping[str, Any]  # of the ``$name`` in it
+    max_rows: int
+    time_s: float
+
+
+def result_table(service: Service, query: SqlQuery) -> ResultTable:
+    """Return the first rows of a result."""
+    paths = [service.library.target(name) for name in query.targets]
+    with (
+        service.query_pool.session(paths, query.time_s) as session,
+        session.ask(query.text, query.values) as running,
+    ):
+        found: ResultTable = running.table(query.max_rows)
+    return found
+
+
+def result_file(
+    service: Service, query: SqlQuery, form: str, stem: str
+) -> tuple[StreamingResponse, int, bool]:
+    """Return a result as a file, its rows, and whether there are more; ``stem`` has no suffix."""
+    paths = [service.library.target(name) for name in query.targets]
+    with scratch_folder(service.paths) as folder:
+        source, target = folder / "rows.arrow", folder / "result"
+        with (
+            service.query_pool.session(paths, query.time_s) as session,
+            session.ask(query.text, query.values) as running,
+        ):
+            count, is_cut = write_rows(running.batches(), source, query.max_rows)
+        service.sandbox.convert(source, target, form)
+        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
+    headers = {
+        "Content-Length": str(size),
+        "Content-Disposition": f'attachment; filename="{stem}{FORMATS[form].suffix}"',
+    }
+    answer = StreamingResponse(chunks, media_type=FORMATS[form].media_type, headers=headers)
+    return answer, count, is_cut
+
+
+@router.post(
+    "",
+    summary="Run a query",
+    response_model=SqlRows,
+    responses={
+        200: {
+            "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
+            "``X-Starcat-Cut`` whether there are more.",
+            "content": {
+                FORMATS[name].media_type.partition(";")[0]: {}
+                for name in FILE_FORMATS
+                if name != "json"
+            },
+        }
+    },
+)
+async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
+    """Run an SQL query on databases and catalogs; nothing is ever written."""
+    asked = _checked(service, question)
+    if question.format == "rows":
+        return await service.query_pool.run(_rows, service, asked)
+    return await service.query_pool.run(_file, service, asked, question.format)
+
+
+@router.get("/queries", summary="Queries by name")
+def queries(reader: Reader) -> list[GalleryQuery]:
+    """Return the queries that people ask often, with their values."""
+    return [
+        GalleryQuery.model_validate(query, from_attributes=True) for query in gallery().values()
+    ]
+
+
+@router.get("/macros", summary="Functions of queries")
+def all_macros(reader: Reader) -> list[MacroFacts]:
+    """Return the functions that queries have beside those of DuckDB."""
+    listed = sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
+    return [MacroFacts.model_validate(one, from_attributes=True) for one in listed]
+
+
+@router.get("/views", summary="Tables of targets")
+async def views(
+    service: TheService,
+    reader: Reader,
+    target: Annotated[
+        list[TargetName],
+        Query(min_length=1, max_length=8, description="As in a question. Repeatable."),
+    ],
+) -> list[ViewFacts]:
+    """Return the tables that a query about some targets sees."""
+    return await service.query_pool.run(_views, service, target)
+
+
+def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
+    """Return what is asked, within the limits that the operator set."""
+    if (question.query is None) == (question.named is None):
+        raise Problem(422, "give either a query or the name of one", key="query")
+    settings = service.settings
+    default, most = settings.max_rows, settings.max_rows
+    if question.format == "rows":
+        default, most = min(1000, most), min(MAX_SHOWN, most)
+    count = len(question.targets)
+    if question.named is not None:
+        named = named_query(question.named)
+        if named.targets != count:
+            raise QueryError(f"{named.name} is about {named.targets} targets; {count} given")
+        text = named.text
+        values = named.with_values({key: str(one) for key, one in question.values.items()})
+    else:
+        text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
+    time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
+    return SqlQuery(question.targets, text, values, min(question.max_rows or default, most), time_s)
+
+
+def _rows(service: Service, query: SqlQuery) -> Response:
+    # What JSON has was made sure of: a model would check every value once more.
+    return JSONResponse(result_table(service, query).as_json())
+
+
+def _file(service: Service, query: SqlQuery, form: str) -> Response:
+    answer, rows, is_cut = result_file(service, query, form, "answer")
+    answer.headers.update({"X-Starcat-Rows": str(rows), "X-Starcat-Cut": str(is_cut).lower()})
+    return answer
+
+
+def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
+    with service.query_pool.session([service.library.target(name) for name in targets]) as session:
+        return [
+            ViewFacts(
+                target=target.name,
+                view=view.name,
+                description=view.schema.description if view.schema else "",
+                columns=_columns(view),
+            )
+            for target in session.targets
+            for view in target.views
+        ]
+
+
+def _columns(view: View) -> list[ViewColumn]:
+    if view.schema is None:
+        return [ViewColumn(name=name, dtype="", unit="", description="") for name in view.columns]
+    return [
+        ViewColumn(name=one.name, dtype=one.dtype, unit=one.unit or "", description=one.description)
+        for one in view.schema.columns
+    ]

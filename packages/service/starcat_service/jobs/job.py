@@ -1,0 +1,328 @@
+"""A job as it is remembered: what was asked for, how far it is, what becomes of it.
+
+The table is the queue: a job is begun by whoever turns its row from queued to running. From then
+on the number of the attempt says whose job it is: what an earlier attempt reports is not taken.
+Each step is one transaction, and only one can take it.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from starcat.errors import TargetMissing
+from starcat_service.paths import JOB_ID, checked
+from starcat_service.records import Records
+
+Kind = Literal["build", "ingest", "evaluate"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
+
+ENDED: tuple[State, ...] = ("done", "failed", "cancelled")
+
+QUERY = "query"
+"""Kind of the rows that are asynchronous queries of TAP, which only `starcat_service.vo` shows."""
+
+ASKER = "asker"
+"""Key of a request: who is counted as one user, where the owner is somebody without a name."""
+
+MAX_INTERRUPTED = 8
+"""So often a job may lose its server before it is taken for the cause."""
+
+MAX_LOG_LINES = 2000
+"""Lines of the log of a job that are kept, all attempts together."""
+
+NO_STAGE = "stage = NULL, done = NULL, total = NULL"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job; times are seconds since 1970."""
+
+    id: str  # 32 hexadecimal digits
+    kind: Kind
+    key: str  # SHA-256 of all that the result depends on
+    owner: str
+    title: str  # for people, such as "gaia-12deg 1.0.0"
+    state: State
+    request: dict[str, Any]
+    created_s: float
+    started_s: float | None
+    ended_s: float | None
+    attempt: int  # how often it was begun
+    stage: str | None
+    done: int | None  # of the stage
+    total: int | None
+    error: dict[str, Any] | None  # problem details
+    result: dict[str, Any] | None  # such as {"database": "0123456789abcdef"}
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing will change any more, unless it is tried again."""
+        return self.state in ENDED
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a job: ``data`` is a state, a stage, or a line of the log."""
+
+    number: int  # 1, 2, 3 ... of its job
+    at_s: float
+    kind: str  # "state", "stage" or "log"
+    data: dict[str, Any]
+
+
+class JobStore:
+    """The builds, ingests and evaluations of a service."""
+
+    def __init__(self, records: Records) -> None:
+        self._records = records
+
+    def get(self, job_id: str) -> Job:
+        """Return a job."""
+        return job_in(self._records.connection(), job_id)
+
+    def all(
+        self,
+        *,
+        state: State | None = None,
+        kind: Kind | None = None,
+        owner: str | None = None,
+        most: int = 100,
+        skip: int = 0,
+    ) -> list[Job]:
+        """Return the jobs, the newest first."""
+        where, values = _where(state=state, kind=kind, owner=owner)
+        newest = f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?"
+        return [job_of(row) for row in self._records.rows(newest, *values, most, skip)]
+
+    def count(
+        self, *, state: State | None = None, kind: Kind | None = None, owner: str | None = None
+    ) -> int:
+        """Return how many jobs there are."""
+        where, values = _where(state=state, kind=kind, owner=owner)
+        [[found]] = self._records.rows(f"SELECT count(*) FROM jobs {where}", *values)
+        return int(found)
+
+    def events(self, job_id: str, after: int = 0) -> list[Event]:
+        """Return what happened to a job."""
+        later = (
+            "SELECT number, at_s, kind, data FROM job_events WHERE job = ? AND number > ? "
+            "ORDER BY number"
+        )
+        rows = self._records.rows(later, job_id, after)
+        return [Event(number, at_s, kind, json.loads(data)) for number, at_s, kind, data in rows]
+
+
+def _where(**wanted: str | None) -> tuple[str, list[str]]:
+    given = {name: value for name, value in wanted.items() if value is not None}
+    conditions = " AND ".join(["kind != ?", *(f"{name} = ?" for name in given)])
+    return f"WHERE {conditions}", [QUERY, *given.values()]
+
+
+def job_in(connection: sqlite3.Connection, job_id: str) -> Job:
+    """Return a job within a transaction."""
+    checked(job_id, JOB_ID, "job")
+    row = connection.execute(
+        "SELECT * FROM jobs WHERE id = ? AND kind != ?", (job_id, QUERY)
+    ).fetchone()
+    if row is None:
+        raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
+    return job_of(row)
+
+
+def job_of(row: sqlite3.Row) -> Job:
+    """Return the job of a row of the records."""
+    content = {name: row[name] for name in Job.__dataclass_fields__}
+    for name in ("request", "error", "result"):
+        content[name] = None if content[name] is None else json.loads(content[name])
+    return Job(**content)
+
+
+def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
+    """Return whether a job of some kinds waits."""
+    waiting = f"SELECT 1 FROM jobs WHERE state = 'queued' AND kind IN ({_marks(kinds)}) LIMIT 1"
+    return bool(records.rows(waiting, *kinds))
+
+
+def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
+    """Begin a job of some kinds; None where none waits.
+
+    It is the oldest of the user of whom fewest run, and of those of the one who waits for longest.
+    """
+    marks = _marks(kinds)
+    of = f"owner || ' ' || coalesce(json_extract(request, '$.{ASKER}'), '')"
+    first = (
+        f"SELECT id FROM jobs LEFT JOIN (SELECT {of} AS who, sum(state = 'running') AS running, "
+        f"max(started_s) AS served_s FROM jobs WHERE kind IN ({marks}) GROUP BY who) "
+        f"ON who = {of} WHERE state = 'queued' AND kind IN ({marks}) "
+        "ORDER BY running, served_s NULLS FIRST, queued_s, id LIMIT 1"
+    )
+    with records.writing() as connection:
+        row = connection.execute(
+            "UPDATE jobs SET state = 'running', started_s = ?, attempt = attempt + 1, "
+            f"cancel_requested = 0, {NO_STAGE}, error = NULL WHERE id = ({first}) RETURNING *",
+            (time.time(), *kinds, *kinds),
+        ).fetchone()
+        if row is None:
+            return None
+        job = job_of(row)
+        add_event(connection, job.id, "state", {"state": "running", "attempt": job.attempt})
+    return job
+
+
+def _marks(values: Sequence[str]) -> str:
+    return ", ".join("?" * len(values))
+
+
+def running_jobs(records: Records) -> list[Job]:
+    """Return the jobs that run, of all kinds."""
+    rows = records.rows("SELECT * FROM jobs WHERE state = 'running' ORDER BY created_s")
+    return [job_of(row) for row in rows]
+
+
+def interrupt(records: Records, job: Job) -> None:
+    """Have a job wait again whose attempt is lost, unless that was too often."""
+    with records.writing() as connection:
+        row = connection.execute(
+            "UPDATE jobs SET interrupted = interrupted + 1 WHERE id = ? AND attempt = ? "
+            "AND state = 'running' RETURNING interrupted, cancel_requested",
+            (job.id, job.attempt),
+        ).fetchone()
+        if row is None:
+            return
+        if row["cancel_requested"]:
+            end_job(connection, job.id, "cancelled")
+        elif row["interrupted"] >= MAX_INTERRUPTED:
+            detail = (
+                f"the service ended {row['interrupted']} times while this job ran, which may be "
+                "because of it; ask for less, or try it again"
+            )
+            end_job(connection, job.id, "failed", failed("Interrupted", 500, detail).content)
+        else:
+            _requeue(connection, job.id)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt ended; ``queued`` where the service stops, and the job is to run again."""
+
+    state: Literal["done", "failed", "cancelled", "queued"]
+    content: Mapping[str, Any] = field(default_factory=dict)  # the result, or problem details
+
+
+def failed(title: str, status: int, detail: str) -> Outcome:
+    """Return the end of an attempt with problem details."""
+    content = {"type": "about:blank", "title": title, "status": status, "detail": detail}
+    return Outcome("failed", content)
+
+
+class Attempt:
+    """An attempt at a job: what it reports is taken while the job is its own."""
+
+    def __init__(self, records: Records, job: Job) -> None:
+        self._records = records
+        self.job = job
+
+    def cancel_requested(self) -> bool:
+        """Return whether it has to end: the job was cancelled, or is another attempt's."""
+        wanted = self._records.rows(
+            "SELECT 1 FROM jobs WHERE id = ? AND attempt = ? AND state = 'running' "
+            "AND NOT cancel_requested",
+            self.job.id,
+            self.job.attempt,
+        )
+        return not wanted
+
+    def report(self, message: Mapping[str, Any]) -> None:
+        """Take a message of the process: ``stage``, ``done``, ``total``; or ``log``, ``level``."""
+        if "stage" in message:
+            self.report_stage(message["stage"], message["done"], message["total"])
+        elif "log" in message:
+            self.log(message["level"], message["log"])
+
+    def report_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Record how much of a stage is done; of the events of a stage only the last is kept."""
+        with self._records.writing() as connection:
+            changed = self._update(connection, "stage = ?, done = ?, total = ?", stage, done, total)
+            if not changed:
+                return
+            before = connection.execute(
+                "SELECT max(number) FROM job_events WHERE job = ? AND kind = 'stage' "
+                "AND json_extract(data, '$.stage') = ?",
+                (self.job.id, stage),
+            ).fetchone()[0]
+            add_event(
+                connection, self.job.id, "stage", {"stage": stage, "done": done, "total": total}
+            )
+            connection.execute(
+                "DELETE FROM job_events WHERE job = ? AND number = ?", (self.job.id, before)
+            )
+
+    def log(self, level: str, text: str) -> None:
+        """Add a line to the log; the level is info, warning or error."""
+        with self._records.writing() as connection:
+            if not self._is_mine(connection):
+                return
+            [lines] = connection.execute(
+                "SELECT count(*) FROM job_events WHERE job = ? AND kind = 'log'", (self.job.id,)
+            ).fetchone()
+            if lines < MAX_LOG_LINES:
+                add_event(connection, self.job.id, "log", {"level": level, "text": text})
+            elif lines == MAX_LOG_LINES:
+                text = f"the log ends here, after {lines:,} lines"
+                add_event(connection, self.job.id, "log", {"level": "warning", "text": text})
+
+    def end(self, outcome: Outcome) -> None:
+        """Record how it ended."""
+        with self._records.writing() as connection:
+            if not self._is_mine(connection):
+                return
+            if outcome.state == "queued":
+                _requeue(connection, self.job.id)
+            else:
+                end_job(connection, self.job.id, outcome.state, outcome.content)
+
+    def _is_mine(self, connection: sqlite3.Connection) -> bool:
+        return self._update(connection, "attempt = ?", self.job.attempt)
+
+    def _update(self, connection: sqlite3.Connection, change: str, *values: object) -> bool:
+        done = connection.execute(
+            f"UPDATE jobs SET {change} WHERE id = ? AND attempt = ? AND state = 'running'",
+            (*values, self.job.id, self.job.attempt),
+        )
+        return bool(done.rowcount)
+
+
+def _requeue(connection: sqlite3.Connection, job_id: str) -> None:
+    connection.execute(f"UPDATE jobs SET state = 'queued', {NO_STAGE} WHERE id = ?", (job_id,))
+    add_event(connection, job_id, "state", {"state": "queued"})
+
+
+def end_job(
+    connection: sqlite3.Connection, job_id: str, state: State, content: Mapping[str, Any] = {}
+) -> None:
+    """Record how a job ended, within a transaction."""
+    column = {"done": "result", "failed": "error"}.get(state)
+    told = {} if column is None else {column: dict(content)}
+    result, error = (json.dumps(told[one]) if one in told else None for one in ("result", "error"))
+    connection.execute(
+        "UPDATE jobs SET state = ?, ended_s = ?, cancel_requested = 0, result = ?, error = ? "
+        "WHERE id = ?",
+        (state, time.time(), result, error, job_id),
+    )
+    add_event(connection, job_id, "state", {"state": state, **told})
+
+
+def add_event(
+    connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
+) -> None:
+    """Record what happened to a job, within a transaction."""
+    connection.execute(
+        "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
+        "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",
+        (job_id, time.time(), kind, json.dumps(data), job_id),
+    )

@@ -1,0 +1,230 @@
+"""Slots of the server: threads that take jobs from the table, and see each to its end.
+
+A job that an earlier server began is begun again; a query of TAP that one left halfway has failed.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from starcat.storage.locks import locked
+from starcat_service.jobs.cluster import ClusterJobs
+from starcat_service.jobs.job import (
+    QUERY,
+    Attempt,
+    Outcome,
+    begin_next,
+    failed,
+    interrupt,
+    is_waiting,
+    running_jobs,
+)
+from starcat_service.jobs.runner import CANCELLED, STOPPED, Processes, limit_exceeded, time_exceeded
+from starcat_service.jobs.submission import folder_bytes, owner_excess
+from starcat_service.jobs.work import order_of
+from starcat_service.paths import JOB_ID, ServicePaths
+from starcat_service.security.request_limits import disk_shortage
+
+if TYPE_CHECKING:
+    from starcat_service.service import Service
+
+MADE_BY_PROCESSES = ("build", "ingest", "evaluate")
+
+POLL_S = 1.0
+"""How often an idle slot looks into the table, if nobody wakes it."""
+
+PAUSE_S = 5.0
+"""Pause of a slot after something failed that was no job's fault, such as a full disk."""
+
+DISK_TICK_S = 2.0
+"""How often the disk that a job takes is counted."""
+
+GRACE_S = 10.0
+"""Seconds that slots have beyond the time of their jobs to end."""
+
+WAIT_S = 10.0
+"""Seconds that a process of a job has to die, after its server has."""
+
+ENDED_WITH_SERVER = (
+    "the server ended while the query ran; run it again, the job keeps its parameters"
+)
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """Slots of some kinds of jobs."""
+
+    name: str
+    kinds: tuple[str, ...]
+    count: int
+    run: Callable[[Attempt], Outcome]
+    is_ready: Callable[[], bool] = lambda: True
+
+
+class JobSlots:
+    """The slots of a service; jobs of other machines have one each too, which waits for them."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.processes = Processes()
+        self.stop_at_s: float | None = None  # when what still runs is ended, `time.monotonic`
+        self.cluster: ClusterJobs | None = None
+        if service.settings.scheduler is not None:
+            self.cluster = ClusterJobs(service, self.run_process, self.reason_to_end)
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether all slots take jobs."""
+        return all(thread.is_alive() for thread in self._threads)
+
+    def start(self) -> None:
+        """Take up the jobs that an earlier server has left, and begin those that wait."""
+        recover(self.service)
+        for lane in self._lanes():
+            for number in range(lane.count):
+                thread = threading.Thread(
+                    target=self._serve, args=(lane,), name=f"{lane.name}-{number}", daemon=True
+                )
+                thread.start()
+                self._threads.append(thread)
+
+    def begin_stop(self) -> None:
+        """Take no further job; those that run have their time, and queries end at once."""
+        if self.stop_at_s is None:
+            self.stop_at_s = time.monotonic() + self.service.settings.shutdown_s
+        self.service.wake_slots()
+
+    def stop(self) -> None:
+        """Stop, and wait until all slots have ended."""
+        self.begin_stop()
+        until_s = time.monotonic() + self.service.settings.shutdown_s + GRACE_S
+        for thread in self._threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+        self.processes.end_all()
+        if self.cluster is not None:
+            self.cluster.close()
+
+    def run_next(self, kinds: tuple[str, ...] = MADE_BY_PROCESSES) -> bool:
+        """Run the job that has waited for longest, if any does."""
+        [lane] = (lane for lane in self._lanes() if lane.kinds == kinds)
+        return self._run_next(lane)
+
+    def _lanes(self) -> tuple[_Lane, _Lane]:
+        service, cluster = self.service, self.cluster
+        made = _Lane("job", MADE_BY_PROCESSES, service.settings.workers, self.run_process)
+        if cluster is not None:
+            made = _Lane("job", made.kinds, made.count, cluster.run, cluster.is_ready)
+        # One of the queries that run at the same time is left to those who wait for the answer.
+        queries = max(1, service.settings.queries - 1)
+        return made, _Lane("query", (QUERY,), queries, self._answer_query)
+
+    def _serve(self, lane: _Lane) -> None:
+        records, queued = self.service.records, self.service.job_queued
+        while self.stop_at_s is None:
+            try:
+                with queued:
+                    if not is_waiting(records, lane.kinds):
+                        queued.wait(POLL_S)
+                        continue
+                if lane.is_ready():
+                    self._run_next(lane)
+                    continue
+            except Exception:
+                _logger.exception("a slot of jobs cannot go on yet")
+            with queued:
+                queued.wait(PAUSE_S)
+        records.close()
+
+    def _run_next(self, lane: _Lane) -> bool:
+        if self.stop_at_s is not None:
+            return False
+        job = begin_next(self.service.records, lane.kinds)
+        if job is None:
+            return False
+        attempt = Attempt(self.service.records, job)
+        try:
+            attempt.end(lane.run(attempt))
+        except BaseException:
+            interrupt(self.service.records, job)
+            raise
+        return True
+
+    def _answer_query(self, attempt: Attempt) -> Outcome:
+        return self.service.query_jobs.answer(attempt, lambda: self.stop_at_s is not None)
+
+    def run_process(self, attempt: Attempt) -> Outcome:
+        """Do a job in a process of this machine."""
+        service, job = self.service, attempt.job
+        short = disk_shortage(service.settings)
+        if short is not None:
+            return failed("Insufficient storage", 507, short)
+        order = order_of(job, service.settings, str(service.paths.root))
+        try:
+            return self.processes.run(order, attempt.report, self._watch(attempt))
+        finally:
+            shutil.rmtree(service.paths.job_work(job.id), ignore_errors=True)
+
+    def reason_to_end(self, attempt: Attempt) -> Outcome | None:
+        """Return how an attempt has to end because of what others want."""
+        if self.stop_at_s is not None and time.monotonic() >= self.stop_at_s:
+            return STOPPED
+        return CANCELLED if attempt.cancel_requested() else None
+
+    def _watch(self, attempt: Attempt) -> Callable[[], Outcome | None]:
+        """Return a function that tells how an attempt that runs here has to end, if it has to."""
+        service, job = self.service, attempt.job
+        began_s = disk_at_s = time.monotonic()
+
+        def watch() -> Outcome | None:
+            nonlocal disk_at_s
+            outcome = self.reason_to_end(attempt)
+            outcome = outcome or time_exceeded(began_s, service.settings.job_time_s)
+            if outcome is not None or time.monotonic() - disk_at_s < DISK_TICK_S:
+                return outcome
+            disk_at_s = time.monotonic()
+            made = folder_bytes(service.paths.job(job.id))
+            full = disk_shortage(service.settings) or owner_excess(service, job.owner, made)
+            return None if full is None else limit_exceeded(full)
+
+        return watch
+
+
+def recover(service: Service) -> None:
+    """Take up the jobs of a service where nobody runs any, and remove what is half made."""
+    for job in running_jobs(service.records):
+        if str(job.kind) == QUERY:
+            Attempt(service.records, job).end(Outcome("failed", {"detail": ENDED_WITH_SERVER}))
+            continue
+        _wait_for_end(service.paths, job.id)
+        _logger.warning("job %s was interrupted in attempt %d", job.id, job.attempt)
+        interrupt(service.records, job)
+    for folder in service.paths.jobs.iterdir():
+        if JOB_ID.fullmatch(folder.name):
+            shutil.rmtree(service.paths.job_work(folder.name), ignore_errors=True)
+    for folder in service.paths.databases.iterdir():
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()
+    service.query_jobs.sweep()
+
+
+def _wait_for_end(paths: ServicePaths, job_id: str) -> None:
+    """Wait until the process of a job is gone; the next attempt waits too, if it is not."""
+    lock = paths.job_lock(job_id)
+    if not lock.exists():
+        return
+    until_s = time.monotonic() + WAIT_S
+    while time.monotonic() < until_s:
+        with suppress(BlockingIOError), locked(lock, wait=False):
+            return
+        time.sleep(0.05)
+    _logger.error("job %s: its process does not end", job_id)

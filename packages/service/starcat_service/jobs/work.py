@@ -1,0 +1,362 @@
+"""The process of one job: it reads an order, says how far it is, and leaves a result or an error.
+
+The order is the first line of its input. What it has to say are lines of JSON on its output: a
+stage, a line of the log, and at last the result or the error. It ends when its input does, which
+is when the worker that started it is gone.
+
+What the kinds of jobs do is a function each, from a request to a result. What a job makes is made
+in a folder of its own, and moved to its place in one step when it is whole; what is there already
+is not made again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import logging
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
+
+from starcat.errors import StarcatError, TargetMissing
+from starcat.progress import Progress
+from starcat.query.confinement import limit_memory
+from starcat.storage.atomic import sync
+from starcat.storage.locks import locked
+from starcat_service.jobs.job import Job, Kind, Outcome, failed
+from starcat_service.library import Library
+from starcat_service.paths import ServicePaths
+from starcat_service.sandbox.child import own_output
+from starcat_service.settings import Settings
+
+NICENESS = 10
+"""Requests come before jobs."""
+
+STAGES_A_SECOND = 4.0
+
+MAX_LINE = 2000
+"""Characters of a line of the log that are kept."""
+
+MOST_CURVE_FRAMES = 200
+"""Frames of a point of the curves that an evaluation draws."""
+
+NO_THREAD = "can't start new thread"
+"""What Python says where there is no memory for the stack of a thread."""
+
+_SET_PARENT_DEATH_SIGNAL = 1
+
+Log = Callable[[str, str], None]
+"""Called with a level and a line of the log."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the process of a job is told to do."""
+
+    root: str  # of the service
+    job_id: str
+    kind: Kind
+    key: str
+    request: Mapping[str, Any]
+    memory_bytes: int
+    scheduler: str | None  # address of a Dask cluster, for stores
+    threads: int
+
+    @property
+    def paths(self) -> ServicePaths:
+        """Files and folders of the service."""
+        return ServicePaths(Path(self.root))
+
+    @property
+    def work(self) -> Path:
+        """The folder that it makes things in."""
+        return self.paths.job_work(self.job_id)
+
+
+def prepare(kind: Kind) -> None:
+    """Load what a kind of job needs: programs do not count as memory that a job takes."""
+    for name in _NEEDS[kind]:
+        import_module(name)
+
+
+def _do_job(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    shutil.rmtree(order.work, ignore_errors=True)
+    order.work.mkdir(parents=True)
+    return _DOES[order.kind](order, progress, log)
+
+
+def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    database_id = order.key[:16]
+    library = Library(order.paths)
+    result = {"database": database_id}
+    try:
+        library.database(database_id)
+    except TargetMissing:
+        pass
+    else:
+        log("info", f"database {database_id} is there already")
+        return result
+    from starcat.pipeline.build import build
+    from starcat.specs.reading import spec_from_dict
+
+    spec = spec_from_dict(dict(order.request["spec"]), "spec")
+    made = order.work / database_id
+    built = build(
+        spec,
+        {},
+        made,
+        workers=order.threads,
+        progress=progress,
+        announce=lambda cost: log("info", cost.in_words),
+        max_memory_bytes=order.memory_bytes,
+    )
+    for problem in built.problems:
+        log("warning", problem)
+    for warning in built.warnings:
+        log("warning", warning)
+    clean = built.rates[0]
+    log(
+        "info",
+        f"{clean.identified} of {clean.frames} clean frames were identified, {clean.wrong} wrongly",
+    )
+    place_database(made, order.paths.database(database_id))
+    return result
+
+
+def place_database(made: Path, final: Path) -> None:
+    """Give the folder of a database its name, in one step."""
+    if final.is_dir():
+        aside = made.with_name("aside")
+        final.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
+    sync(made)
+    made.rename(final)
+    sync(final.parent)
+
+
+def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    from starcat.catalog.source_files import locate
+
+    asked = order.request
+    source, to = str(asked["source"]), asked["to"]
+    how = {name: asked[name] for name in ("band", "epoch_jyear", "read_limit_mag")}
+    paths = locate(source, {})
+    name = f"{source}-{order.key[:16]}" + (".parquet" if to == "parquet" else "")
+    result: dict[str, Any] = {"catalog": name, "source": source}
+    final = order.paths.catalogs / name
+    made = order.work / name
+    if to == "hats":
+        from starcat.store.ingest import ingest_to_store
+        from starcat.store.plan import StoreOptions
+
+        options = StoreOptions(
+            memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
+        )
+        stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
+        problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
+    else:
+        from starcat.catalog.ingest import write_star_tables
+        from starcat.catalog.verdict import rejected_path
+        from starcat.store.reading import read_catalog
+
+        read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
+        write_star_tables(read, made)
+        problems, notes, rows = read.problems, read.notes, len(read.stars)
+        if rejected_path(made).exists():
+            rejected_path(made).replace(rejected_path(final))
+    for line in (*problems, *notes):
+        log("warning", line)
+    if made.is_dir() and final.is_dir():  # the same content: it has the same key
+        shutil.rmtree(made)
+    else:
+        made.replace(final)
+    sync(final.parent)
+    return {**result, "rows": rows}
+
+
+def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    from starcat.matcher.matcher import Matcher
+    from starcat.simulation.selftest import self_test
+    from starcat_lab.curves import measure_curves
+
+    asked = order.request
+    database = Library(order.paths).database(str(asked["database"]))
+    noise_px = float(asked["noise_px"])
+    matcher = Matcher.open(database.folder, None, tolerance_px=max(0.5, 4.0 * noise_px))
+    log("info", f"{asked['frames']} frames of each kind, of {database.title}")
+    rates = self_test(
+        matcher,
+        int(asked["frames"]),
+        noise_px,
+        int(asked["seed"]),
+        progress,
+        noise_mag=float(asked["noise_mag"]),
+    )
+    clean = rates[0]
+    log(
+        "info",
+        f"{clean.identified} of {clean.frames} clean pointings were identified, "
+        f"{clean.wrong} wrongly",
+    )
+    few = max(1, min(MOST_CURVE_FRAMES, int(asked["frames"])))
+    log("info", f"{few} frames for each point of the curves")
+    curves = measure_curves(database.folder, order.work, few, int(asked["seed"]), progress)
+    return {
+        "database": database.id, "rates": [each.as_dict() for each in rates], "curves": curves
+    }  # fmt: skip
+
+
+_DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
+    "build": _build,
+    "ingest": _ingest,
+    "evaluate": _evaluate,
+}
+
+
+_NEEDS: Mapping[Kind, tuple[str, ...]] = {
+    "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
+    "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
+    "evaluate": ("starcat.simulation.selftest", "starcat_lab.curves"),
+}
+
+
+def order_of(job: Job, settings: Settings, root: str) -> Order:
+    """Return the order of a job in a service, or in a folder of another machine."""
+    return Order(
+        root=root,
+        job_id=job.id,
+        kind=job.kind,
+        key=job.key,
+        request=job.request,
+        memory_bytes=int(settings.job_memory_gib * 2**30),
+        scheduler=settings.scheduler,
+        threads=threads_of(settings.workers),
+    )
+
+
+def threads_of(workers: int) -> int:
+    """Return how many threads a job may use where several run at the same time."""
+    return max(1, (os.cpu_count() or 1) // max(1, workers))
+
+
+class Messages:
+    """What happens, written as lines of JSON."""
+
+    def __init__(self, output: IO[bytes]) -> None:
+        self._output = output
+        self._lock = threading.Lock()
+        self._stage, self._at_s = "", 0.0
+
+    def stage(self, stage: str, done: int, total: int | None) -> None:
+        """Write how much of a stage is done, unless that was written a moment ago."""
+        now = time.monotonic()
+        is_last = total is not None and done >= total
+        with self._lock:
+            is_new = stage != self._stage
+            if not (is_new or is_last or now - self._at_s >= 1.0 / STAGES_A_SECOND):
+                return
+            if is_last and not is_new and now - self._at_s < 0.05:
+                return
+            self._stage, self._at_s = stage, now
+        self.write(
+            {"stage": stage, "done": int(done), "total": None if total is None else int(total)}
+        )
+
+    def log(self, level: str, text: str) -> None:
+        """Write a line of the log."""
+        self.write({"log": text[:MAX_LINE], "level": level})
+
+    def write(self, content: dict[str, Any]) -> None:
+        """Write any message."""
+        with self._lock:
+            self._output.write(json.dumps(content).encode() + b"\n")
+            self._output.flush()
+
+
+class _Lines(logging.Handler):
+    """What starcat logs, as lines of the job's log."""
+
+    def __init__(self, messages: Messages) -> None:
+        super().__init__(logging.INFO)
+        self._messages = messages
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = "info" if record.levelno < logging.WARNING else "warning"
+        self._messages.log(level, record.getMessage())
+
+
+def main() -> None:
+    """Read the order, and do it."""
+    _end_with_parent()
+    messages = Messages(own_output())
+    order = Order(**json.loads(sys.stdin.buffer.readline()))
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    with suppress(OSError, AttributeError):
+        os.nice(NICENESS)
+        # What answers somebody who waits gets a processor at once, where Linux can do that.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    logger = logging.getLogger("starcat")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(_Lines(messages))
+    with locked(order.paths.job_lock(order.job_id)):
+        prepare(order.kind)
+        limit_memory(order.memory_bytes)
+        try:
+            messages.write({"result": _do_job(order, messages.stage, messages.log)})
+        except Exception as error:
+            messages.write({"error": _problem_of(error, order)})
+    sys.stderr.flush()
+    os._exit(0)  # whatever threads of libraries do
+
+
+def _end_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+
+
+def _end_with_input() -> None:
+    """End this process, and those that it has started, when its input ends."""
+    while sys.stdin.buffer.read(1):
+        pass
+    if hasattr(os, "killpg") and os.getpgid(0) == os.getpid():
+        os.killpg(os.getpid(), signal.SIGKILL)
+    os._exit(1)
+
+
+def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
+    """Return problem details of an exception; a traceback is the operator's."""
+    from starcat.failures import failure_of
+    from starcat_service.problems import ProblemDetails, problem_of, without_folders
+
+    if isinstance(error, MemoryError) or NO_THREAD in str(error):
+        return dict(out_of_memory(order.memory_bytes).content)
+    if isinstance(error, OSError) and not isinstance(error, StarcatError):
+        failure = failure_of(error, "the job")
+        detail = without_folders(failure.message)
+        problem = ProblemDetails(
+            title="The system refused", status=500, detail=detail, kind=failure.kind
+        )
+    else:
+        problem = problem_of(error)
+    if problem.status == 500:
+        traceback.print_exception(error)
+    return problem.model_dump(exclude_none=True)
+
+
+def out_of_memory(memory_bytes: int) -> Outcome:
+    """Return what to say of a job that wanted more memory than it may take."""
+    detail = (
+        f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
+        "(job_memory_gib); ask for less, or ask the operator for more"
+    )
+    return failed("Out of memory", 422, detail)

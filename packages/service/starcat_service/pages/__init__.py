@@ -1,0 +1,34 @@
+"""What a browser shows: pages made on the server, and the small scripts that they use."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from starcat_service.pages import (
+    console,
+    databases,
+    documentation,
+    downloads,
+    home,
+    identify,
+    jobs,
+    new,
+    releases,
+    rendering,
+    sky,
+)
+
+ROUTERS: tuple[APIRouter, ...] = (
+    rendering.static_router,
+    home.router,
+    new.router,
+    jobs.router,
+    databases.router,
+    console.router,
+    identify.router,
+    releases.router,
+    documentation.router,
+    sky.router,
+    downloads.router,
+)
+"""Routers of the page, in the order in which they are asked."""

@@ -1,0 +1,167 @@
+"""What becomes of an identified frame on a page: names, files to save, a link that repeats it."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlencode
+
+from starcat.images.picture import short_name
+from starcat.images.second_look import WIDE_FOV_ERROR
+from starcat_service.pages.sky import names_of
+
+MOST_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
+COLUMNS = (
+    *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
+    *("dx_px", "dy_px", "separation_arcsec", "dropped"),
+)  # of a CSV of answers
+
+REMEDIES = {"mirrored": "camera.flip=on", "scale": f"field_error={100 * WIDE_FOV_ERROR:g}"}
+"""What is to be changed in an address where a second look has found why there is no answer."""
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """A frame with what a page offers of it."""
+
+    content: dict[str, Any]  # as 'starcat identify --json' prints it, and the name of each star
+    link: str = ""  # the address that repeats the answer; empty where that were too long
+    wcs: str = ""  # FITS header as an address; empty unless identified
+    unusable: str = ""  # why the file has no answer
+    notes: tuple[str, ...] = ()
+    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag where known
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether it has an attitude."""
+        return bool(self.content["status"] == "identified")
+
+    @property
+    def remedy(self) -> str:
+        """The address that does what a refusal advises; empty where no field of the page does."""
+        change = REMEDIES.get(self.content.get("refusal", {}).get("reason", ""), "")
+        return f"{self.link}&{change}" if self.link and change else ""
+
+    @property
+    def stars(self) -> list[dict[str, Any]]:
+        """The spots that are stars."""
+        return [one for one in self.content["stars"] if one["star"] is not None]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """All frames of a request, with the files that are made of them."""
+
+    database: str
+    method: str
+    frames: Sequence[ShownFrame]
+    first: ShownFrame  # that which is shown in full
+    json: str = field(init=False)
+    csv: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        answered = [one.content for one in self.frames if not one.unusable]
+        object.__setattr__(self, "json", _address(json.dumps(answered, indent=1), "json"))
+        object.__setattr__(self, "csv", _address(csv_of(answered), "csv"))
+
+    @property
+    def identified(self) -> int:
+        """How many frames are identified."""
+        return sum(one.is_identified for one in self.frames)
+
+
+def shown_frames(
+    found: Mapping[str, Any], given: Mapping[str, str], epoch_jyear: float
+) -> list[ShownFrame]:
+    """Return the frames of a file that was identified."""
+    shown: list[ShownFrame] = []
+    for content, more in zip(found["frames"], found["more"], strict=True):
+        _name_stars(content, epoch_jyear)
+        measured = _measured(content["stars"], more["mag"])
+        shown.append(
+            ShownFrame(
+                content,
+                link_of(measured, given),
+                _address(more["wcs"], "fits") if more["wcs"] else "",
+                notes=tuple(found["notes"]) if not shown else (),
+                measured=measured,
+            )
+        )
+    return shown
+
+
+def unusable_frame(name: str, why: str) -> ShownFrame:
+    """Return what is shown of a file that has no answer."""
+    content = {"frame": name, "status": "unusable", "n_matched": 0, "stars": []}
+    return ShownFrame(content, unusable=why)
+
+
+def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
+    """Give each star the name that the picture has for it."""
+    stars = [one for one in content["stars"] if one["star"] is not None]
+    names = names_of([{**one, "label": one["star"]} for one in stars], epoch_jyear)
+    for one, name in zip(stars, names, strict=True):
+        one["name"] = name or short_name(one["star"])
+
+
+def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None) -> dict[str, Any]:
+    """Return the centroids of a frame, as programs send them, to a thousandth of a pixel."""
+    spots = [(round(one["x_px"], 3), round(one["y_px"], 3)) if one["x_px"] is not None
+             and one["y_px"] is not None else None for one in stars]  # fmt: skip
+    known = [k for k, spot in enumerate(spots) if spot is not None]
+    measured: dict[str, Any] = {"centroids_px": [list(spots[k] or ()) for k in known]}
+    if mag is not None and all(mag[k] is not None for k in known):
+        measured["mag"] = [round(mag[k] or 0.0, 3) for k in known]
+    return measured
+
+
+def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
+    """Return the address that repeats an answer: the centroids that were found are in it."""
+    values = {name: text for name, text in given.items() if text}
+    if not values.get("seed"):
+        lines = [f"{x:.8g} {y:.8g}" for x, y in measured["centroids_px"]]
+        if "mag" in measured:
+            lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
+        values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
+        values.pop("camera.flip", None)  # of what was measured y counts down
+    query = urlencode({name: text for name, text in values.items() if text})
+    return f"/identify?{query}" if len(query) <= MOST_LINK else ""
+
+
+def csv_of(contents: Sequence[Mapping[str, Any]]) -> str:
+    """Return the spots of frames as CSV, a line each."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for content in contents:
+        writer.writerows({"frame": content["frame"], **star} for star in content["stars"])
+    return file.getvalue()
+
+
+def marks_of(frame: ShownFrame) -> list[dict[str, Any]]:
+    """Return the stars of a frame for the view of the sky."""
+    return [
+        {
+            "id": one["star_id"],
+            "label": one["star"],
+            "name": one["name"],
+            "mag": one["mag"],
+            "ra_deg": one["ra_deg"],
+            "dec_deg": one["dec_deg"],
+            "reason": f"matched, {one['separation_arcsec']:.1f} arcsec off",
+        }
+        for one in frame.stars
+    ]
+
+
+_KINDS = {"json": "application/json", "csv": "text/csv", "fits": "application/fits"}
+
+
+def _address(text: str, kind: str) -> str:
+    """Return a file as an address that holds it: nothing of a frame is kept here."""
+    return f"data:{_KINDS[kind]};base64,{base64.b64encode(text.encode()).decode()}"

@@ -1,0 +1,210 @@
+"""The SQL console: a question about a database, the first rows of its answer, or all in a file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from fastapi import Depends, Query, Request
+from fastapi.responses import Response
+from starlette.concurrency import run_in_threadpool
+
+from starcat.errors import QueryError, StarcatError, TargetMissing
+from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
+from starcat.query.result import ResultTable
+from starcat_service.access import Reader
+from starcat_service.api.sql import SqlQuery, result_file, result_table
+from starcat_service.library import Database
+from starcat_service.pages.facts import database_rows, products_of
+from starcat_service.pages.notebook import Notebook, query_code
+from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.pages.sky import around, view_of
+from starcat_service.problems import Problem, ProblemDetails, problem_of
+from starcat_service.service import Service, TheService
+
+router = page_router()
+ROWS = (20, 100, 500, 2000)  # rows that can be shown
+VALUE = "value."  # what the names of fields with values of ``$name`` begin with
+MARKS = 2000  # rows that are shown in the sky
+MAX_TEXT = 8_000  # characters of a query, which is part of an address
+
+FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIMIT 20"
+"""What stands in the console before anything was asked."""
+
+_NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
+
+
+@dataclass(frozen=True)
+class ConsoleForm:
+    """The fields of the console."""
+
+    query: str = ""  # SQL; empty before anything was asked
+    named: str = ""  # query of the gallery that was chosen
+    other: str = ""  # id of a second database
+    rows: int = 100  # to show at most
+    values: dict[str, str] = field(default_factory=dict)  # texts of the ``$name`` in it
+
+
+def console_form(
+    request: Request,
+    query: Annotated[str, Query(max_length=MAX_TEXT)] = "",
+    named: Annotated[str, Query(max_length=100)] = "",
+    other: Annotated[str, Query(max_length=64)] = "",
+    rows: Annotated[int, Query(ge=1, le=max(ROWS))] = 100,
+) -> ConsoleForm:
+    """Return the fields of the console from an address."""
+    values = {
+        name.removeprefix(VALUE): text
+        for name, text in request.query_params.items()
+        if name.startswith(VALUE) and len(name) < 80
+    }
+    return ConsoleForm(query.replace("\r\n", "\n"), named, other, rows, values)
+
+
+TheForm = Annotated[ConsoleForm, Depends(console_form)]
+
+
+@router.get("/databases/{database_id}/sql")
+async def console(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    form: TheForm,
+    part: Annotated[Literal["", "answer"], Query()] = "",
+) -> Response:
+    """Show the console with the answer to its query; the script wants the answer alone."""
+    answer: ResultTable | None = None
+    problem: ProblemDetails | None = None
+    if form.query:
+        try:
+            answer = await service.query_pool.run(_rows, service, database_id, form)
+        except TargetMissing:
+            raise  # the page itself is not there
+        except (StarcatError, Problem) as error:
+            problem = problem_of(error)
+    content = {"asked": form, "answer": answer, "problem": problem, "notebook": None, "view": None}
+    return await run_in_threadpool(
+        _page, request, service, database_id, content, is_part=bool(part)
+    )
+
+
+@router.get("/databases/{database_id}/sql/file")
+async def answer_file(
+    service: TheService, _: Reader, database_id: str, asked: TheForm, form: PageFormat = "csv"
+) -> Response:
+    """Give all rows of an answer as a file."""
+    database = service.library.database(database_id)
+    query = _checked(service, database.id, asked, service.settings.max_rows)
+    found = await service.query_pool.run(result_file, service, query, form, database.title)
+    return found[0]
+
+
+def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
+    most = min(form.rows, service.settings.max_rows)
+    found = result_table(service, _checked(service, database_id, form, most))
+    return found.with_json_values()
+
+
+def _checked(service: Service, database_id: str, form: ConsoleForm, most: int) -> SqlQuery:
+    """Return the query of a form with its values as numbers where they look like numbers."""
+    if not form.query.strip():
+        raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
+    targets = [database_id, *([form.other] if form.other else [])]
+    chosen = _chosen(form.named)
+    values: Mapping[str, Any]
+    if chosen is not None and form.query.strip() == chosen.text.strip():
+        if chosen.targets != len(targets):
+            raise QueryError(f"{chosen.name} is about {chosen.targets} targets; choose the other")
+        known = {value.name for value in chosen.values}
+        values = chosen.with_values({n: t for n, t in form.values.items() if n in known})
+    else:
+        values = {name: guessed(text) for name, text in form.values.items()}
+    return SqlQuery(targets, form.query, values, most, service.settings.query_time_s)
+
+
+def _page(
+    request: Request, service: Service, database_id: str, content: dict[str, Any], *, is_part: bool
+) -> Response:
+    database = service.library.database(database_id)
+    problem: ProblemDetails | None = content["problem"]
+    status = 200 if problem is None else problem.status
+    if content["answer"] is not None:
+        content["notebook"] = _notebook(request, service, database, content["asked"])
+        content["view"] = _view(database, content["answer"])
+    if is_part:
+        return render(request, "console_answer.html", status=status, **content)
+    form: ConsoleForm = content["asked"]
+    chosen = _chosen(form.named)
+    text = form.query or (chosen.text if chosen else FIRST)
+    others = [one for one in service.library.databases() if one.id != database.id]
+    return render(
+        request,
+        "console.html",
+        status=status,
+        **content,
+        row=database_rows(service, database)[0],
+        formats={name: FORMATS[name].title for name in PAGE_FORMATS},
+        tab="sql",
+        text=text,
+        chosen=chosen,
+        values=_values_in(text, chosen, form.values),
+        others=[(one.id, one.title) for one in others],
+        queries=list(gallery().values()),
+        macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
+        products=products_of(database.manifest),
+        row_choices=ROWS,
+        max_text=MAX_TEXT,
+    )
+
+
+def _notebook(
+    request: Request, service: Service, database: Database, form: ConsoleForm
+) -> Notebook:
+    asked = _checked(service, database.id, form, min(form.rows, service.settings.max_rows))
+    code = query_code(
+        address_of(request, service), list(asked.targets), asked.text, asked.values, asked.max_rows
+    )
+    return Notebook(f"{database.title}-query", code)
+
+
+def _view(database: Database, answer: ResultTable) -> dict[str, Any] | None:
+    """Return the rows of an answer as places in the sky, if that is what they are."""
+    columns = {column.name: k for k, column in enumerate(answer.columns)}
+    if not {"ra_deg", "dec_deg"} <= set(columns):
+        return None
+    known = {name: columns.get(name) for name in ("designation", "mag", "star_id", "reason")}
+    marks = []
+    for row in answer.rows[:MARKS]:
+        ra, dec = row[columns["ra_deg"]], row[columns["dec_deg"]]
+        if not all(isinstance(one, int | float) for one in (ra, dec)):
+            continue
+        said = {name: None if k is None else row[k] for name, k in known.items()}
+        mag = said["mag"] if isinstance(said["mag"], int | float) else None
+        label = str(said["designation"] or f"{answer.columns[0].name} {row[0]}")
+        reason = None if said["reason"] is None else str(said["reason"]).replace("_", " ")
+        one = {"label": label, "ra_deg": ra, "dec_deg": dec, "mag": mag, "reason": reason}
+        marks.append(one if said["star_id"] is None else {**one, "id": str(said["star_id"])})
+    return view_of(database, marks=marks, at=around(marks)) if marks else None
+
+
+def _chosen(name: str) -> NamedQuery | None:
+    return named_query(name) if name else None
+
+
+def _values_in(
+    text: str, chosen: NamedQuery | None, given: Mapping[str, str]
+) -> list[tuple[str, str, str]]:
+    """Return name, text and meaning of the values that a query can be given."""
+    known = {value.name: value for value in chosen.values} if chosen else {}
+    return [
+        (
+            name,
+            given.get(name, str(known[name].default) if name in known else ""),
+            known[name].help if name in known else "",
+        )
+        for name in dict.fromkeys(_NAMES.findall(text))
+    ]

@@ -1,0 +1,266 @@
+"""The pages of databases: the list, one database, its coverage, its report, two versions."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from html import escape
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import Query, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
+
+from starcat.artifact.diff import Difference
+from starcat.errors import TargetMissing
+from starcat.geometry.sphere import directions_from_radec
+from starcat.matcher.methods.table import METHODS
+from starcat.report.coverage_map import (
+    Fields,
+    bins_of,
+    field_at,
+    nearest_raster,
+    raster_png,
+    sky_map,
+)
+from starcat_service.access import Builder, Reader
+from starcat_service.api.databases import difference_of, fields_of
+from starcat_service.jobs.submission import submit_evaluation
+from starcat_service.library import Database
+from starcat_service.pages.downloads import image_choices
+from starcat_service.pages.facts import (
+    MANIFEST_DIGEST,
+    database_rows,
+    products_of,
+    rejections_of,
+    report_of,
+    star_columns,
+)
+from starcat_service.pages.notebook import Notebook, database_code, difference_code, query_code
+from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.pages.sky import CACHED, view_of
+from starcat_service.service import Service, TheService
+from starcat_service.settings import Role
+
+router = page_router()
+
+REPORT_PAGE = "report/index.html"
+REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox"
+"""A report has its style and its plots inside, and nothing else; no script of it runs."""
+
+RASTER_WIDTH = 960
+FIELDS_SHOWN = 25  # fields of the tiling on a page
+DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
+
+CHANGED = """\
+SELECT 'added' AS reason, designation, mag, ra_deg, dec_deg
+FROM b.stars WHERE star_id NOT IN (SELECT star_id FROM a.stars)
+UNION ALL
+SELECT 'removed', designation, mag, ra_deg, dec_deg
+FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
+ORDER BY mag"""
+"""Stars of one database that are none of the other, with their places."""
+
+Order = Literal["fewest", "most", "number", "ra", "dec"]
+
+
+@router.get("/databases")
+def list_of_databases(request: Request, service: TheService, _: Reader) -> Response:
+    """Show all databases."""
+    return render(request, "databases.html", rows=database_rows(service))
+
+
+@router.get("/databases/{database_id}")
+def one_database(
+    request: Request, service: TheService, reader: Reader, database_id: str
+) -> Response:
+    """Show what is known of a database."""
+    database = service.library.database(database_id)
+    manifest = database.manifest
+    return render(
+        request,
+        "database.html",
+        **_head(service, database, "overview"),
+        report=report_of(database),
+        products=products_of(manifest),
+        rejections=rejections_of(manifest),
+        image=image_choices(database),
+        notebook=Notebook(database.title, database_code(address_of(request, service), database.id)),
+        methods=[
+            name
+            for name, method in METHODS.items()
+            if set(method.products) <= set(manifest["products"])
+        ],
+        files=sorted(manifest["files"].items()),
+        digest=manifest[MANIFEST_DIGEST],
+        may_evaluate=reader.role >= Role.BUILDER,
+    )
+
+
+@router.get("/databases/{database_id}/coverage")
+def coverage_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    order: Annotated[Order, Query()] = "fewest",
+    page: Annotated[int, Query(ge=1, le=1_000_000)] = 1,
+    at_most: Annotated[str, Query(pattern=r"^\d{0,9}$")] = "",
+) -> Response:
+    """Show the view of the sky and the fields of the tiling."""
+    database = service.library.database(database_id)
+    fields = fields_of(database)
+    chosen = [
+        number
+        for number in _ordered(fields, order)
+        if not at_most or fields.stars[number] <= int(at_most)
+    ]
+    pages = max(1, -(-len(chosen) // FIELDS_SHOWN))
+    page = min(page, pages)
+    numbers = chosen[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
+    return render(
+        request,
+        "coverage.html",
+        **_head(service, database, "coverage"),
+        report=report_of(database),
+        sky_map=sky_map(fields),
+        fields=[field_at(fields, number) for number in numbers],
+        star_columns=["designation", "mag", *star_columns(database.manifest)],
+        fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
+        view=view_of(database, fields=f"/databases/{database.id}/fields.json"),
+        order=order,
+        page=page,
+        pages=pages,
+        at_most=at_most,
+        count=len(fields),
+        chosen=len(chosen),
+        notebook=_fields_notebook(request, service, database, order, page, at_most),
+    )
+
+
+_SQL_ORDER = {
+    "fewest": "star_count, boresight",
+    "most": "star_count DESC, boresight",
+    "number": "boresight",
+    "ra": "ra_deg, boresight",
+    "dec": "dec_deg, boresight",
+}
+
+
+def _fields_notebook(
+    request: Request, service: Service, database: Database, order: Order, page: int, at_most: str
+) -> Notebook | None:
+    """Return Python that asks for the fields on the page; None where no product has them."""
+    if "boresights" not in database.products:
+        return None
+    query = (
+        "SELECT boresight, ra_deg, dec_deg, star_count FROM boresights\n"
+        + (f"WHERE star_count <= {int(at_most)}\n" if at_most else "")
+        + f"ORDER BY {_SQL_ORDER[order]} LIMIT {FIELDS_SHOWN} OFFSET {(page - 1) * FIELDS_SHOWN}"
+    )
+    code = query_code(address_of(request, service), [database.id], query, {}, FIELDS_SHOWN)
+    return Notebook(f"{database.title}-fields", code)
+
+
+def _ordered(fields: Fields, order: Order) -> list[int]:
+    keys = {"fewest": fields.stars, "most": -fields.stars, "ra": fields.ra_deg}
+    keys |= {"dec": fields.dec_deg, "number": np.arange(len(fields))}
+    return list(np.argsort(keys[order], kind="stable").tolist())
+
+
+@lru_cache(maxsize=16)
+def _map_png(database_id: str, fields: Fields) -> bytes:
+    directions = directions_from_radec(fields.ra_deg, fields.dec_deg)
+    nearest = nearest_raster(directions, np.arange(len(fields)), RASTER_WIDTH)
+    return raster_png(nearest, fields.stars)
+
+
+@router.get("/databases/{database_id}/coverage.png")
+def coverage_raster(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the raster of the map of the sky."""
+    database = service.library.database(database_id)
+    return Response(
+        _map_png(database.id, fields_of(database)), media_type="image/png", headers=CACHED
+    )
+
+
+@router.get("/databases/{database_id}/fields.json")
+def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the fields of the tiling to the script of the map."""
+    fields = fields_of(service.library.database(database_id))
+    content = {
+        "ra_deg": fields.ra_deg.round(4).tolist(),
+        "dec_deg": fields.dec_deg.round(4).tolist(),
+        "stars": fields.stars.tolist(),
+        "bins": [{"least": one.least, "colour": one.colour} for one in bins_of(fields.stars)],
+    }
+    return JSONResponse(content, headers=CACHED)
+
+
+@router.get("/databases/{database_id}/report")
+def build_report(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the page that the build wrote; it cannot do anything."""
+    database = service.library.database(database_id)
+    path = database.folder / REPORT_PAGE
+    if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
+        raise TargetMissing(f"{database.title} has no report; build it again to get one")
+    headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
+    # It has no head of the service: a line above it leads back.
+    page = path.read_bytes().replace(b"<body>", b"<body>" + _way_back(database).encode(), 1)
+    return Response(page, media_type="text/html; charset=utf-8", headers=headers)
+
+
+def _way_back(database: Database) -> str:
+    return (
+        f'<p><a href="/databases/{database.id}">← {escape(database.name)} '
+        f'{escape(database.version)}</a> · <a href="/databases">Databases</a></p>'
+    )
+
+
+@router.get("/databases/{database_id}/compare")
+async def compare(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    other: Annotated[str, Query(max_length=64)] = "",
+) -> Response:
+    """Show what differs between this database and a later or other one."""
+    difference = None
+    if other:
+        # In its turn among the queries: it reads whole tables.
+        difference = await service.query_pool.run(difference_of, service, database_id, other)
+    return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
+
+
+def _comparison(
+    request: Request, service: Service, database_id: str, other: str, difference: Difference | None
+) -> Response:
+    database = service.library.database(database_id)
+    others = [one for one in service.library.databases() if one.id != database.id]
+    later = service.library.database(other) if other else None
+    code = difference_code(address_of(request, service), database.id, other)
+    versions = [one.id for one in others if one.name == database.name]
+    return render(
+        request,
+        "compare.html",
+        **_head(service, database, "compare"),
+        others=others,
+        suggested=other or (versions[-1] if versions else ""),
+        later=later,
+        difference=difference,
+        notebook=Notebook(f"{database.title}-{later.title}", code) if later else None,
+        changed=CHANGED,
+        most=DIFFERENCES_SHOWN,
+    )
+
+
+@router.post("/databases/{database_id}/evaluate")
+def evaluate(service: TheService, builder: Builder, database_id: str) -> Response:
+    """Have it measured how often frames are identified, and show the job."""
+    submitted = submit_evaluation(service, database_id, builder.name)
+    return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
+
+
+def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
+    return {"row": database_rows(service, database)[0], "database": database, "tab": tab}

@@ -1,0 +1,124 @@
+"""A design as an address: a preset, and the keys of the spec that are not as it has them.
+
+``?preset=sao-12deg&camera.fov_x_deg=20`` can be read, written by hand and sent to a colleague. A
+text with comments, or one that is no TOML, goes into the address as it is: nothing is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
+
+import tomlkit
+
+from starcat.errors import ConfigError
+from starcat.specs.reading import changed, preset, preset_names
+from starcat_service.pages.draft import (
+    TEXT,
+    Draft,
+    draft_of_content,
+    draft_of_text,
+    without_defaults,
+)
+from starcat_service.pages.naming import FOLLOWING, followed
+
+PRESET, PINNED = "preset", "pinned"
+OTHERS = (PRESET, PINNED, TEXT, "job", "database")
+"""What is in an address besides keys of a spec."""
+
+MOST_CHARACTERS = 12_000
+"""Of an address: servers on the way refuse longer ones."""
+
+
+def query_of(draft: Draft, chosen: str, pinned: str = "") -> str | None:
+    """Return the query of the address of a design: empty, or with its question mark.
+
+    None where it is too long for an address, as one with a large table of a response is.
+    """
+    base = chosen if chosen in preset_names() else preset_names()[0]
+    query = {PRESET: base} if base != preset_names()[0] else {}
+    changes = _changes(draft, base)
+    query |= {TEXT: draft.text} if changes is None else changes
+    if pinned:
+        query[PINNED] = pinned
+    text = urlencode(query, safe="/:, ").replace(" ", "+")
+    if len(text) > MOST_CHARACTERS:
+        return None
+    return f"?{text}" if text else ""
+
+
+def draft_of_query(query: Mapping[str, str]) -> Draft:
+    """Return the design of an address."""
+    if TEXT in query:
+        return draft_of_text(query[TEXT])
+    changes = {key: text for key, text in query.items() if key not in OTHERS}
+    try:
+        return draft_of_content(_content(query.get(PRESET) or preset_names()[0], changes))
+    except (ConfigError, ValueError, TypeError) as error:
+        raise ConfigError(f"the address is of no design: {error}", key="address") from None
+
+
+def pinned_draft(query: str) -> Draft:
+    """Return the design that is pinned, from the query of its address."""
+    return draft_of_query(dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True)))
+
+
+def _base(name: str) -> dict[str, Any]:
+    return without_defaults(preset(name).recorded())
+
+
+def _changes(draft: Draft, base: str) -> dict[str, str] | None:
+    """Return what differs from a preset by key; None where that would lose some of the text."""
+    before, after = dict(_leaves(_base(base))), dict(_leaves(draft.content))
+    if "#" in draft.text or not draft.content:
+        return None
+    changes = {key: _typed(value) for key, value in after.items() if before.get(key) != value}
+    changes |= {key: "" for key in before if key not in after}
+    if any(key in OTHERS for key in changes):
+        return None
+    own = {key: changes.pop(key, _typed(after.get(key, ""))) for key in FOLLOWING}
+    try:
+        followed_by = _content(base, changes)
+        changes |= {k: v for k, v in own.items() if followed_by.get(k) != draft.content.get(k)}
+        same = _content(base, changes)
+    except (ConfigError, ValueError, TypeError):
+        return None
+    return changes if same == draft.content else None
+
+
+def _content(base: str, changes: dict[str, str]) -> dict[str, Any]:
+    """Return a preset as it is changed; name and description follow where they are not given."""
+    content = changed(_base(base), changes)
+    own = followed(content) if changes else {}
+    return content | {key: text for key, text in own.items() if key not in changes}
+
+
+def _leaves(content: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
+
+
+def _typed(value: Any) -> str:
+    """Return a value as `changed` reads it: a text is its own value where it is nothing else."""
+    if isinstance(value, str) and value and changed({}, {"x": value}) == {"x": value}:
+        return value
+    return str(tomlkit.item(value).as_string())
+
+
+def differences(now: Draft, pinned: Draft) -> list[tuple[str, str, str]]:
+    """Return key, value and pinned value of what two designs differ in."""
+    mine, others = dict(_leaves(now.content)), dict(_leaves(pinned.content))
+    keys = [*mine, *(key for key in others if key not in mine)]
+    return [
+        (key, _shown(mine, key), _shown(others, key))
+        for key in keys
+        if mine.get(key) != others.get(key) and key not in ("name", "description", "version")
+    ]
+
+
+def _shown(content: Mapping[str, Any], key: str) -> str:
+    return _typed(content[key]) if key in content else "as by default"

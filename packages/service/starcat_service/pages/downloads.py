@@ -1,0 +1,72 @@
+"""What is taken away from a database: the image for flight software, and the spec."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import tomlkit
+from fastapi import Query
+from fastapi.responses import Response, StreamingResponse
+
+from starcat.onboard.layout import BYTE_ORDERS, FEATURES
+from starcat_service.access import Reader
+from starcat_service.library import Database
+from starcat_service.pages.rendering import page_router
+from starcat_service.service import Service, TheService
+from starcat_service.transfers import BYTES, TYPES, chunks_of, scratch_folder
+
+router = page_router()
+
+Method = Literal["triangle", "pyramid"]
+Endian = Literal["little", "big"]
+
+
+def image_choices(database: Database) -> dict[str, list[tuple[str, str]]]:
+    """Return the methods and the byte orders that an image of a database can have."""
+    methods = [name for name, (product, _) in FEATURES.items() if product in database.products]
+    return {
+        "methods": [(name, f"{name}s") for name in methods],
+        "orders": [(name, f"{name}-endian") for name in BYTE_ORDERS],
+    }
+
+
+@router.get("/databases/{database_id}/image")
+async def flight_image(
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    method: Annotated[Method, Query()] = "triangle",
+    endian: Annotated[Endian, Query()] = "little",
+) -> Response:
+    """Give the image for flight software, the bytes that ``starcat export`` writes."""
+    database = service.library.database(database_id)
+    return await service.sandbox.run(_image, service, database, method, endian)
+
+
+def _image(service: Service, database: Database, method: str, endian: str) -> Response:
+    with scratch_folder(service.paths) as folder:
+        target = folder / "image.img"
+        arguments = {"artifact": str(database.folder), "target": str(target)}
+        service.sandbox.call("flight_image", {**arguments, "method": method, "endian": endian})
+        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
+    headers = {
+        "Content-Length": str(size),
+        "Content-Disposition": f'attachment; filename="{database.title}.img"',
+    }
+    return StreamingResponse(chunks, media_type=BYTES, headers=headers)
+
+
+@router.get("/databases/{database_id}/spec.toml")
+def spec(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the spec that a database was built from, with all defaults."""
+    database = service.library.database(database_id)
+    headers = {"Content-Disposition": f'attachment; filename="{database.title}.toml"'}
+    text = tomlkit.dumps(_without_none(database.spec))
+    return Response(text, media_type=TYPES[".toml"], headers=headers)
+
+
+def _without_none(content: Any) -> Any:
+    """Return a content without what is not given, which TOML cannot say."""
+    if isinstance(content, dict):
+        return {key: _without_none(one) for key, one in content.items() if one is not None}
+    return content

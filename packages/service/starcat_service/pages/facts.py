@@ -1,0 +1,143 @@
+"""What pages say of a database: read from its manifest and from the report of its build."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.catalog.verdict import Reason
+from starcat.errors import ProductError, reason
+from starcat.releases.publishing import recorded
+from starcat.simulation.selftest import rates_of
+from starcat.storage.schema import product_schema
+from starcat_service.library import Database
+from starcat_service.service import Service
+
+REPORT = "report/report.json"
+MANIFEST_DIGEST = "manifest_sha256"  # key of a manifest with the digest of all the others
+NOT_LISTED = (Reason.beyond_read_limit.name,)
+"""Reasons whose records are counted and not in the product ``rejected``."""
+
+_ROWS = """\
+SELECT designation, mag, band, ra_deg, dec_deg, reason, amplitude_mag, star_id
+FROM rejected
+WHERE reason = '{}'
+ORDER BY mag, star_id"""
+
+MAX_JOBS = 1000  # jobs that are looked through for the time of a build
+
+
+@dataclass(frozen=True)
+class Row:
+    """A database as lists and heads of pages show it."""
+
+    database: Database
+    rates: list[Mapping[str, Any]]  # of the self-test, the clean frames first
+    is_released: bool  # whether exactly this is in the registry
+    built_s: float  # seconds since 1970
+
+
+def database_rows(service: Service, *databases: Database) -> list[Row]:
+    """Return databases as the list shows them: these, or all."""
+    released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
+    built: dict[str, float] = {}
+    for job in service.jobs.all(state="done", most=MAX_JOBS):
+        made = (job.result or {}).get("database")
+        if job.kind == "build" and made and job.ended_s:
+            built[str(made)] = job.ended_s
+    return [
+        Row(
+            one,
+            _rates(one),
+            one.title in released and released[one.title] == one.manifest_blob.sha256,
+            built.get(one.id) or (one.folder / MANIFEST_NAME).stat().st_mtime,
+        )
+        for one in databases or service.library.databases()
+    ]
+
+
+def _rates(database: Database) -> list[Mapping[str, Any]]:
+    """Return the rates of the self-test: a damaged report does not hide other databases."""
+    try:
+        # A report of an older version has no share of all pointings.
+        return [rates_of(one).as_dict() for one in report_of(database).get("self_test", ())]
+    except ProductError:
+        return []
+
+
+def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the products of a manifest, each with its schema and the size of its file."""
+    return [
+        {
+            **facts,
+            "name": name,
+            "schema": product_schema(*facts["schema"].rsplit("-", 1)),
+            "bytes": manifest["files"][facts["parquet"]]["bytes"],
+            "in_database": facts.get("in_database", False),
+        }
+        for name, facts in manifest["products"].items()
+    ]
+
+
+def star_columns(manifest: Mapping[str, Any]) -> list[str]:
+    """Return the columns of ``stars`` with errors and blends that the database knows."""
+    spec = manifest["spec"]
+    schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
+    known = ["mag_error", "position_error_end_arcsec"]
+    if not isinstance(spec["epoch_jyear"], int | float):
+        known.append("drift_arcsec")
+    if spec["selection"].get("neighbours"):
+        known += ["centroid_offset_arcsec", "contamination", "blend_mag"]
+    columns = {column.name for column in schema.columns}
+    return [name for name in known if name in columns]
+
+
+def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return why records of the catalogs are no guide stars, the most frequent reason first.
+
+    Each has its number of records, what it means, and a query for its rows; None where they are not
+    listed.
+    """
+    counts: Counter[str] = Counter()
+    for source in manifest["sources"]:
+        if source["role"] == "stars":
+            counts.update(source["rejected"])
+    words = {reason.name: reason.value for reason in Reason}
+    return [
+        {
+            "name": name.replace("_", " "),
+            "records": count,
+            "meaning": words.get(name, ""),
+            "query": None if name in NOT_LISTED or name not in words else _ROWS.format(name),
+        }
+        for name, count in sorted(counts.items(), key=lambda one: (-one[1], one[0]))
+        if count
+    ]
+
+
+def report_of(database: Database) -> dict[str, Any]:
+    """Return the report of a build."""
+    path = database.folder / REPORT
+    if REPORT not in database.manifest["files"]:
+        return {}
+    try:
+        return _read_json(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError) as error:
+        words = reason(error) if isinstance(error, OSError) else str(error)
+        raise ProductError(
+            f"{path.name}: the report of {database.title} cannot be read ({words}); build the "
+            "database again",
+            path=path,
+        ) from error
+
+
+@lru_cache(maxsize=64)
+def _read_json(path: Path, changed_ns: int) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_bytes())
+    return content

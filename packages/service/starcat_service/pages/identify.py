@@ -1,0 +1,401 @@
+"""The page *Identify*: a frame in, its attitude and its named stars out."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import Query, Request
+from fastapi.responses import Response
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData, UploadFile
+
+from starcat.errors import ConfigError, StarcatError, quoted
+from starcat.geometry.camera import Camera
+from starcat.images.identify_options import IdentifyOptions
+from starcat.images.render import write_simulated
+from starcat.matcher.centroids import is_number
+from starcat.matcher.database import open_database
+from starcat.matcher.methods.table import METHODS
+from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.specs.camera_file import camera_toml, parse_camera
+from starcat_service.access import Reader
+from starcat_service.api.identify import (
+    MIB,
+    SUFFIXES,
+    FrameUpload,
+    checked_options,
+    identify_upload,
+)
+from starcat_service.library import Database
+from starcat_service.pages.answers import Shown, ShownFrame, marks_of, shown_frames, unusable_frame
+from starcat_service.pages.notebook import Notebook, identify_code
+from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.pages.sky import view_of
+from starcat_service.pages.wording import page_problem
+from starcat_service.problems import Problem
+from starcat_service.service import Service, TheService
+from starcat_service.transfers import scratch_folder
+
+router = page_router()
+
+MAX_SEED = 2**31 - 1
+MAX_PIXELS = 2**23  # frames with more are given as centroids, not as pictures
+NOISE_PX = 0.3  # noise of a centroid, each axis
+
+CAMERA = ("width_px", "height_px", "fov_x_deg", "focal_length_mm", "pixel_um")
+"""Fields of another camera, named ``camera.`` and this."""
+
+FIELDS = (
+    "database", "method", "field_error", "fov_from", "fov_to", "tolerance_px", "time",
+    "centroids", "brightness", "seed", "lens", "camera.flip", "camera_file",
+    *(f"camera.{name}" for name in CAMERA),
+)  # fmt: skip
+"""Fields of the form that are texts."""
+
+MOST_FILES = 50  # pictures at once
+
+
+@router.get("/identify")
+async def identify_page(request: Request, service: TheService, _: Reader) -> Response:
+    """Show the form; an address that holds a frame is answered."""
+    given = {name: request.query_params.get(name, "")[:MIB] for name in FIELDS}
+    if not (given["centroids"] or given["seed"]):
+        return await run_in_threadpool(_page, request, service, given)
+    return await _answered(request, service, FormData(), given)
+
+
+@router.post("/identify")
+async def identify(request: Request, service: TheService, _: Reader) -> Response:
+    """Identify the frames of a form, and show the form again with the answer."""
+    async with request.form(max_files=MOST_FILES, max_fields=40) as form:
+        given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
+        return await _answered(request, service, form, given)
+
+
+async def _answered(
+    request: Request, service: Service, form: FormData, given: dict[str, str]
+) -> Response:
+    try:
+        asked = await service.sandbox.run(_asked, service, form, given)
+        answer = await _answer(service, asked, given)
+    except (StarcatError, Problem) as error:
+        answer = {"problem": page_problem(error)}
+    return await run_in_threadpool(_page, request, service, given, **answer)
+
+
+@dataclass(frozen=True)
+class _Asked:
+    database: Database
+    uploads: list[FrameUpload]
+    options: IdentifyOptions
+    camera: Camera
+
+
+def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
+    database = service.library.database(given["database"])
+    uploads = frames_of(form, given, database, service)
+    camera = camera_of(given, database) or database.camera
+    return _Asked(database, uploads, options_of(given, service, database), camera)
+
+
+async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dict[str, Any]:
+    """Return what is shown of all files; others have their turn between them."""
+    until_s = time.monotonic() + service.settings.query_time_s
+    frames: list[ShownFrame] = []
+    first, method, picture = None, "", b""
+    for upload in asked.uploads:
+        if time.monotonic() > until_s:
+            frames.append(unusable_frame(upload.name, "not looked at, the others took the time"))
+            continue
+        is_wanted = first is None or not first.is_identified
+        try:
+            found, drawn, method = await service.sandbox.run(
+                _frames, service, asked, upload, given, draw=is_wanted
+            )
+        except (StarcatError, Problem) as error:
+            if len(asked.uploads) == 1:
+                raise
+            frames.append(unusable_frame(upload.name, page_problem(error).detail))
+            continue
+        if found and (first is None or (is_wanted and found[0].is_identified)):
+            first, picture = found[0], drawn
+        frames += found
+    first = first or frames[0]
+    return {
+        "shown": Shown(asked.database.title, method, frames, first),
+        "picture": _address(picture),
+        "errors_arcsec": _errors(first.content),
+        "field_deg": _field_deg(first.content, asked.camera),
+        "view": _view(first, asked.database, asked.camera),
+        "options": _options_told(asked.options),
+    }
+
+
+def _frames(
+    service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
+) -> tuple[list[ShownFrame], bytes, str]:
+    """Identify the frames of one file; return them, the picture of the first, and the method."""
+    kind: Literal["png"] | None = "png" if draw else None
+    found, drawn = identify_upload(
+        service, asked.database.id, upload, asked.options, kind, for_page=True
+    )
+    epoch_jyear = float(asked.database.manifest["epoch_jyear"])
+    return shown_frames(found, given, epoch_jyear), drawn, str(found["method"])
+
+
+def _options_told(options: IdentifyOptions) -> dict[str, Any]:
+    """Return options as a program states them for centroids whose y counts down."""
+    return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
+
+
+def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:
+    """Return what the view of the sky is told of an answer."""
+    content = frame.content
+    if not frame.is_identified:
+        return None
+    found = camera.with_focal_length(float(content["focal_length_px"]))
+    ra, dec, roll = (content[f"{name}_deg"] for name in ("boresight_ra", "boresight_dec", "roll"))
+    return view_of(
+        database,
+        found,
+        frame={"ra": ra, "dec": dec, "roll": roll},
+        at={"ra": ra, "dec": dec, "size": min(2.2 * found.fov_x_deg, 360.0)},
+        marks=marks_of(frame),
+    )
+
+
+@router.get("/identify/frame/{database_id}")
+async def simulated_frame(
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
+) -> Response:
+    """Give a simulated frame of a database's camera, to try things with."""
+    database = service.library.database(database_id)
+    name = f"{database.title}-{seed}{frame_suffix(database)}"
+    content = await service.sandbox.run(_simulated, service, database, name, seed)
+    kind = "image/png" if name.endswith(".png") else "text/csv; charset=utf-8"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=kind, headers=headers)
+
+
+def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
+    databases = service.library.databases()
+    problem = answer.get("problem")
+    nothing = dict.fromkeys(("shown", "picture", "problem", "errors_arcsec", "field_deg", "view"))
+    chosen = next((one for one in databases if one.id == given["database"]), None)
+    camera = (chosen or databases[0]).camera if databases else None
+    shown: Shown | None = answer.get("shown")
+    notebook = None
+    if shown is not None and shown.first.measured and chosen is not None:
+        asked = shown.first.measured, answer.pop("options")
+        code = identify_code(address_of(request, service), chosen.id, *asked)
+        notebook = Notebook(f"{shown.first.content['frame']}-answer", code)
+    return render(
+        request,
+        "identify.html",
+        status=problem.status if problem else 200,
+        databases=[(one.id, one.title) for one in databases],
+        methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
+        given=given,
+        placeholders={
+            name: f"{getattr(camera, name):.6g}" for name in ("width_px", "height_px", "fov_x_deg")
+        }
+        if camera
+        else {},
+        errors={problem.key: problem.detail} if problem and problem.key else {},
+        suffixes=",".join(SUFFIXES),
+        most_mib=service.settings.upload_mib,
+        most_files=MOST_FILES,
+        notebook=notebook,
+        **{**nothing, **answer},
+    )
+
+
+def frames_of(
+    form: FormData, given: dict[str, str], database: Database, service: Service
+) -> list[FrameUpload]:
+    """Return the files of frames that a form brings."""
+    if given["seed"]:
+        number = _number(given["seed"], "seed")
+        seed = int(min(max(number or 0, 0), MAX_SEED))
+        name = f"simulated-{seed}{frame_suffix(database)}"
+        return [FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))]
+    uploads = [one for one in form.getlist("file") if isinstance(one, UploadFile) and one.filename]
+    if uploads:
+        return [FrameUpload.of_form(one, service.settings.upload_mib) for one in uploads]
+    if not given["centroids"].strip():
+        raise Problem(
+            422,
+            "no frame was given; choose an image or a file of centroids, paste centroids, or try "
+            "a simulated frame",
+            key="file",
+        )
+    third = "mag" if given["brightness"] == "mag" else "flux"
+    suffix, text = centroid_file(given["centroids"], third)
+    return [FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))]
+
+
+def options_of(given: dict[str, str], service: Service, database: Database) -> IdentifyOptions:
+    """Return how a frame is to be identified."""
+    percent = _number(given["field_error"], "field_error")
+    ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
+    if (ends[0] is None) != (ends[1] is None):
+        missing = "fov_from" if ends[0] is None else "fov_to"
+        raise Problem(
+            422, "give both ends of the range of fields, or leave both empty", key=missing
+        )
+    camera = camera_of(given, database)
+    content = {
+        "method": given["method"] or None,
+        "fov_error": None if percent is None else percent / 100.0,
+        "fov_deg": None if ends[0] is None else ends,
+        "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
+        "flip": True if given["camera.flip"] else None,
+        "time": given["time"].strip() or None,
+        "camera": None if camera is None else camera_toml(camera),
+    }
+    return checked_options(content).model_copy(
+        update={"time_limit_s": service.settings.query_time_s}
+    )
+
+
+def camera_of(given: Mapping[str, str], database: Database) -> Camera | None:
+    """Return the camera that a form describes; None for that of the database.
+
+    A size that is not given is that of the database, and so is the focal length.
+    """
+    if given["camera_file"].strip():
+        return parse_camera(given["camera_file"], Path("camera file"))
+    scale = CAMERA[3:] if given["lens"] == "focal" else CAMERA[2:3]
+    told = {name: _number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale}
+    if all(value is None for value in told.values()):
+        return None
+    own = database.camera
+    size = {name: value or getattr(own, name) for name, value in told.items() if name in CAMERA[:2]}
+    lens = {name: value for name in scale if (value := told[name]) is not None}
+    values = {**size, **(lens or {"focal_length_px": own.focal_length_px})}
+    lines = [f"{name} = {_toml_number(float(value))}" for name, value in values.items()]
+    try:
+        return parse_camera("\n".join(lines), Path("camera"))
+    except ConfigError as error:
+        raise Problem(422, str(error), key=f"camera.{error.key or CAMERA[0]}") from None
+
+
+def _toml_number(value: float) -> str:
+    return str(int(value)) if value.is_integer() else repr(value)
+
+
+def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
+    stars = open_database(database.folder, ())
+    frame = next(
+        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
+    )
+    with scratch_folder(service.paths) as folder:
+        write_simulated(folder / name, frame, stars.camera, seed)
+        return (folder / name).read_bytes()
+
+
+def _address(picture: bytes) -> str | None:
+    """Return a picture as an address that holds it, as JPEG: nothing of a frame is kept."""
+    if not picture:
+        return None
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.open(io.BytesIO(picture)).convert("RGB").save(file, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _errors(answer: dict[str, Any]) -> list[str] | None:
+    """Return the standard deviations of the attitude about the three axes, arcseconds."""
+    rows: list[list[float | None]] = answer.get("covariance_arcsec2") or []
+    squares = [row[k] for k, row in enumerate(rows)]
+    known = [f"{math.sqrt(one):.3g}" for one in squares if one is not None]
+    return known if len(known) == 3 else None
+
+
+def _field_deg(answer: dict[str, Any], camera: Camera) -> float | None:
+    """Return the full angle across the width, degrees, by the focal length that was found."""
+    focal_length_px = answer.get("focal_length_px")
+    if not focal_length_px:
+        return None
+    half = 0.5 * camera.width_px / float(focal_length_px)
+    return 2.0 * math.degrees(math.atan(half))
+
+
+def _number(text: str, name: str) -> float | None:
+    if not text.strip():
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise Problem(
+            422, f"{name}: {text[:40]!r} is not a number; give one, or leave it empty", key=name
+        ) from None
+
+
+def frame_suffix(database: Database) -> str:
+    """Return the suffix of the file of a simulated frame: a picture unless it were too large."""
+    camera = database.camera
+    return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"
+
+
+MAX_LINES = 20_000
+
+_SEPARATORS = re.compile(r"[\s,;]+")
+
+
+def centroid_file(text: str, third: str = "flux") -> tuple[str, str]:
+    """Return pasted centroids as a centroid file; ``third`` is what a third number is."""
+    stripped = text.strip()
+    if stripped[:1] in ("{", "["):
+        return ".json", stripped
+    if "x_px" in stripped.partition("\n")[0]:
+        return ".csv", stripped + "\n"
+    rows = _rows(text)
+    if not rows:
+        raise ConfigError(
+            "no centroid was pasted; give a line 'x y' or 'x y brightness' for each, in pixels",
+            key="centroids",
+        )
+    names = ("x_px", "y_px", third)[: len(rows[0])]
+    return ".csv", "\n".join(map(",".join, (names, *rows))) + "\n"
+
+
+def _rows(text: str) -> list[list[str]]:
+    rows: list[list[str]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = _SEPARATORS.sub(" ", line.partition("#")[0]).split()
+        if not words:
+            continue
+        if len(rows) == MAX_LINES:
+            raise ConfigError(
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame of so many is no "
+                "frame of stars. Leave out the faint ones",
+                key="centroids",
+            )
+        if not (2 <= len(words) <= 3 and all(map(is_number, words))):
+            raise ConfigError(
+                f"line {number}: {quoted(line.strip())}; expected two or three numbers, 'x y' or "
+                "'x y brightness'",
+                key="centroids",
+                value=line.strip()[:80],
+            )
+        if rows and len(words) != len(rows[0]):
+            raise ConfigError(
+                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}; "
+                "give all of them a brightness, or none",
+                key="centroids",
+            )
+        rows.append(words)
+    return rows

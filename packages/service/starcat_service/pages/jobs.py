@@ -1,0 +1,218 @@
+"""The pages of jobs: the list, and one job with its steps, its log and what became of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Query, Request
+from fastapi.responses import RedirectResponse, Response
+
+from starcat.progress import BYTE_STAGES
+from starcat.simulation.selftest import rates_of
+from starcat_service.access import Builder, Reader
+from starcat_service.jobs.job import Event, Job, State
+from starcat_service.jobs.submission import cancel_job, may_change, retry_job
+from starcat_service.pages.draft import draft_of_content, without_defaults
+from starcat_service.pages.rendering import count_text, page_router, render, size_text
+from starcat_service.service import TheService
+
+JOBS_A_PAGE = 50
+LINES = 500  # lines of the log that a page has; the address of the log has all
+STATES: tuple[State, ...] = ("queued", "running", "done", "failed", "cancelled")
+
+STEPS = {
+    "build": (
+        ("Read the catalogs", ("read", "rows", "check", "motions")),
+        ("Make the products", ("product",)),
+        ("Identify simulated frames", ("self-test",)),
+        ("Write the report", ("report",)),
+        ("Check every file", ("verify",)),
+    ),
+    "ingest": (
+        ("Read the catalog", ("read", "rows")),
+        ("Write the stars", ("store", "margins", "write")),
+    ),
+    "evaluate": (
+        ("Identify simulated frames", ("self-test", "build")),
+        ("Curves against noise, false and missing stars", ("curves",)),
+    ),
+}
+"""What people see of the stages of each kind of job: a name, and first words of stages."""
+
+router = page_router()
+
+
+@router.get("/jobs")
+def jobs_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    state: State | None = None,
+    page: Annotated[int, Query(ge=1, le=10**6)] = 1,
+) -> Response:
+    """List the jobs, the newest first."""
+    total = service.jobs.count(state=state)
+    jobs = service.jobs.all(state=state, most=JOBS_A_PAGE, skip=(page - 1) * JOBS_A_PAGE)
+    return render(
+        request,
+        "jobs.html",
+        jobs=jobs,
+        counts={name: service.jobs.count(state=name) for name in STATES},
+        total=total,
+        state=state,
+        page=page,
+        pages=max(1, math.ceil(total / JOBS_A_PAGE)),
+        took=took_s,
+        progress=progress_text,
+    )
+
+
+@router.get("/jobs/{job_id}")
+def job_page(request: Request, service: TheService, who: Reader, job_id: str) -> Response:
+    """Show a job."""
+    job = service.jobs.get(job_id)
+    events = service.jobs.events(job_id)
+    spec = job.request.get("spec") if job.kind == "build" else None
+    return render(
+        request,
+        "job.html",
+        job=job,
+        steps=steps_of(job, events),
+        log=[event for event in events if event.kind == "log"][-LINES:],
+        last=events[-1].number if events else 0,
+        spec=None if spec is None else draft_of_content(without_defaults(spec)).text,
+        facts=facts_of(job),
+        took=took_s(job),
+        progress=progress_text(job),
+        may_change=may_change(job, who),
+        # A job of an older version has recorded no share of all pointings.
+        rates=[rates_of(one).as_dict() for one in (job.result or {}).get("rates", ())],
+        charts=charts_of(job),
+        chart=(CHART_WIDTH, CHART_HEIGHT),
+    )
+
+
+@router.post("/jobs/{job_id}/cancel")
+def cancel(service: TheService, who: Builder, job_id: str) -> Response:
+    """End a job, and show it."""
+    cancel_job(service, job_id, who)
+    return RedirectResponse(f"/jobs/{job_id}", 303)
+
+
+@router.post("/jobs/{job_id}/retry")
+def retry(service: TheService, who: Builder, job_id: str) -> Response:
+    """Have a job done once more, and show it."""
+    retry_job(service, job_id, who)
+    return RedirectResponse(f"/jobs/{job_id}", 303)
+
+
+def took_s(job: Job) -> float | None:
+    """Return for how long a job has been running, seconds; None before it began."""
+    if job.started_s is None:
+        return None
+    return max(0.0, (job.ended_s or time.time()) - job.started_s)
+
+
+def progress_text(job: Job) -> str:
+    """Return how far a job is within its stage, such as ``self-test: 120 of 400``."""
+    if job.stage is None:
+        return ""
+    if job.total is None or job.done is None:
+        return job.stage
+    is_bytes = job.stage.split()[0] in BYTE_STAGES
+    shown = size_text if is_bytes else count_text
+    return f"{job.stage}: {shown(job.done)} of {shown(job.total)}"
+
+
+def facts_of(job: Job) -> list[tuple[str, str]]:
+    """Return what else is known of a job, besides the spec of a build."""
+    facts = {**job.request, **(job.result or {})}
+    return [
+        (name.replace("_", " "), str(value))
+        for name, value in facts.items()
+        if value is not None and name not in ("spec", "rates", "curves")
+    ]
+
+
+CHART_WIDTH, CHART_HEIGHT = 300.0, 150.0
+"""Of the area of a curve; its labels are outside of it."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A point of a curve, where it is drawn."""
+
+    x: float
+    y: float
+    low_y: float  # ends of the interval
+    high_y: float
+    value: float  # of the quantity
+    told: Mapping[str, Any]  # the share
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A curve as it is drawn: 0 to 100 % upwards."""
+
+    label: str
+    held: str  # what the other quantities are held at, where that is not nothing
+    marks: list[Mark]
+
+    @property
+    def line(self) -> str:
+        """Points of the line."""
+        return " ".join(f"{mark.x:.1f},{mark.y:.1f}" for mark in self.marks)
+
+
+def charts_of(job: Job) -> list[Chart]:
+    """Return the curves of an evaluation."""
+    return [_chart(curve) for curve in (job.result or {}).get("curves", ())]
+
+
+def _chart(curve: Mapping[str, Any]) -> Chart:
+    points = curve["points"]
+    most = max(point["x"] for point in points) or 1.0
+
+    def y(percent: float | None) -> float:
+        return CHART_HEIGHT * (1.0 - (percent or 0.0) / 100.0)
+
+    marks = [
+        Mark(
+            CHART_WIDTH * point["x"] / most,
+            y(point["percent"]),
+            y(point["low_percent"]),
+            y(point["high_percent"]),
+            point["x"],
+            point,
+        )
+        for point in points
+    ]
+    return Chart(curve["label"], curve["held"], marks)
+
+
+def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:
+    """Return the steps of a job: name, first words of its stages, and how far it is."""
+    begun = max(
+        (event.number for event in events if event.data.get("state") == "running"), default=0
+    )
+    seen = {
+        str(event.data["stage"]).split()[0]
+        for event in events
+        if event.kind == "stage" and event.number > begun
+    }
+    steps = STEPS[job.kind]
+    reached = max((k for k, (_, words) in enumerate(steps) if seen & set(words)), default=-1)
+    if job.state == "running":
+        reached = max(reached, 0)
+    found = []
+    for k, (name, words) in enumerate(steps):
+        state = "done" if job.state == "done" or k < reached else "open"
+        if k == reached and job.state != "done":
+            state = "current" if job.state == "running" else "failed"
+        state = "open" if job.state == "queued" else state
+        found.append({"name": name, "words": " ".join(words), "state": state})
+    return found

@@ -1,0 +1,395 @@
+"""The page *New database*: a spec is designed, and what it would give is seen at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+from urllib.parse import quote
+
+from fastapi import Depends, Query, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+from pydantic import ValidationError
+from starlette.datastructures import UploadFile
+
+from starcat.catalog.source import data_source
+from starcat.errors import ConfigError, SourceMissing, StarcatError
+from starcat.pipeline.starter import advice
+from starcat.specs.build_spec import CameraSpec
+from starcat.specs.reading import preset, preset_names
+from starcat_service.access import Reader, principal_of
+from starcat_service.catalogs import is_here
+from starcat_service.jobs.submission import check_title, submit_build
+from starcat_service.pages.design import (
+    PINNED,
+    PRESET,
+    differences,
+    draft_of_query,
+    pinned_draft,
+    query_of,
+)
+from starcat_service.pages.draft import (
+    PRODUCTS,
+    TEXT,
+    Draft,
+    draft_of_content,
+    draft_of_form,
+    draft_with,
+    without_defaults,
+)
+from starcat_service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_of
+from starcat_service.pages.rendering import (
+    ENVIRONMENT,
+    count_text,
+    duration_text,
+    page_router,
+    render,
+    size_text,
+)
+from starcat_service.pages.response import FILE, MOST_BYTES, PER, keys_of_file
+from starcat_service.pages.wording import in_page_words, page_problem
+from starcat_service.problems import Problem, ProblemDetails
+from starcat_service.service import Service, TheService
+from starcat_service.settings import Role
+
+MOST_FIELDS = 100  # fields of a form; this one has 41
+MOST_KEYS = 200  # of an address
+
+router = page_router()
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What a form was sent with."""
+
+    fields: dict[str, str]
+    file: tuple[str, bytes] | None  # name and content of the CSV file of a response
+
+
+async def sent_form(request: Request) -> Sent:
+    """Return what a request brings; of a file no more is read than may be taken."""
+    async with request.form(max_files=1, max_fields=MOST_FIELDS) as form:
+        fields = {name: value for name, value in form.items() if isinstance(value, str)}
+        file = form.get(FILE)
+        if not isinstance(file, UploadFile) or not file.filename:
+            return Sent(fields, None)
+        return Sent(fields, (file.filename, await file.read(MOST_BYTES + 1)))
+
+
+Form = Annotated[Sent, Depends(sent_form)]
+
+
+@router.get("/new")
+def new_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    chosen: Annotated[str, Query(alias=PRESET)] = "",
+    pinned: Annotated[str, Query()] = "",
+    job: Annotated[str | None, Query()] = None,
+    database: Annotated[str | None, Query()] = None,
+) -> Response:
+    """Show the form with the design of the address, or with that of a job or of a database."""
+    if job is None and database is None:
+        draft = draft_of_query(dict(request.query_params.multi_items()[:MOST_KEYS]))
+    else:
+        draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
+    # A page that waits for no catalog is there at once; its script asks for the estimate.
+    form = {PRESET: chosen or preset_names()[0], PINNED: pinned}
+    return _page(request, service, draft, form, is_first=True)
+
+
+def _spec_of(service: Service, job: str | None, database: str | None) -> dict[str, Any]:
+    if job is None:
+        return dict(service.library.database(database or "").manifest["spec"])
+    spec = service.jobs.get(job).request.get("spec")
+    if spec is None:
+        raise Problem(404, f"job {job} builds nothing; choose one that does")
+    return dict(spec)
+
+
+@router.post("/new")
+def sent_page(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
+    """Build what the form has, or show what it would give."""
+    (draft, told), form = _asked(service, sent), sent.fields
+    if form.get("do") != "build" or draft.spec is None or draft.wrong:
+        return _page(request, service, draft, form, told)
+    who = principal_of(request)
+    try:
+        if who.role < Role.BUILDER:
+            raise Problem(403, "building needs the role builder; sign in with a token that has it")
+        job = submit_build(service, draft.spec, who.name).job
+    except (StarcatError, Problem) as error:
+        return _page(request, service, draft, form, refused=page_problem(error))
+    return RedirectResponse(f"/jobs/{job.id}", 303)
+
+
+@router.post("/new/preview")
+def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
+    """Tell a script what the form has become, and what that would give."""
+    (draft, told), form = _asked(service, sent), sent.fields
+    found = _shown(service, draft, form, told)
+    content: dict[str, Any] = {
+        "toml": draft.text,
+        "values": draft.values,
+        "lens": draft.lens,
+        "products": draft.products,
+        "bands": draft.bands,
+        "responses": draft.responses,
+        **{name: found[name] for name in ("errors", "summary", "address", "pinned_query")},
+        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(found),
+        "result": ENVIRONMENT.get_template("new_result.html").render(found),
+        "is_busy": found["is_busy"],
+        "is_known": found["preview"] is not None,
+        "can_build": found["can_build"],
+        "stars": _counts(found["preview"]),
+    }
+    return JSONResponse(content, headers={"Cache-Control": "no-store"})
+
+
+@router.get("/new/tiling")
+def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Response:
+    """Tell a script where the fields of a tiling are."""
+    ra_deg, dec_deg = tiling_of(count)
+    content = {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
+    return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
+
+
+def _asked(service: Service, sent: Sent) -> tuple[Draft, list[str]]:
+    """Return the design that a form asks for, and what is to be said of it."""
+    form = sent.fields
+    draft = draft_of_form(form)
+    if sent.file is not None:
+        try:
+            return draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), []
+        except ConfigError as error:
+            return replace(draft, wrong=(*draft.wrong, error)), []
+    if form.get("do") == "pin":
+        query = query_of(draft, form.get(PRESET, ""))
+        if query is None:
+            return draft, ["This design is too long to be pinned: keep its text instead."]
+        form[PINNED] = query.removeprefix("?") or f"{PRESET}="
+    elif form.get("do") == "unpin":
+        form[PINNED] = ""
+    elif form.get("do") == "suggest":
+        try:
+            return suggested(service, draft)
+        except (StarcatError, Problem) as error:
+            return draft, [f"No limits can be suggested: {page_problem(error).detail}"]
+    return draft, []
+
+
+def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
+    """Return a design with the limits that its camera needs, and what is to be said of them."""
+    try:
+        camera = CameraSpec.model_validate(draft.content.get("camera"))
+    except ValidationError:
+        return draft, ["No limits can be suggested before the fields of the camera are right."]
+    starter = service.catalogs.starter("camera", camera)
+    limit = starter.spec.selection.faint_limit_mag
+    own = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
+    if draft.spec is not None and own != (starter.spec.catalog.source, None):
+        limit, _ = service.catalogs.enough_limit(draft.spec)
+    selection, boresights = starter.spec.selection, starter.spec.boresights
+    changes: dict[str, Any] = {
+        "selection.faint_limit_mag": limit,
+        "selection.max_stars_per_field": selection.max_stars_per_field,
+        "selection.doubles.min_separation_deg": selection.doubles.min_separation_deg,
+        "selection.doubles.max_delta_mag": selection.doubles.max_delta_mag,
+        "boresights.count": boresights.count,
+        "boresights.brightest": boresights.brightest,
+    }
+    for name in PRODUCTS:
+        changes[f"products.{name}.enabled"] = False if name in starter.left_out else None
+    fov = camera.camera()
+    told = (
+        f"For {fov.fov_x_deg:.4g} x {fov.fov_y_deg:.4g} deg: faint limit {limit:g}, the "
+        f"{selection.max_stars_per_field} brightest of each field, "
+        f"{count_text(boresights.count)} boresights."
+    )
+    return draft_with(draft, changes), [told, *(f"{one}." for one in advice(starter))]
+
+
+def _shown(
+    service: Service, draft: Draft, form: dict[str, str], told: list[str] | None = None
+) -> dict[str, Any]:
+    """Return what page and script are told of a design and of what it would give."""
+    errors, problem = dict(draft.errors), None
+    seen, found = _preview(service, draft)
+    if found is not None:
+        key = found.key if found.key in draft.values else _key_in(found.detail, draft)
+        if key is None or found.status == 503:
+            problem = found
+        else:
+            errors[key] = found.detail
+    if draft.spec is not None:
+        errors |= _taken(service, draft)
+    refusals = []
+    for text in seen.estimate.refusals if seen else ():
+        key = _key_in(text, draft)
+        if key is None:
+            refusals.append(text)
+        else:
+            errors.setdefault(key, in_page_words(text))
+    is_refused = seen is not None and bool(refusals or seen.verdict.will_fail)
+    is_busy = problem is not None and problem.status == 503
+    return {
+        "preview": seen,
+        "problem": problem and problem.detail,
+        "errors": errors,
+        "refusals": refusals,
+        "told": told or [],
+        "summary": _summary(seen, [*errors.values(), *refusals], problem),
+        "is_busy": is_busy,
+        "can_build": not errors and not is_refused and (problem is None or is_busy),
+        "address": _address(draft, form),
+        "pinned_query": form.get(PINNED, ""),
+        **_pinned(service, draft, form),
+    }
+
+
+def _key_in(message: str, draft: Draft) -> str | None:
+    """Return the first key of a message that the form has a field for."""
+    places = {key: message.find(key) for key in draft.values if "." in key and key in message}
+    if not places and "[selection]" in message:
+        return "selection.faint_limit_mag"
+    return min(places, key=places.__getitem__) if places else None
+
+
+def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+    """Return what a page is told of a design of which no estimate was made yet."""
+    errors = draft.errors | (_taken(service, draft) if draft.spec else {})
+    return {
+        **dict.fromkeys(("preview", "pinned", "problem")),
+        "errors": errors,
+        "told": [],
+        "differing": [],
+        "summary": "",
+        "can_build": not errors,
+        "address": _address(draft, form),
+        "pinned_query": form.get(PINNED, ""),
+    }
+
+
+def _address(draft: Draft, form: dict[str, str]) -> str:
+    """Return the address of a design; empty where it is too long for one."""
+    query = query_of(draft, form.get(PRESET, ""), form.get(PINNED, ""))
+    return "" if query is None else f"/new{query}"
+
+
+def _taken(service: Service, draft: Draft) -> dict[str, str]:
+    """Return the error where a database of this name and version is there already."""
+    try:
+        if draft.spec is not None:
+            check_title(service, draft.spec)
+    except Problem as error:
+        return {error.key or TEXT: error.detail}
+    except StarcatError:
+        pass  # its catalog is missing, which is said elsewhere
+    return {}
+
+
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
+    if draft.spec is None:
+        return None, None
+    try:
+        return preview_of(service.catalogs, draft.spec), None
+    except SourceMissing as error:
+        return None, page_problem(error).model_copy(update={"key": "catalog.source"})
+    except (StarcatError, Problem) as error:
+        return None, page_problem(error)
+
+
+def _pinned(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+    """Return what is told of the design that is pinned, to compare this one with it."""
+    query = form.get(PINNED, "")
+    if not query:
+        return {"pinned": None, "differing": []}
+    try:
+        other = pinned_draft(query)
+    except StarcatError:
+        return {"pinned": None, "differing": []}
+    return {"pinned": _preview(service, other)[0], "differing": differences(draft, other)}
+
+
+def _counts(seen: Preview | None) -> list[int]:
+    return [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist()
+
+
+def _page(
+    request: Request,
+    service: Service,
+    draft: Draft,
+    form: dict[str, str],
+    told: list[str] | None = None,
+    refused: ProblemDetails | None = None,
+    *,
+    is_first: bool = False,
+) -> Response:
+    found = _first(service, draft, form) if is_first else _shown(service, draft, form, told)
+    if refused is not None and refused.key in draft.values:
+        found["errors"][refused.key] = refused.detail
+        refused = None
+    status = refused.status if refused else 422 if found["errors"] and not is_first else 200
+    return render(
+        request,
+        "new.html",
+        status=status,
+        **found,
+        draft=draft,
+        refused=refused and refused.detail,
+        is_first=is_first,
+        presets=_presets(),
+        chosen=form.get(PRESET, ""),
+        response_per=form.get(PER, ""),
+        sources=_sources(service),
+        may_build=principal_of(request).role >= Role.BUILDER,
+        sign_in=f"/sign-in?next={quote(str(found['address']) or '/new', safe='')}",
+        text_error=found["errors"].get(TEXT),
+    )
+
+
+def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | None) -> str:
+    if seen is None:
+        why = next(iter(wrong), problem.detail if problem else "")
+        return f"No estimate: {why}" if why else ""
+    if wrong:
+        return f"Cannot be built: {wrong[0]}"
+    if seen.verdict.will_fail:
+        return f"Not to be built: {seen.verdict.words}"
+    found = seen.estimate
+    stars = found.coverage.stars
+    return (
+        f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "
+        f"field ({stars.minimum} to {stars.maximum}), {size_text(found.total_bytes)}, built in "
+        f"about {duration_text(max(1.0, found.build_seconds))}"
+    )
+
+
+def _presets() -> list[tuple[str, str, str]]:
+    """Return name, description, and what is lacking, of the presets."""
+    found = []
+    for name in preset_names():
+        spec = preset(name)
+        missing = [source for source in spec.sources if not is_here(source)]
+        found.append((name, spec.description, lacking(missing) if missing else ""))
+    return found
+
+
+def lacking(sources: list[str]) -> str:
+    """Return what to say where the files of catalogs are not on the server."""
+    known = [(one, data_source(one).identifier.partition(";")[0]) for one in sources]
+    names = " and ".join(f"{one} ({identifier})" for one, identifier in known)
+    is_one = len(sources) == 1
+    return (
+        f"the files of {names} are not on this server; whoever runs it gets "
+        f"{'them' if is_one else 'each'} with starcat fetch {' and starcat fetch '.join(sources)}"
+    )
+
+
+def _sources(service: Service) -> list[tuple[str, str]]:
+    """Return the star catalogs there are, those whose files are here first."""
+    found = []
+    for one in service.catalogs.offered():
+        told = one.source.identifier if one.is_here else "its files are not here"
+        found.append((one.source.name, f"{one.source.name} – {told}"))
+    return found

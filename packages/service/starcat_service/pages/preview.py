@@ -1,0 +1,165 @@
+"""What a spec would give, as the page *New database* shows it: verdict, map, histogram, sizes."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from starcat.arrays import Array
+from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.pipeline.estimate import Estimate
+from starcat.pipeline.starter import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD
+from starcat.report.coverage_map import (
+    FIXED_BINS,
+    Counts,
+    Fields,
+    SkyMap,
+    nearest_raster,
+    raster_png,
+    sky_map,
+)
+from starcat.report.report import BLIND_SHARE
+from starcat.simulation.selftest import wilson_interval
+from starcat.specs.build_spec import BuildSpec
+from starcat_service.catalogs import Catalogs
+from starcat_service.pages.rendering import count_text
+
+MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
+MOST_BARS = 48
+MOST_MAPPED = 50_000
+"""Of more boresights than these no map is drawn: their fields would be finer than its dots."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar of the histogram of stars in a field."""
+
+    least: int  # stars of a field
+    most: int
+    fields: int
+    colour: str  # class of the colour that the map has for them
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a design will do, in words."""
+
+    level: str  # "good", "warn" or "bad"
+    words: str
+    will_fail: bool = False  # whether the self-test of the build asks for more than there is
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What a spec would give."""
+
+    estimate: Estimate
+    verdict: Verdict
+    files: list[tuple[str, int | None, int]]  # name, rows of a product, bytes; the largest first
+    bars: list[Bar]
+    map: SkyMap | None  # None: the tiling is too fine for a map
+    picture: str  # the raster, as an address that holds it
+
+
+def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
+    """Return what the page shows of a spec."""
+    estimate = catalogs.estimate(spec)
+    counts = estimate.fields.count.astype(np.int64)
+    ra_deg, dec_deg = tiling_of(len(counts))
+    none = np.zeros_like(counts)
+    fields = Fields(ra_deg, dec_deg, counts, none, none)
+    is_mapped = len(counts) <= MOST_MAPPED
+    return Preview(
+        estimate,
+        verdict_of(estimate, catalogs),
+        sorted(estimate.files, key=lambda file: (-file[2], file[0])),
+        _bars(counts),
+        sky_map(fields, FIXED_BINS) if is_mapped else None,
+        _picture(counts) if is_mapped else "",
+    )
+
+
+def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
+    """Return whether nearly every field has the stars that it needs, and what to do if not."""
+    blind, stars = 1.0 - found.enough_share, found.coverage.stars
+    spec = found.spec
+    if blind > BLIND_SHARE:
+        words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
+        advice, test = _advice(spec, catalogs), spec.self_test
+        hits = round(found.enough_share * test.frames)
+        if wilson_interval(hits, test.frames)[1] >= test.min_identified:
+            return Verdict("bad", f"{words}. {advice}")
+        asked = f"{_percent(test.min_identified)} of all pointings (self_test.min_identified)"
+        words += f", and a build fails that does not identify {asked}"
+        return Verdict("bad", f"{words}. {advice}", will_fail=True)
+    if stars.one_percent < ENOUGH_STARS - 2:
+        words = (
+            f"Thin: 1 % of the fields have {stars.one_percent} guide stars or fewer, and a frame "
+            "that misses some of them has no answer"
+        )
+        return Verdict("warn", f"{words}. {_advice(spec, catalogs)}")
+    words = f"Good: 99 % of the fields have {stars.one_percent} guide stars or more"
+    if stars.median > MANY_FIELDS * STARS_A_FIELD:
+        limit, _ = catalogs.enough_limit(spec)
+        words += (
+            f". The middle one has {count_text(stars.median)}, more than are needed: "
+            f"{_band(spec)} {limit:.1f}, or a limit of stars per field, would do"
+        )
+    return Verdict("good", f"{words}.")
+
+
+def _advice(spec: BuildSpec, catalogs: Catalogs) -> str:
+    limit, deepest = catalogs.enough_limit(spec)
+    own = spec.selection.faint_limit_mag
+    if limit > own + 0.04:
+        ends = limit >= deepest - 0.1
+        more = f", where the catalog ends, or take {_OTHERS}" if ends else ""
+        return f"Go to {_band(spec)} {limit:.1f}{more}."
+    if own >= deepest - 0.1:
+        return f"The catalog ends at {_band(spec)} {deepest:.1f}: take {_OTHERS}."
+    return (
+        f"{_band(spec)} {own:g} is faint enough: the other rules remove the stars. See below which "
+        "of them does, or let limits be suggested."
+    )
+
+
+_OTHERS = "a deeper catalog or a wider field"
+
+
+def _band(spec: BuildSpec) -> str:
+    return spec.camera.response.name or spec.catalog.band or "magnitude"
+
+
+def _percent(share: float) -> str:
+    percent = 100.0 * share
+    return f"{percent:.0f} %" if percent >= 9.95 else f"{percent:.2g} %"
+
+
+@lru_cache(maxsize=4)
+def tiling_of(count: int) -> tuple[Array, Array]:
+    """Return right ascension and declination of the boresights of a tiling."""
+    return radec_from_directions(saff_kuijlaars(count))
+
+
+def _bars(counts: Counts) -> list[Bar]:
+    least, most = int(counts.min()), int(counts.max())
+    step = -(-(most - least + 1) // MOST_BARS)
+    fields = np.bincount((counts - least) // step)
+    bars = []
+    for low, count in zip(range(least, most + 1, step), fields.tolist(), strict=True):
+        colour = next(one.name for one in reversed(FIXED_BINS) if one.least <= low)
+        bars.append(Bar(low, low + step - 1, count, colour))
+    return bars
+
+
+@lru_cache(maxsize=4)
+def _nearest(count: int) -> Array:
+    return nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
+
+
+def _picture(counts: Counts) -> str:
+    raster = raster_png(_nearest(len(counts)), counts, FIXED_BINS)
+    return f"data:image/png;base64,{base64.b64encode(raster).decode()}"

@@ -1,0 +1,90 @@
+"""The page *Releases*: what was published, how to get it, and publishing."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Form, Query, Request
+from fastapi.responses import RedirectResponse, Response
+
+from starcat.errors import StarcatError
+from starcat_service.access import Publisher, Reader
+from starcat_service.api import releases as api
+from starcat_service.library import Database
+from starcat_service.pages.facts import database_rows
+from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.problems import Problem, ProblemDetails, problem_of
+from starcat_service.service import Service, TheService
+from starcat_service.settings import Role
+
+router = page_router()
+
+
+@router.get("/releases")
+def releases_page(
+    request: Request,
+    service: TheService,
+    reader: Reader,
+    database: Annotated[str, Query(max_length=64)] = "",
+    published: Annotated[str, Query(max_length=200)] = "",
+) -> Response:
+    """Show what was published, and the form to publish what was not."""
+    return _page(request, service, reader, database=database, published=published)
+
+
+@router.post("/releases")
+def publish(
+    request: Request,
+    service: TheService,
+    publisher: Publisher,
+    database: Annotated[str, Form(max_length=64)],
+    note: Annotated[str, Form(max_length=api.MAX_NOTE)] = "",
+    confirmed: Annotated[bool, Form()] = False,
+) -> Response:
+    """Ask whether a database is to be published for good, or publish it and show it."""
+    wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
+    if not confirmed:
+        asked = service.library.database(database)
+        return _page(request, service, publisher, database=database, note=wanted.note, asked=asked)
+    try:
+        released = api.publish(wanted, Response(), service, publisher)
+    except (StarcatError, Problem) as error:
+        problem = problem_of(error)
+        return _page(request, service, publisher, database=database, note=note, problem=problem)
+    return RedirectResponse(f"/releases?published={released.title}#{released.title}", 303)
+
+
+def _page(
+    request: Request,
+    service: Service,
+    principal: Reader,
+    *,
+    database: str = "",
+    note: str = "",
+    published: str = "",
+    problem: ProblemDetails | None = None,
+    asked: Database | None = None,
+) -> Response:
+    listed = api.all_releases(service, principal).releases
+    newest_first = sorted(listed, key=lambda one: one.published_s or 0.0, reverse=True)
+    rows = database_rows(service)
+    return render(
+        request,
+        "releases.html",
+        status=problem.status if problem else 200,
+        releases=newest_first,
+        address=address_of(request, service),
+        unreleased=[
+            (row.database.id, f"{row.database.name} {row.database.version}")
+            for row in rows
+            if not row.is_released
+        ],
+        has_databases=bool(rows),
+        asked=asked,
+        may_publish=principal.role >= Role.PUBLISHER,
+        most_note=api.MAX_NOTE,
+        database=database,
+        note=note,
+        published=published if published in {one.title for one in listed} else "",
+        problem=problem,
+    )

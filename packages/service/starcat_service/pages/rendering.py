@@ -1,0 +1,217 @@
+"""Pages out of templates, errors as pages, and the files that pages need.
+
+The digest of style sheets, scripts and pictures is in their address.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from fastapi import APIRouter, FastAPI, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from starlette.exceptions import HTTPException
+
+from starcat.version import __version__
+from starcat_service.access import principal_of
+from starcat_service.pages.wording import in_page_words
+from starcat_service.problems import Problem, RenderingRoute, as_json, problem_of
+from starcat_service.service import Service
+
+NAVIGATION = (
+    ("/new", "New database"),
+    ("/jobs", "Jobs"),
+    ("/databases", "Databases"),
+    ("/identify", "Identify"),
+    ("/releases", "Releases"),
+    ("/docs", "Help"),
+)
+"""Address and name of what the head of every page leads to."""
+
+
+MEDIA_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+
+FILES = {
+    path.name: path.read_bytes()
+    for path in sorted((Path(__file__).parent / "static").iterdir())
+    if path.suffix in MEDIA_TYPES
+}
+"""All of them by name, read once: no path is ever made of a request."""
+
+DIGEST = hashlib.sha256(b"".join(FILES[name] for name in sorted(FILES))).hexdigest()[:12]
+"""One digest for all, so that a script may import another by its name."""
+
+
+def static_address(name: str) -> str:
+    """Return the address of a static file."""
+    if name not in FILES:
+        raise KeyError(name)
+    return f"/static/{DIGEST}/{name}"
+
+
+def count_text(value: float | None) -> str:
+    """Return a count with a thin space between thousands, such as ``4 999``.
+
+    Examples
+    --------
+    >>> count_text(4999) == "4\N{NARROW NO-BREAK SPACE}999", count_text(None)
+    (True, '–')
+    """
+    return "–" if value is None else f"{round(value):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def size_text(value: float | None) -> str:
+    """Return a size with its unit, such as ``4.2 MB``.
+
+    Examples
+    --------
+    >>> [size_text(number).replace("\N{NO-BREAK SPACE}", " ") for number in (999, 1000, 4.2e6)]
+    ['999 B', '1.0 kB', '4.2 MB']
+    """
+    if value is None:
+        return "–"
+    number, unit = float(value), "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if number < 999.5:
+            break
+        number, unit = number / 1000.0, larger
+    digits = 1 if unit != "B" and number < 99.95 else 0
+    return f"{number:.{digits}f}\N{NO-BREAK SPACE}{unit}"
+
+
+def duration_text(value: float | None) -> str:
+    """Return a duration, such as ``4.2 s`` or ``3 min 20 s``.
+
+    Examples
+    --------
+    >>> [duration_text(s).replace("\N{NO-BREAK SPACE}", " ") for s in (0.04, 4.21, 200, 7260)]
+    ['0.04 s', '4.2 s', '3 min 20 s', '2 h 1 min']
+    """
+    if value is None:
+        return "–"
+    if value < 59.5:
+        digits = 2 if value < 0.995 else (1 if value < 9.95 else 0)
+        text = f"{value:.{digits}f} s"
+    elif value < 3570.0:
+        text = "{} min {} s".format(*divmod(round(value), 60))
+    else:
+        text = "{} h {} min".format(*divmod(round(value / 60.0), 60))
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def time_text(value: float | None) -> str:
+    """Return a moment as ``2026-11-22 14:05:09``, UTC."""
+    return "–" if value is None else f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def moment_text(value: float) -> str:
+    """Return a moment as ``2026-11-22T14:05:09Z``, for the attribute ``datetime``."""
+    return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("starcat_service.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "count": count_text,
+        "size": size_text,
+        "duration": duration_text,
+        "time": time_text,
+        "moment": moment_text,
+        "plain": in_page_words,
+    }
+    environment.globals |= {
+        "static": static_address,
+        "navigation": NAVIGATION,
+        "starcat_version": __version__,
+    }
+    return environment
+
+
+ENVIRONMENT = _environment()
+
+
+def render(request: Request, template: str, *, status: int = 200, **content: Any) -> HTMLResponse:
+    """Return a page."""
+    page = ENVIRONMENT.get_template(template).render(
+        principal=principal_of(request),
+        path=request.url.path,
+        **{"sign_in": sign_in_address(request), **content},
+    )
+    return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def address_of(request: Request, service: Service) -> str:
+    """Return the address of the service as whoever asks reaches it."""
+    return (service.settings.public_url or str(request.base_url)).rstrip("/")
+
+
+def sign_in_address(request: Request) -> str:
+    """Return the address to sign in at, which leads back to the page that was asked for."""
+    if request.method != "GET" or request.url.path in ("/", "/sign-in"):
+        return "/sign-in"
+    asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+    return f"/sign-in?next={quote(asked)}"
+
+
+class _PageRoute(RenderingRoute):
+    """A route whose errors are pages, in the words that the REST interface has for them."""
+
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return the page of an error; who only has to sign in is led there."""
+        if isinstance(error, HTTPException) and error.status_code == 405:
+            return as_json(error)
+        problem = problem_of(error)
+        if problem.status == 401 and request.method == "GET":
+            return RedirectResponse(sign_in_address(request), 303)
+        return _error_page(request, error)
+
+
+def page_router() -> APIRouter:
+    """Return a router for pages: not in the schema, and its errors are pages."""
+    return APIRouter(route_class=_PageRoute, include_in_schema=False)
+
+
+def add_missing_page(app: FastAPI) -> None:
+    """Make an application tell a browser on a page that there is nothing at an address."""
+
+    @app.exception_handler(404)
+    def tell_missing(request: Request, error: Exception) -> Response:
+        is_for_people = "text/html" in request.headers.get("accept", "")
+        if is_for_people and request.method == "GET" and not request.url.path.startswith("/api/"):
+            detail = "there is nothing at this address; every part of the service is linked above"
+            return _error_page(request, Problem(404, detail))
+        return as_json(error)
+
+
+def _error_page(request: Request, error: Exception) -> Response:
+    problem = problem_of(error)
+    return render(request, "error.html", status=problem.status, problem=problem)
+
+
+static_router = APIRouter(include_in_schema=False)
+
+
+@static_router.get("/static/{digest}/{name}")
+def static_file(digest: str, name: str) -> Response:
+    """Give a static file; those of an older version are gone."""
+    if digest != DIGEST or name not in FILES:
+        raise Problem(404, "there is no such file of the page; load the page again")
+    return Response(
+        FILES[name],
+        media_type=MEDIA_TYPES[Path(name).suffix],
+        headers={"Cache-Control": "public, max-age=31536000, immutable", "ETag": f'"{DIGEST}"'},
+    )

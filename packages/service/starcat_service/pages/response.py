@@ -1,0 +1,72 @@
+"""The response of the sensor on the page *New database*: picked from a list, or from a CSV file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+from starcat.bands.response import response_from_text, shipped, shipped_names
+from starcat.errors import ConfigError
+from starcat.specs.camera_response import MOST_ROWS
+from starcat_service.pages.naming import value_at
+
+NAME = "camera.response.name"
+FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside
+PER = "response_per"  # what the file is relative to, where it does not say so itself
+
+MOST_BYTES = 500_000
+
+_OWN = ("per", "wavelength_nm", "value")
+"""Keys of a response that stands in the spec."""
+
+_OTHERS = ("file", "optics_file", "optics_wavelength_nm", "optics_transmission")
+_LATER = ("photometry", "zero_point")
+
+
+def responses_of(own: str) -> list[tuple[str, str]]:
+    """Return name and text of the responses that a design may choose from, its own one included."""
+    found = [("", "the catalog's band")]
+    found += [(name, f"{name}: {shipped(name).title}") for name in shipped_names()]
+    if own and own not in shipped_names():
+        found.append((own, f"{own[:60]}: from a file"))
+    return found
+
+
+def keys_of_another(content: Mapping[str, Any], name: str) -> dict[str, None]:
+    """Return the keys that go away with a response where another one, or none, is chosen."""
+    gone = _OWN if name else (*_OWN, *_OTHERS, *_LATER)
+    keys = [f"camera.response.{key}" for key in gone]
+    return dict.fromkeys(key for key in keys if value_at(content, key) is not None)
+
+
+def keys_of_file(filename: str, content: bytes, per: str) -> dict[str, Any]:
+    """Return the keys of a spec that a CSV file gives, with the numbers that are in it."""
+    try:
+        name = _name(filename)
+        if len(content) > MOST_BYTES:
+            raise ConfigError(f"it has more than {MOST_BYTES:,} bytes")
+        text = content.decode("utf-8-sig")
+        try:
+            made = response_from_text(name, text, None)
+        except ConfigError as error:
+            if error.key != "per" or per not in ("photon", "energy"):
+                raise
+            made = response_from_text(name, text, "photon" if per == "photon" else "energy")
+        if len(made.value) > MOST_ROWS:
+            raise ConfigError(f"it has {len(made.value):,} rows, and a spec {MOST_ROWS:,} at most")
+    except (ConfigError, UnicodeDecodeError) as error:
+        told = str(error)
+        if isinstance(error, UnicodeDecodeError):
+            told = "it is no text; give a CSV file of two columns, wavelength in nm and response"
+        raise ConfigError(f"{PurePath(filename).name[:60]}: {told}", key=FILE) from error
+    table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
+    found = {"name": name, "per": made.counts, **table}
+    return {f"camera.response.{key}": value for key, value in found.items()}
+
+
+def _name(filename: str) -> str:
+    """Return the name of a file as the name of a response, none that ships with starcat."""
+    stem = re.sub(r"[^0-9A-Za-z._-]+", "-", PurePath(filename).stem).strip("-._")[:28] or "sensor"
+    return f"{stem}-own" if stem in shipped_names() else stem

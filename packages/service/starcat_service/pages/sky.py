@@ -1,0 +1,176 @@
+"""What the view of the sky shows: stars of a part of it, and the field of a camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import Query
+from fastapi.responses import JSONResponse, Response
+
+from starcat.catalog.source import data_source
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.sky.names import common_names
+from starcat_service.access import Reader
+from starcat_service.api.sql import SqlQuery, result_table
+from starcat_service.library import Database
+from starcat_service.pages.rendering import page_router
+from starcat_service.service import Service, TheService
+
+router = page_router()
+
+MOST = 1500  # stars of a kind in a view
+EDGE_POINTS = 12  # of an outline, on each edge
+CACHED = {"Cache-Control": "private, max-age=86400"}
+"""What never changes under its address: the id says what is in a database."""
+
+SIMBAD = "https://simbad.cds.unistra.fr/simbad/sim-id"
+VIZIER = "https://vizier.cds.unistra.fr/viz-bin/VizieR"
+_CDS = re.compile(r"CDS ([IVXB]+/\w+)")
+
+_PART = """(SELECT '{kind}' AS kind, {reason} AS reason, star_id, designation, mag, ra_deg, dec_deg
+FROM {rows} WHERE mag IS NOT NULL AND ra_deg IS NOT NULL AND {wanted}
+ORDER BY mag, star_id LIMIT {most})"""
+_KINDS = (
+    ("guide", "stars", "NULL", "true"),
+    ("rejected", "rejected", "reason", "reason <> 'too_faint'"),
+    ("faint", "rejected", "reason", "reason = 'too_faint'"),
+)
+"""Kind of a star, its product, where its reason is, and which of the rows it is."""
+
+
+@router.get("/databases/{database_id}/sky.json")
+async def stars_of_view(
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    ra: Annotated[float, Query(ge=0, le=360)] = 0.0,
+    dec: Annotated[float, Query(ge=-90, le=90)] = 0.0,
+    radius: Annotated[float, Query(gt=0, le=180)] = 180.0,
+    faint: bool = False,
+) -> Response:
+    """Give the brightest stars of a part of the sky, those that were rejected with their reason."""
+    found = await service.query_pool.run(
+        _stars, service, service.library.database(database_id), (ra, dec, radius), faint
+    )
+    return JSONResponse({"stars": found}, headers=CACHED)
+
+
+def _stars(
+    service: Service, database: Database, where: tuple[float, float, float], faint: bool
+) -> list[dict[str, Any]]:
+    is_all = where[2] >= 90.0
+    parts = [
+        _PART.format(
+            kind=kind,
+            reason=reason,
+            rows=table if is_all else f"cone($ra, $dec, $radius, of := '{table}')",
+            wanted=wanted,
+            most=MOST,
+        )
+        for kind, table, reason, wanted in _KINDS
+        if table in database.products and (faint or kind != "faint")
+    ]
+    values = {} if is_all else dict(zip(("ra", "dec", "radius"), where, strict=True))
+    query = SqlQuery(
+        [database.id],
+        "\nUNION ALL\n".join(parts) + "\nORDER BY kind, mag, star_id",
+        values,
+        len(_KINDS) * MOST,
+        service.settings.query_time_s,
+    )
+    answer = result_table(service, query).with_json_values()
+    names = [column.name for column in answer.columns]
+    stars = [_star(dict(zip(names, row, strict=True))) for row in answer.rows]
+    return _named(stars, float(database.manifest["epoch_jyear"]))
+
+
+def _star(row: Mapping[str, Any]) -> dict[str, Any]:
+    star = {
+        "kind": row["kind"],
+        "id": str(row["star_id"]),
+        "label": row["designation"] or f"star {row['star_id']}",
+        "mag": round(row["mag"], 4),
+        "ra_deg": round(row["ra_deg"], 6),
+        "dec_deg": round(row["dec_deg"], 6),
+    }
+    reason = row["reason"]
+    return star if reason is None else {**star, "reason": str(reason).replace("_", " ")}
+
+
+def _cds_catalog(source: str) -> str:
+    """Return the number that the CDS gives to a catalog; empty where it has none."""
+    if source == "gaia":  # of which the embedded sky is an excerpt
+        return "I/355/gaiadr3"
+    try:
+        found = _CDS.search(data_source(source).identifier)
+    except ConfigError:
+        return ""
+    return found[1] if found else ""
+
+
+NAMED_TO_MAG = 8.5  # stars fainter than this have no name of their own
+
+
+def _named(stars: list[dict[str, Any]], epoch_jyear: float) -> list[dict[str, Any]]:
+    bright = [one for one in stars if one["mag"] <= NAMED_TO_MAG]
+    for one, name in zip(bright, names_of(bright, epoch_jyear), strict=True):
+        if name:
+            one["name"] = name
+    return stars
+
+
+def names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
+    """Return the names that people know stars by; None for those that have only a designation."""
+    if not stars:
+        return []
+    ra, dec, mag = (
+        np.array([one[name] for one in stars], dtype=np.float64)
+        for name in ("ra_deg", "dec_deg", "mag")
+    )
+    labels = [str(one["label"]) for one in stars]
+    found = common_names(labels, directions_from_radec(ra, dec), mag, epoch_jyear)
+    return [None if name == label else name for name, label in zip(found, labels, strict=True)]
+
+
+def outline_of(camera: Camera) -> list[list[float]]:
+    """Return directions along the edge of a detector in the camera frame, once around."""
+    w, h, part = camera.width_px, camera.height_px, np.arange(EDGE_POINTS) / EDGE_POINTS
+    x = np.concatenate([part * w, np.full(EDGE_POINTS, w), w - part * w, np.zeros(EDGE_POINTS)])
+    y = np.concatenate([np.zeros(EDGE_POINTS), part * h, np.full(EDGE_POINTS, h), h - part * h])
+    edge = camera.directions_from_pixels(np.stack([x, y], axis=1))
+    return [[round(value, 8) for value in row] for row in edge.tolist()]
+
+
+def view_of(database: Database, camera: Camera | None = None, **more: Any) -> dict[str, Any]:
+    """Return what the script of the view is told: addresses, and the field of a camera."""
+    own, address = camera or database.camera, f"/databases/{database.id}"
+    return {
+        "stars": f"{address}/sky.json",
+        "sql": f"{address}/sql",
+        "simbad": SIMBAD,
+        "vizier": VIZIER,
+        "catalog": _cds_catalog(str(database.spec["catalog"]["source"])),
+        "outline": outline_of(own),
+        "fov": [own.fov_x_deg, own.fov_y_deg],
+        **more,
+    }
+
+
+def around(places: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return a view that holds some places: its middle, and the angle across it, degrees."""
+    ra, dec = (np.array([one[name] for one in places]) for name in ("ra_deg", "dec_deg"))
+    directions = directions_from_radec(ra, dec)
+    middle = directions.sum(axis=0)
+    length = float(np.sqrt(middle @ middle))
+    if length < 0.3 * len(places):  # all over the sky
+        return {"ra": 0.0, "dec": 0.0, "size": 360.0}
+    middle /= length
+    reach = float(np.degrees(separation(directions, middle).max()))
+    ra_deg, dec_deg = radec_from_directions(middle)
+    size = 360.0 if reach > 60.0 else max(3.0 * reach, 1.0)
+    return {"ra": round(float(ra_deg), 4), "dec": round(float(dec_deg), 4), "size": size}

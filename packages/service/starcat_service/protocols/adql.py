@@ -1,0 +1,313 @@
+"""ADQL 2.1 to the SQL of DuckDB, and the rows that it finds with what is known of their columns.
+
+`adql_grammar` reads the text and refuses everything that is not ADQL. This module replaces
+names by those of the session, and functions by those of DuckDB and of starcat's macros. The module
+`adql_shapes` turns geometry into arithmetic. The session that runs the SQL checks it again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sqlglot import exp
+
+from starcat.errors import quoted, suggest
+from starcat.exchange.columns import begun, described
+from starcat.progress import Progress, no_progress
+from starcat.query.names import quoted_name
+from starcat.query.session import Session
+from starcat_service.protocols.adql_columns import Columns, Names
+from starcat_service.protocols.adql_geometry import within
+from starcat_service.protocols.adql_grammar import Refusal, parse_adql, refusals_of
+from starcat_service.protocols.adql_shapes import (
+    GEOMETRY,
+    GeometryCalls,
+    check_count,
+    condition_of,
+    is_text,
+    number_sql,
+    places_of,
+    raw,
+    shape_of,
+    sql_text,
+)
+from starcat_service.protocols.tables import Column, Tables, cast
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function that is no geometry, as DuckDB writes it."""
+
+    # How many arguments it takes.
+    least: int
+    most: int
+    # SQL of DuckDB with {0}, {1} for the arguments, 0 where one is left out; {all} for all of them.
+    written: str
+    is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
+    is_windowed: bool = False  # whether it needs OVER
+
+    def sql(self, arguments: list[str]) -> str:
+        """Return the call as DuckDB writes it."""
+        left_out = ["0"] * (self.most - len(arguments))
+        return self.written.format(*arguments, *left_out, all=", ".join(arguments))
+
+
+def _same(name: str, count: int = 1) -> Function:
+    places = ", ".join(f"{{{k}}}" for k in range(count))
+    return Function(count, count, f"{name}({places})")
+
+
+WINDOWED = (
+    ("ROW_NUMBER", 0, 0), ("RANK", 0, 0), ("DENSE_RANK", 0, 0), ("NTILE", 1, 1), ("LAG", 1, 3),
+    ("LEAD", 1, 3), ("FIRST_VALUE", 1, 1), ("LAST_VALUE", 1, 1),
+)  # fmt: skip
+"""Functions that look at other rows of a window: their names and how many arguments they take."""
+
+_SAME = "ABS DEGREES EXP FLOOR LOG10 RADIANS SQRT ACOS ASIN ATAN COS COT SIN TAN LOWER UPPER"
+
+FUNCTIONS: dict[str, Function] = {
+    **{name: _same(name.lower()) for name in _SAME.split()},
+    "CEILING": _same("ceil"),
+    "LOG": _same("ln"),
+    # A remainder by 0 has no value; DuckDB would end the query.
+    "MOD": Function(2, 2, "mod({0}, nullif({1}, 0))"),
+    "PI": _same("pi", 0),
+    "POWER": _same("power", 2),
+    # What a seed does depends on the service, ADQL says; here it does nothing.
+    "RAND": Function(0, 1, "random()"),
+    "ROUND": Function(1, 2, "round(({0})::DOUBLE, {1})"),
+    "TRUNCATE": Function(1, 2, "trunc(({0})::DOUBLE, {1})"),
+    "ATAN2": _same("atan2", 2),
+    "COALESCE": Function(1, 1000, "coalesce({all})"),
+    "TIMESTAMP": Function(1, 1, "CAST({0} AS TIMESTAMP)"),
+    **{
+        name: Function(1, 1, f"{name.lower()}({{0}})", is_set=True)
+        for name in ("COUNT", "SUM", "AVG", "MIN", "MAX", "STDDEV", "VARIANCE")
+    },
+    "SIGN": _same("sign"),
+    "SUBSTRING": Function(2, 3, "substring({all})"),
+    "LENGTH": _same("length"),
+    **{
+        name: Function(least, most, f"{name.lower()}({{all}})", is_windowed=True)
+        for name, least, most in WINDOWED
+    },
+    "IVO_HEALPIX_INDEX": Function(3, 3, "healpix({0}, {1}, {2})"),
+}
+"""Functions by their names in ADQL. Logarithms are natural where the name does not say 10."""
+
+EXTENSIONS = (
+    ("CASE", "CASE WHEN condition THEN value ELSE value END, and CASE value WHEN ..."),
+    ("COALESCE", "The first value that is there (ADQL 2.1 has it as optional)."),
+    ("LIMIT", "LIMIT n at the end of a query, as TOP n."),
+    ("SELECT without FROM", "One row of constants."),
+    ("OVER", f"Windows with PARTITION BY and ORDER BY for {', '.join(n for n, *_ in WINDOWED)} and "
+     "functions of sets."),
+    ("SIGN", "-1, 0 or 1."), ("SUBSTRING", "SUBSTRING(text, first[, length]), from 1 on."),
+    ("LENGTH", "Characters of a text."), ("STDDEV", "Standard deviation of a sample."),
+    ("VARIANCE", "Variance of a sample."),
+    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; what is "
+     "given back is ICRS."),
+)  # fmt: skip
+"""What is read beyond ADQL, as other archives read it, with what it does."""
+
+USER_FUNCTIONS = (
+    (
+        "ivo_healpix_index(hpxOrder INTEGER, ra DOUBLE, dec DOUBLE) -> BIGINT",
+        "The HEALPix cell of a position, degrees, in nested numbering of an order from 0 to 29.",
+    ),
+)
+"""Functions that ADQL does not have by itself, with what they do."""
+
+
+@dataclass(frozen=True)
+class Translation:
+    """A query as the session runs it."""
+
+    sql: str  # SQL of DuckDB
+    # What is known of the columns of the answer; None where their names are not known before it
+    # runs.
+    columns: Columns | None
+
+
+def translate(text: str, tables: Tables) -> Translation:
+    """Return a query in ADQL as SQL."""
+    tree = parse_adql(text)
+    with refusals_of(text):
+        return _Translator(tables, tree).translation()
+
+
+def ask(
+    session: Session,
+    asked: Translation,
+    max_rows: int | None = None,
+    progress: Progress = no_progress,
+) -> pa.RecordBatchReader:
+    """Return the rows that a query finds, in types that VOTable has; names of columns differ.
+
+    One row more than `max_rows` is given, so that it shows that there are more. The first rows are
+    there already, and no other query may be asked before the last.
+    """
+    with session.ask(asked.sql) as running:
+        found = running.columns
+    columns = _known(asked.columns, [name for name, _ in found])
+    chosen = ", ".join(
+        f"{cast(f'#{k}', kind)} AS {quoted_name(column.name)}"
+        for k, ((_, kind), column) in enumerate(zip(found, columns, strict=True), start=1)
+    )
+    limit = "" if max_rows is None else f" LIMIT {max_rows + 1}"
+    with session.ask(
+        f"SELECT {chosen} FROM ({asked.sql}) AS found{limit}", progress=progress
+    ) as it:
+        batches = described(it.batches(), (column.facts for column in columns))
+    return begun(batches)
+
+
+def _known(columns: tuple[Column, ...] | None, names: list[str]) -> list[Column]:
+    """Return the columns of an answer, each with a name of its own."""
+    if columns is None or len(columns) != len(names):
+        columns = tuple(map(Column.unknown, names))
+    given: list[Column] = []
+    taken: set[str] = set()
+    for column in columns:
+        name, number = column.name, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{column.name}_{number}"
+        taken.add(name.lower())
+        given.append(column.named(name))
+    return given
+
+
+class _Translator:
+    """The work of `translate`: parts of the tree are replaced from the leaves on."""
+
+    def __init__(self, tables: Tables, tree: exp.Expr) -> None:
+        self._tree = tree
+        self._names = Names(tables, tree)
+        self._geometry = GeometryCalls()
+
+    def translation(self) -> Translation:
+        tree = self._tree
+        parts = list(tree.walk())
+        for part in parts:
+            if isinstance(part, exp.Column):
+                self._names.check(part)
+        columns = self._names.columns(tree)
+        root = exp.Paren(this=tree)
+        for part in reversed(parts):
+            self._rewrite(part)
+        for part in list(root.walk()):
+            if (shape := shape_of(part)) is not None:
+                part.replace(raw(shape.value))
+        return Translation(sql_text(root.this), columns)
+
+    def _rewrite(self, part: exp.Expr) -> None:
+        part.comments = None
+        if isinstance(part, exp.Table):
+            self._names.resolve(part)
+        elif isinstance(part, exp.Column):
+            self._names.shorten(part)
+        elif isinstance(part, exp.Literal) and not part.is_string:
+            # In its place: to put another part there takes as long as the list is that it is in.
+            part.set("this", number_sql(part.name))
+        elif isinstance(part, exp.HexString):
+            part.replace(raw(number_sql(str(int(part.name, 16)))))
+        elif isinstance(part, exp.Cast) and part.to.expressions:
+            size = part.to.expressions[0].name
+            part.replace(raw(f"left(CAST({sql_text(part.this)} AS VARCHAR), {size})"))
+        elif isinstance(part, (exp.EQ, exp.NEQ)):
+            self._compare(part)
+        elif isinstance(part, (exp.LT, exp.LTE, exp.GT, exp.GTE)):
+            self._compare_distance(part)
+        elif isinstance(part, exp.Anonymous):
+            self._call(part)
+        elif isinstance(part, exp.SetOperation):
+            for side in ("this", "expression"):
+                query = part.args[side]
+                if isinstance(query, exp.Select) and query.args.get("limit"):
+                    part.set(side, exp.Subquery(this=query))
+
+    def _compare(self, part: exp.EQ | exp.NEQ) -> None:
+        """Write ``1 = CONTAINS(...)`` as what CONTAINS asks, which DuckDB can look ahead with."""
+        for one, other in ((part.this, part.expression), (part.expression, part.this)):
+            asked = condition_of(one)
+            number = "" if asked is None else sql_text(other)
+            if asked is not None and number in ("0", "1"):
+                is_asked = (number == "1") == isinstance(part, exp.EQ)
+                part.replace(raw(asked if is_asked else f"NOT {asked}"))
+                return
+
+    def _compare_distance(self, part: exp.LT | exp.LTE | exp.GT | exp.GTE) -> None:
+        """Write ``DISTANCE(...) < r`` with the declinations that are possible, as CONTAINS has it.
+
+        Only where rows are chosen by it, and of places that are not there none is.
+        """
+        near, far = part.this, part.expression
+        if isinstance(part, (exp.GT, exp.GTE)):
+            near, far = far, near
+        places = places_of(near)
+        if places is None or not _chooses(part):
+            return
+        sign = "<=" if isinstance(part, (exp.LTE, exp.GTE)) else "<"
+        part.replace(raw(within(*places, sign, f"({sql_text(far)})")))
+
+    def _call(self, part: exp.Anonymous) -> None:
+        name = part.this.upper() if isinstance(part.this, str) else ""
+        if self._geometry.read(part):
+            return
+        if name == "IN_UNIT":
+            self._in_unit(part)
+            return
+        if name not in FUNCTIONS:
+            known = sorted({*FUNCTIONS, *GEOMETRY, "IN_UNIT", "CAST"})
+            raise Refusal(
+                f"no function {quoted(part.name)}; {suggest(name, known)}there are "
+                f"{', '.join(known)}",
+                part,
+            )
+        function = FUNCTIONS[name]
+        if function.is_windowed and not isinstance(part.parent, exp.Window):
+            raise Refusal(f"{name} needs a window, as OVER (ORDER BY mag) behind it", part)
+        check_count(part, function.least, function.most)
+        arguments = part.expressions
+        inner = arguments[0] if arguments else None
+        if isinstance(inner, exp.Distinct) and not function.is_set:
+            raise Refusal(f"{name} takes no DISTINCT", part)
+        if isinstance(inner, exp.Star) and name != "COUNT":
+            raise Refusal(f"{name} takes no *", part)
+        for argument in arguments:
+            if shape_of(argument) is not None:
+                raise Refusal(f"{name} takes numbers or texts, and no geometry", part)
+        part.replace(raw(function.sql([sql_text(argument) for argument in arguments])))
+
+    def _in_unit(self, part: exp.Anonymous) -> None:
+        """Write the factor between the unit of a column and another."""
+        check_count(part, 2, 2)
+        value, wanted = part.expressions
+        if not isinstance(value, exp.Column) or not is_text(wanted):
+            raise Refusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
+        found = self._names.column(value)
+        if found is None or not found.unit:
+            raise Refusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
+        from astropy import units
+
+        try:
+            factor = units.Unit(found.unit).to(units.Unit(wanted.name))
+        except (ValueError, TypeError) as error:
+            raise Refusal(
+                f"IN_UNIT: {quoted(found.unit)} of {value.name} is not to be had in "
+                f"{quoted(wanted.name)}",
+                part,
+            ) from error
+        part.replace(raw(f"({sql_text(value)} * {float(factor)!r}::DOUBLE)"))
+
+
+def _chooses(part: exp.Expr) -> bool:
+    """Return whether a condition is one that all rows have to fulfil."""
+    while isinstance(part.parent, (exp.And, exp.Paren)):
+        part = part.parent
+    return isinstance(part.parent, (exp.Where, exp.Join))

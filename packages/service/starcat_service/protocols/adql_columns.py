@@ -1,0 +1,207 @@
+"""Which columns a query gives, and what is known of them: names and scopes of a syntax tree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sqlglot import exp
+
+from starcat.errors import quoted, suggest
+from starcat_service.protocols.adql_grammar import Refusal
+from starcat_service.protocols.tables import Column, Tables
+
+Columns = tuple[Column, ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Something that stands after FROM."""
+
+    name: str  # its alias, or the name of the table; lower case, empty where it has none
+    columns: Columns | None  # None where they are not known
+
+
+class Names:
+    """What the names in a query mean."""
+
+    def __init__(self, tables: Tables, tree: exp.Expr) -> None:
+        self._tables = tables
+        self._select: dict[int, exp.Select | None] = {}
+        self._sources_of: dict[int, list[Source]] = {}
+        # From the root on, so that no part has to look upwards through many others.
+        for part in tree.walk():
+            above = self._select.get(id(part.parent))
+            self._select[id(part)] = part if isinstance(part, exp.Select) else above
+
+    def resolve(self, table: exp.Table) -> None:
+        """Write the full name of a table, as the session has it, in its place."""
+        if not table.db and self._common(table, table.name) is not None:
+            return
+        found = self._tables.find(table.db, table.name)
+        if found is None:
+            given = f"{table.db}.{table.name}" if table.db else table.name
+            known = self._tables.names()
+            raise Refusal(
+                f"no table {quoted(given)}; {suggest(given, known)}TAP_SCHEMA.tables lists the "
+                f"{len(known)} that there are, each with its schema",
+                table,
+            )
+        view = found.view or found.name
+        if not table.alias and (not table.db or view != found.name):
+            table.set("alias", exp.TableAlias(this=exp.to_identifier(table.name, quoted=True)))
+        table.set("this", exp.to_identifier(view, quoted=True))
+        table.set("db", exp.to_identifier(found.schema, quoted=True))
+
+    def shorten(self, column: exp.Column) -> None:
+        """Drop the schema of a column whose view has another name than its table."""
+        found = self._tables.find(column.db, column.table) if column.db else None
+        if found is not None and found.view:
+            column.set("db", None)
+
+    def columns(self, query: exp.Expr) -> Columns | None:
+        """Return the columns that a query gives."""
+        while isinstance(query, (exp.SetOperation, exp.Subquery)):
+            query = query.this
+        if not isinstance(query, exp.Select):
+            return None
+        found: list[Column] = []
+        for number, part in enumerate(query.expressions, start=1):
+            more = self._projected(query, part, number)
+            if more is None:
+                return None
+            found += more
+        return tuple(found)
+
+    def column(self, column: exp.Column) -> Column | None:
+        """Return what is known of a column that is named in a query."""
+        for select in self._around(column):
+            found = self._in(select, column)
+            if found is not None:
+                return found
+        return None
+
+    def check(self, column: exp.Column) -> None:
+        """Check that a column is one of those that the query can see."""
+        if isinstance(column.this, exp.Star) or self.column(column) is not None:
+            return
+        known: set[str] = set()
+        around = self._around(column)
+        if not around:
+            return  # the ORDER BY of several queries names columns of the answer
+        for select in around:
+            known |= {part.alias.lower() for part in select.expressions if part.alias}
+            for source in self.sources(select):
+                if source.columns is None:
+                    return
+                if not column.table or column.table.lower() == source.name:
+                    known |= {one.name.lower() for one in source.columns}
+        if column.name.lower() in known:
+            return
+        where = f" in {quoted(column.table)}" if column.table else ""
+        raise Refusal(
+            f"no column {quoted(column.name)}{where}; {suggest(column.name.lower(), known)}"
+            f"{'there are ' + ', '.join(sorted(known)[:12]) if known else 'no table has the name'}",
+            column,
+        )
+
+    def _around(self, part: exp.Expr) -> list[exp.Select]:
+        """Return the queries that a part stands in, from the innermost out."""
+        found: list[exp.Select] = []
+        select = self._select.get(id(part))
+        while select is not None:
+            found.append(select)
+            select = self._select.get(id(select.parent)) if select.parent else None
+        return found
+
+    def sources(self, select: exp.Select) -> list[Source]:
+        """Return what stands after FROM in a query."""
+        if id(select) not in self._sources_of:
+            first = select.args.get("from_")
+            parts = [*([first] if first else ()), *(select.args.get("joins") or ())]
+            found = [source for part in parts for source in self._sources(part.this)]
+            self._sources_of[id(select)] = found
+        return self._sources_of[id(select)]
+
+    def _sources(self, part: exp.Expr) -> Iterator[Source]:
+        if isinstance(part, exp.Table):
+            yield Source((part.alias or part.name).lower(), self._renamed(part, self._of(part)))
+        elif isinstance(part, exp.Subquery):
+            if isinstance(part.this, (exp.Table, exp.Subquery)) and not part.alias:
+                yield from self._sources(part.this)
+            else:
+                columns = self._renamed(part, self.columns(part.this))
+                yield Source(part.alias.lower(), columns)
+        for join in part.args.get("joins") or ():
+            yield from self._sources(join.this)
+
+    def _of(self, table: exp.Table) -> Columns | None:
+        if not table.db and (common := self._common(table, table.name)) is not None:
+            return self._renamed(common, self.columns(common.this))
+        found = self._tables.find(table.db, table.name)
+        return found.columns if found else None
+
+    def _renamed(self, part: exp.Expr, columns: Columns | None) -> Columns | None:
+        """Return columns under the names that an alias gives them."""
+        alias = part.args.get("alias")
+        names = [one.name for one in alias.args.get("columns") or ()] if alias else []
+        if not names or columns is None or len(names) > len(columns):
+            return columns
+        given = tuple(one.named(name) for one, name in zip(columns, names, strict=False))
+        return given + columns[len(names) :]
+
+    def _common(self, part: exp.Expr, name: str) -> exp.CTE | None:
+        """Return the query of WITH that a name means at a place in the query."""
+        child: exp.Expr = part
+        parent = part.parent
+        while parent is not None:
+            common = parent.args.get("with_")
+            if common is not None:
+                before = list(common.expressions)
+                if child is common:
+                    inside = part.find_ancestor(exp.CTE)
+                    while inside is not None and inside.parent is not common:
+                        inside = inside.find_ancestor(exp.CTE)
+                    before = before[: before.index(inside)] if inside in before else before
+                for one in reversed(before):
+                    if one.alias.lower() == name.lower():
+                        found: exp.CTE = one
+                        return found
+            child, parent = parent, parent.parent
+        return None
+
+    def _projected(self, query: exp.Select, part: exp.Expr, number: int) -> list[Column] | None:
+        if isinstance(part, exp.Star) or (isinstance(part, exp.Column) and part.name == "*"):
+            joins = query.args.get("joins", ())
+            if any(join.args.get("using") or join.args.get("method") for join in joins):
+                return None
+            table = part.table.lower() if isinstance(part, exp.Column) else ""
+            chosen = [s for s in self.sources(query) if not table or s.name == table]
+            found: list[Column] = []
+            for source in chosen:
+                if source.columns is None:
+                    return None
+                found += source.columns
+            return found
+        value = part.this if isinstance(part, exp.Alias) else part
+        name = part.alias or _default_name(value, number)
+        known = self._in(query, value) if isinstance(value, exp.Column) else None
+        return [known.named(name) if known else Column.unknown(name)]
+
+    def _in(self, select: exp.Select, column: exp.Column) -> Column | None:
+        table = column.table.lower()
+        for source in self.sources(select):
+            if table and table != source.name:
+                continue
+            for one in source.columns or ():
+                if one.name.lower() == column.name.lower():
+                    return one
+        return None
+
+
+def _default_name(value: exp.Expr, number: int) -> str:
+    if isinstance(value, exp.Column):
+        return value.name
+    if isinstance(value, exp.Anonymous):
+        return f"{value.name.lower()}_{number}"
+    return f"col_{number}"

@@ -1,0 +1,266 @@
+"""Calls of ADQL's geometry: to shapes, and to SQL of what is asked of them.
+
+A shape is noted at its call in the syntax tree, for the call that it is an argument of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sqlglot import exp
+
+from starcat.errors import quoted
+from starcat_service.protocols import adql_geometry as geometry
+from starcat_service.protocols.adql_geometry import Circle, Point, Polygon, Shape, Zone
+from starcat_service.protocols.adql_grammar import Refusal
+
+MAX_CORNERS = 400  # corners of a polygon at most
+MAX_CHARACTERS = 1_000_000
+"""Length of the arithmetic that the geometry of a query may become, roughly."""
+
+FRAMES = ("", "ICRS", "UNKNOWNFRAME", "GALACTIC")
+"""Frames of coordinates; those behind a space, as in ``ICRS GEOCENTER``, make no difference."""
+
+_MAX_INTEGER = 2**63 - 1
+_SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
+_FRAME_WORDS = {"ICRS", "GALACTIC", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
+
+
+def shape_of(part: exp.Expr) -> Shape | None:
+    """Return the shape that a call of geometry makes, if it is one."""
+    found: Shape | None = part.meta.get(_SHAPE)
+    return found
+
+
+def condition_of(part: exp.Expr) -> str | None:
+    """Return what CONTAINS or INTERSECTS asked, where a part is their answer as a number."""
+    found: str | None = part.meta.get(_CONDITION)
+    return found
+
+
+def places_of(part: exp.Expr) -> tuple[Point, Point] | None:
+    """Return the places whose separation a part is, if it is one that DISTANCE gave."""
+    found: tuple[Point, Point] | None = part.meta.get(_PLACES)
+    return found
+
+
+def raw(sql: str) -> exp.Var:
+    """Return a part of a tree that is written as it is."""
+    return exp.Var(this=sql)
+
+
+def sql_text(part: exp.Expr) -> str:
+    """Return a part as DuckDB writes it."""
+    return part.sql(dialect="duckdb", identify=True, comments=False)
+
+
+def is_text(part: exp.Expr) -> bool:
+    """Return whether a part is a text in quotes."""
+    return isinstance(part, exp.Literal) and bool(part.is_string)
+
+
+def number_sql(text: str) -> str:
+    """Return a number as DuckDB takes it for a 64-bit integer or a double, and nothing else."""
+    is_whole = text.lstrip("+-").isdigit()
+    if is_whole and abs(int(text)) <= _MAX_INTEGER:
+        return text
+    return text if "e" in text.lower() else f"{text}e0"
+
+
+def check_count(part: exp.Anonymous, least: int, most: int) -> None:
+    """Refuse a call with another number of arguments."""
+    found = len(part.expressions)
+    if not least <= found <= most:
+        many = str(least) if least == most else f"{least} to {most}"
+        raise Refusal(f"{part.name.upper()} takes {many} arguments; found {found}", part)
+
+
+class GeometryCalls:
+    """The calls of geometry in a query, and how much arithmetic they become."""
+
+    def __init__(self) -> None:
+        self._characters = 0
+
+    def read(self, part: exp.Anonymous) -> bool:
+        """Note the shape of a call, or write what it asks as SQL; False for other functions."""
+        name = part.name.upper()
+        if name in _SHAPES:
+            part.meta[_SHAPE] = _SHAPES[name](part)
+        elif name == "CENTROID":
+            part.meta[_SHAPE] = geometry.centroid(*self._shapes_of(part, 1))
+        elif name in _CONDITIONS:
+            try:
+                asked = _CONDITIONS[name](*self._shapes_of(part, 2))
+            except ValueError as error:
+                raise Refusal(f"{name}: {error}", part) from None
+            number = raw(f"CAST({asked} AS INTEGER)")
+            number.meta[_CONDITION] = asked
+            part.replace(number)
+        elif name == "DISTANCE" and len(part.expressions) == 4:
+            numbers = _numbers(part, 4)
+            _replace_distance(part, Point(*numbers[:2]), Point(*numbers[2:]))
+        elif name in _MEASURES:
+            shapes = self._shapes_of(part, 2 if name == "DISTANCE" else 1)
+            if name in _OF_POINTS and not all(isinstance(shape, Point) for shape in shapes):
+                raise Refusal(f"{name} takes a POINT", part)
+            if name == "DISTANCE":
+                _replace_distance(part, *shapes)
+            else:
+                part.replace(raw(_MEASURES[name](*shapes)))
+        return name in GEOMETRY
+
+    def _shapes_of(self, part: exp.Anonymous, count: int) -> list[Shape]:
+        name = part.name.upper()
+        check_count(part, count, count)
+        found = [shape_of(argument) for argument in part.expressions]
+        shapes = [shape for shape in found if shape is not None]
+        if len(shapes) < count:
+            raise Refusal(
+                f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, REGION, CENTROID, written "
+                "out as its arguments",
+                part,
+            )
+        self._characters += geometry.characters(shapes)
+        if self._characters > MAX_CHARACTERS:
+            raise Refusal(
+                f"{name} takes too much arithmetic; give polygons fewer corners, or numbers "
+                "instead of columns, and work middles out in a query in parentheses",
+                part,
+            )
+        return shapes
+
+
+def _replace_distance(part: exp.Expr, *places: Shape) -> None:
+    found = raw(geometry.distance(*places))  # type: ignore[arg-type]
+    found.meta[_PLACES] = places
+    part.replace(found)
+
+
+def _point(part: exp.Anonymous) -> Shape:
+    return _in_icrs(part, Point(*_numbers(part, 2)))
+
+
+def _in_icrs(part: exp.Anonymous, shape: Shape) -> Shape:
+    """Return a shape whose coordinates are of the frame that stands before them."""
+    first = part.expressions[0]
+    if not is_text(first) or first.name.upper().split(" ")[0] != "GALACTIC":
+        return shape
+    if isinstance(shape, Zone):
+        raise Refusal("a galactic BOX is less than half a turn wide, and not beyond a pole", part)
+    return geometry.from_galactic(shape)
+
+
+def _centred(part: exp.Anonymous) -> Shape:
+    """Return a circle or a box, whose middle is given as a place or as two numbers."""
+    first, *others = _without_frame(part) or [part]
+    name = part.name.upper()
+    made = _made(name, [*_place_or_number(first), *map(_operand, others)])
+    if made is None or not isinstance(shape_of(first), (Point, type(None))):
+        many = "1 more number" if name == "CIRCLE" else "2 more numbers"
+        raise Refusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
+    # A place that is given as POINT is in ICRS already.
+    return made if shape_of(first) is not None else _in_icrs(part, made)
+
+
+def _polygon(part: exp.Anonymous) -> Shape:
+    arguments = _without_frame(part)
+    shapes = [shape_of(argument) for argument in arguments]
+    if any(shapes) and not all(isinstance(shape, Point) for shape in shapes):
+        raise Refusal("POLYGON takes places or numbers, and not both", part)
+    numbers = [number for argument in arguments for number in _place_or_number(argument)]
+    if len(numbers) % 2:
+        raise Refusal("POLYGON takes pairs of numbers", part)
+    made = _made("POLYGON", numbers)
+    if made is None:
+        raise Refusal(f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part)
+    return made if any(shapes) else _in_icrs(part, made)
+
+
+def _region(part: exp.Anonymous) -> Shape:
+    check_count(part, 1, 1)
+    [argument] = part.expressions
+    words = argument.name.upper().split() if is_text(argument) else []
+    numbers = [number_sql(word) for word in words if _is_number(word)]
+    name, *frame = words[: len(words) - len(numbers)] or [""]
+    is_read = set(frame) <= _FRAME_WORDS and not any(map(_is_number, frame))
+    made = _made("POINT" if name == "POSITION" else name, numbers) if is_read else None
+    if made is None:
+        raise Refusal(
+            "REGION takes a text such as 'CIRCLE ICRS 10.5 -20 0.1', with POSITION, CIRCLE, BOX or "
+            "POLYGON",
+            part,
+        )
+    return geometry.from_galactic(made) if "GALACTIC" in frame else made
+
+
+def _made(name: str, numbers: list[str]) -> Shape | None:
+    """Return the shape that some numbers make; None where it takes another number of them."""
+    if name == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
+        pairs = zip(numbers[::2], numbers[1::2], strict=True)
+        return Polygon(tuple(Point(*pair) for pair in pairs))
+    match name, len(numbers):
+        case "POINT", 2:
+            return Point(*numbers)
+        case "CIRCLE", 3:
+            return Circle(Point(*numbers[:2]), numbers[2])
+        case "BOX", 4:
+            return geometry.box(Point(*numbers[:2]), *numbers[2:])
+    return None
+
+
+def _numbers(part: exp.Anonymous, count: int) -> list[str]:
+    arguments = _without_frame(part)
+    if len(arguments) != count or any(map(shape_of, arguments)):
+        raise Refusal(f"{part.name.upper()} takes {count} numbers, degrees", part)
+    return [_operand(argument) for argument in arguments]
+
+
+def _without_frame(part: exp.Anonymous) -> list[exp.Expr]:
+    """Return the arguments of a shape without the frame that may stand before them."""
+    arguments = list(part.expressions)
+    if arguments and is_text(arguments[0]):
+        frame = arguments.pop(0).name.upper()
+        if frame.split(" ")[0] not in FRAMES:
+            raise Refusal(
+                f"the frame {quoted(frame)} is not known here; use ICRS or GALACTIC", part
+            )
+    if any(is_text(argument) for argument in arguments):
+        raise Refusal(f"{part.name.upper()} takes numbers, degrees", part)
+    return arguments
+
+
+_SHAPES: dict[str, Callable[[exp.Anonymous], Shape]] = {
+    "POINT": _point, "CIRCLE": _centred, "BOX": _centred, "POLYGON": _polygon, "REGION": _region,
+}  # fmt: skip
+
+_CONDITIONS = {"CONTAINS": geometry.contains, "INTERSECTS": geometry.intersects}
+
+_MEASURES: dict[str, Callable[..., str]] = {
+    "DISTANCE": geometry.distance,
+    "AREA": geometry.area,
+    "COORD1": lambda place: f"(({place.lon})::DOUBLE)",
+    "COORD2": lambda place: f"(({place.lat})::DOUBLE)",
+    "COORDSYS": lambda _: "'ICRS'",
+}
+_OF_POINTS = ("DISTANCE", "COORD1", "COORD2")
+
+GEOMETRY = (*_SHAPES, "CENTROID", *_CONDITIONS, *_MEASURES)  # the functions of geometry
+
+
+def _place_or_number(part: exp.Expr) -> tuple[str, ...]:
+    shape = shape_of(part)
+    return (shape.lon, shape.lat) if isinstance(shape, Point) else (_operand(part),)
+
+
+def _operand(part: exp.Expr) -> str:
+    """Return SQL that arithmetic may be written around."""
+    sql = sql_text(part)
+    return sql if isinstance(part, (exp.Column, exp.Var)) else f"({sql})"
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return word[-1].isdigit() or word[-1] == "."

@@ -1,0 +1,167 @@
+"""Simple cone searches: requests, the query that answers them, and what an error looks like.
+
+References
+----------
+Simple Cone Search 1.03, IVOA Recommendation, February 2008.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from starcat.errors import ConfigError, TargetMissing
+from starcat.exchange.columns import described, field_facts
+from starcat.exchange.formats import Format, response_format
+from starcat.query.names import quoted as sql_text
+from starcat.query.names import quoted_name
+from starcat.query.session import Session
+from starcat.query.targets import View
+from starcat_service.protocols.parameters import parameter_error
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SEPARATION = "separation_deg"
+MEDIA_TYPE = "text/xml;content=x-votable"
+"""What errors and, where no format is asked for, answers are sent as."""
+
+NAMES = ("designation", "star_id")  # columns that tell a star from others, the best first
+
+_ID, _RA, _DEC = "ID_MAIN", "POS_EQ_RA_MAIN", "POS_EQ_DEC_MAIN"
+_BESIDE = ("band",)  # columns without a UCD that belong to one that has it
+
+_BRIEF, _USUAL, _ALL = 1, 2, 3
+_RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
+
+
+@dataclass(frozen=True)
+class ConeRequest:
+    """A circle on the sky, and what is wanted of the stars in it."""
+
+    # Its centre, ICRS.
+    ra_deg: float
+    dec_deg: float
+    radius_deg: float  # its radius; 0 asks for the columns only
+    verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
+    maxrec: int | None  # rows at most; None where that is not said
+    form: Format
+    media_type: str  # what it is sent as
+
+
+def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
+    """Check the parameters of a request."""
+    given: dict[str, str] = {}
+    known = {*_RANGES, "VERB", "MAXREC", "RESPONSEFORMAT"}
+    for name, value in parameters:
+        key = name.upper()
+        if key in given:
+            raise ConfigError(f"{key} is given twice; give it once", key=key, value=value)
+        if key in known:
+            given[key] = value
+    ra_deg, dec_deg, radius_deg = (_degrees(given, key) for key in _RANGES)
+    return ConeRequest(
+        ra_deg,
+        dec_deg,
+        radius_deg,
+        _whole(given, "VERB", _USUAL, _BRIEF, _ALL) or _USUAL,
+        _whole(given, "MAXREC", None, 0, None),
+        *_form(given.get("RESPONSEFORMAT", "")),
+    )
+
+
+def star_view(session: Session) -> View:
+    """Return the view of a session that has the stars."""
+    placed = [view for view in session.views if set(view.position) <= set(view.columns)]
+    for view in sorted(placed, key=lambda view: view.name != "stars"):
+        return view
+    raise TargetMissing("there is no table with ra_deg and dec_deg in it to search")
+
+
+def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
+    """Return the SQL of a search."""
+    chosen = [_selected(view, name) for name in _columns(view, asked.verbosity)]
+    place = f"{asked.ra_deg!r}, {asked.dec_deg!r}, {asked.radius_deg!r}"
+    order = ", ".join([SEPARATION, *(quoted_name(n) for n in NAMES if n in view.columns)])
+    limit = maxrec + 1 if asked.radius_deg else 0
+    return (
+        f"SELECT {', '.join([*chosen, SEPARATION])} "
+        f"FROM cone({place}, of := {sql_text(view.name)}) ORDER BY {order} LIMIT {limit}"
+    )
+
+
+def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
+    """Return rows whose columns have the UCDs that the standard asks for."""
+    ra, dec = view.position
+    ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
+    facts = (
+        {**field_facts(field), "ucd": ucds[field.name]} if field.name in ucds else None
+        for field in batches.schema
+    )
+    return described(batches, facts)
+
+
+def _columns(view: View, verbosity: int) -> list[str]:
+    """Return the columns of an answer, of which identity and place come first."""
+    first = [_name_of(view), *(view.position)]
+    known = {column.name: column.ucd for column in view.described}
+    wanted = {
+        _BRIEF: [],
+        _USUAL: [name for name in view.columns if known.get(name) or name in _BESIDE],
+        _ALL: list(view.columns),
+    }[verbosity]
+    # A table that says nothing of its columns has no usual ones.
+    rest = wanted if known or verbosity == _BRIEF else list(view.columns)
+    return [*first, *(name for name in rest if name not in first and name != SEPARATION)]
+
+
+def _name_of(view: View) -> str:
+    """Return the column that tells a star from others: one of `NAMES`, else the first."""
+    return next((name for name in NAMES if name in view.columns), view.columns[0])
+
+
+def _selected(view: View, name: str) -> str:
+    """Return a column as the standard has it: the identity is a text."""
+    column = quoted_name(name)
+    return f"CAST({column} AS VARCHAR) AS {column}" if name == _name_of(view) else column
+
+
+def _degrees(given: Mapping[str, str], key: str) -> float:
+    least, most = _RANGES[key]
+    if key not in given:
+        raise ConfigError(
+            f"{key} is missing; give RA, DEC and SR in decimal degrees, such as "
+            "RA=83.6&DEC=-5.4&SR=1",
+            key=key,
+        )
+    try:
+        value = float(given[key]) if "_" not in given[key] else math.nan
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:
+        told = f"give decimal degrees from {least:g} to {most:g}"
+        raise parameter_error(key, given[key], told)
+    return value
+
+
+def _form(text: str) -> tuple[Format, str]:
+    """Return a format and its media type; by default what readers of all ages know."""
+    if text.strip().lower() in ("", "text/xml"):
+        return response_format("votable/td"), MEDIA_TYPE
+    form = response_format(text)
+    return form, form.tap_type
+
+
+def _whole(
+    given: Mapping[str, str], key: str, usual: int | None, least: int, most: int | None
+) -> int | None:
+    if not given.get(key):
+        return usual
+    text = given[key]
+    is_number = text.isascii() and text.isdigit() and len(text) < 19
+    if not is_number or int(text) < least or (most is not None and int(text) > most):
+        upto = "" if most is None else f" to {most}"
+        raise parameter_error(key, text, f"give a whole number from {least}{upto}")
+    return int(text)

@@ -1,0 +1,188 @@
+"""Tables that come with a query: VOTables of any serialisation to Parquet files.
+
+astropy reads them. Before it does, a pass over the XML refuses what would make it fetch something
+or take more memory than the size of the file explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.errors import ConfigError, quoted
+from starcat.query.names import identifier
+from starcat.storage.parquet import ARROW_DATATYPES
+from starcat_service.protocols.tables import UPLOADS, Column, Table
+
+MAX_COLUMNS = 1000
+
+MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
+LEAST_UNPACKED_BYTES = 64 << 20
+
+_BYTES = {
+    "boolean": 1, "bit": 1, "unsignedByte": 1, "short": 2, "int": 4, "long": 8, "char": 1,
+    "unicodeChar": 4, "float": 4, "double": 8, "floatComplex": 8, "doubleComplex": 16,
+}  # fmt: skip
+
+
+def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
+    """Write an uploaded table as a Parquet file, and describe it in values that JSON has."""
+    _Inspection(Path(path), name).check()
+    table = _parsed(Path(path), name)
+    arrays, columns = [], []
+    for place, field in zip(table.array.dtype.names, table.fields, strict=True):
+        values = _arrow(table.array[place], field.name, name)
+        if field.xtype == "timestamp":
+            values = _times(values)
+        kind = values.type
+        is_list = pa.types.is_list(kind)
+        datatype = ARROW_DATATYPES.get(kind.value_type if is_list else kind, "char")
+        size = "*" if is_list or datatype in ("char", "unicodeChar") else ""
+        arrays.append(values)
+        told = " ".join(str(field.description or "").split())
+        unit = str(field.unit) if field.unit is not None else ""
+        columns.append(
+            Column(field.name, datatype, size, field.xtype or "", unit, field.ucd or "", told)
+        )
+    names = [column.name for column in columns]
+    _check_names(names, name)
+    pq.write_table(pa.table(arrays, names=names), Path(folder) / f"{name}.parquet")
+    told = f"The uploaded table {name}"
+    return asdict(Table(UPLOADS, name, tuple(columns), told, view=identifier(name)))
+
+
+def table_of_facts(facts: dict[str, Any]) -> Table:
+    """Return the table that `upload_facts` described."""
+    columns = tuple(Column(**column) for column in facts["columns"])
+    return Table(**{**facts, "columns": columns, "keys": ()})
+
+
+def _parsed(path: Path, name: str) -> Any:
+    import warnings
+
+    from astropy.io.votable import parse_single_table
+
+    try:
+        with warnings.catch_warnings():
+            # Small faults of other writers are no reason to refuse a table.
+            warnings.simplefilter("ignore")
+            with path.open("rb") as stream:
+                table = parse_single_table(stream, verify="ignore")
+    except Exception as error:  # whatever astropy makes of somebody's file
+        told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise _refusal(name, f"cannot be read as a VOTable ({told})") from error
+    if not table.fields:
+        raise _refusal(name, "has no columns")
+    return table
+
+
+def _arrow(values: Any, field: str, name: str) -> pa.Array:
+    data = np.asarray(values.data if isinstance(values, np.ma.MaskedArray) else values)
+    mask = np.ma.getmaskarray(values)
+    if data.dtype.kind in "SUO" and not _is_list(data):
+        is_null = mask if mask.ndim == 1 else mask.reshape(len(mask), -1).all(axis=1)
+        texts = (None if one is None else _text(one) for one in data)
+        return pa.array(texts, pa.string(), mask=is_null)
+    if data.dtype.kind not in "biufO":
+        raise _refusal(name, f"column {quoted(field)} has values of type {data.dtype}")
+    if data.ndim > 1 or data.dtype.kind == "O":
+        lists = [np.ma.filled(np.ma.asarray(one), 0).ravel() for one in data]
+        item = pa.from_numpy_dtype(lists[0].dtype) if lists else pa.float64()
+        return pa.array([one.tolist() for one in lists], pa.list_(_item(item)))
+    found = pa.array(np.ascontiguousarray(data.astype(data.dtype.newbyteorder("="))), mask=mask)
+    return found.cast(_item(found.type))
+
+
+def _times(values: pa.Array) -> pa.Array:
+    try:
+        return values.cast(pa.timestamp("us"))
+    except pa.ArrowInvalid:
+        return values
+
+
+def _item(kind: pa.DataType) -> pa.DataType:
+    wider = {pa.int8(): pa.int16(), pa.uint16(): pa.int32(), pa.uint32(): pa.int64()}
+    return wider.get(kind, kind)
+
+
+def _is_list(data: Any) -> bool:
+    """Return whether objects are arrays of numbers, and no texts."""
+    return data.dtype.kind == "O" and any(isinstance(one, np.ndarray) for one in data[:100])
+
+
+def _text(value: object) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _check_names(names: list[str], table: str) -> None:
+    lower = [name.lower() for name in names]
+    twice = next((name for name in names if lower.count(name.lower()) > 1), None)
+    if twice is not None:
+        raise _refusal(table, f"has two columns {quoted(twice)} (capitals make no difference)")
+
+
+@dataclass
+class _Inspection:
+    """A pass over the XML of an upload, which takes no more memory than a part of it."""
+
+    path: Path
+    name: str
+    width: int = 0
+    fields: int = 0
+    rows: int = 0
+    stated_rows: int = 0
+
+    def check(self) -> None:
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = self._begin
+        parser.EntityDeclHandler = self._refuse_entity
+        try:
+            with self.path.open("rb") as stream:
+                parser.ParseFile(stream)
+        except expat.ExpatError as error:
+            raise _refusal(self.name, f"is no XML ({error})") from error
+        rows = max(self.rows, self.stated_rows)
+        most = max(LEAST_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
+        if rows * self.width > most:
+            raise _refusal(
+                self.name,
+                f"says {rows:,} rows of {self.width:,} bytes, more than {MAX_UNPACKED} times its "
+                "size; give fields an arraysize that fits",
+            )
+
+    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        tag = tag.rpartition(":")[2]
+        if tag == "TR":
+            self.rows += 1
+        elif tag == "STREAM" and "href" in attributes:
+            raise _refusal(self.name, "has its rows elsewhere (STREAM with href); put them inline")
+        elif tag == "FIELD":
+            self.fields += 1
+            self.width += _width(attributes)
+            if self.fields > MAX_COLUMNS:
+                raise _refusal(self.name, f"has more than {MAX_COLUMNS} columns")
+        elif tag == "TABLE":
+            stated = attributes.get("nrows", "0")
+            self.stated_rows += int(stated) if stated.isascii() and stated.isdigit() else 0
+
+    def _refuse_entity(self, *_: object) -> None:
+        raise _refusal(self.name, "declares an entity; write the text itself")
+
+
+def _width(attributes: dict[str, str]) -> int:
+    """Return how many bytes a cell takes at least."""
+    total = _BYTES.get(attributes.get("datatype", ""), 8)
+    for part in attributes.get("arraysize", "1").rstrip("*").split("x"):
+        if part.isascii() and part.isdigit():
+            total *= max(1, int(part))
+    return total
+
+
+def _refusal(name: str, told: str) -> ConfigError:
+    return ConfigError(f"UPLOAD {name}: the table {told}; send a VOTable", key="UPLOAD")

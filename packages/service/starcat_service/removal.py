@@ -1,0 +1,112 @@
+"""What is removed: databases by people; jobs, results, uploads and sign-ins when they are old.
+
+The signatures of the registry, which end too, are renewed at the same times.
+
+Databases and releases stay until somebody removes them, and so does every file that this module
+has no rule for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import shutil
+import time
+from pathlib import Path
+
+from starcat_service.jobs.job import ENDED, QUERY, State
+from starcat_service.paths import DATABASE_ID, checked
+from starcat_service.problems import Problem
+from starcat_service.security.tokens import DAY_S, SessionStore
+from starcat_service.service import Service
+
+ACTIVE: tuple[State, ...] = ("queued", "running")
+ALL_JOBS = 1 << 31
+
+EVERY_S = 3600.0
+SCRATCH_DAYS = 1.0
+
+_logger = logging.getLogger(__name__)
+
+
+def remove_database(service: Service, database_id: str) -> None:
+    """Remove a database; what was published of it stays in the registry."""
+    database = service.library.database(checked(database_id, DATABASE_ID, "database"))
+    for state in ACTIVE:
+        for job in service.jobs.all(state=state, most=ALL_JOBS):
+            if job.key.startswith(database_id) or database_id in str(job.request):
+                raise Problem(
+                    409,
+                    f"the job {job.id} ({job.title}), which is {job.state}, uses {database.title}; "
+                    "cancel it, or wait until it has ended",
+                )
+    # It is gone in one step; then its files are.
+    gone = service.paths.scratch / f"removed-{secrets.token_hex(8)}"
+    service.paths.database(database_id).rename(gone)
+    service.query_pool.forget(database.folder)
+    shutil.rmtree(gone, ignore_errors=True)
+
+
+def remove_old(service: Service, now_s: float) -> dict[str, int]:
+    """Remove what is older than the settings say, and return how many of each."""
+    settings, paths = service.settings, service.paths
+    removed = {
+        "jobs": _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
+        "results": _remove_entries(paths.results, now_s - settings.keep_results_days * DAY_S),
+        "scratch": _remove_entries(paths.scratch, now_s - SCRATCH_DAYS * DAY_S),
+        "sessions": SessionStore(service.records, settings.session_hours).forget_expired(),
+    }
+    if any(removed.values()):
+        _logger.info("removed what is old", extra={"facts": {"removed": removed}})
+    return removed
+
+
+async def keep_removing(service: Service) -> None:
+    """Remove what is old now and every hour, until it is cancelled."""
+    while True:
+        try:
+            await asyncio.to_thread(remove_old, service, time.time())
+        except Exception:
+            _logger.exception("what is old could not be removed")
+        try:
+            await asyncio.to_thread(_renew_signatures, service)
+        except Exception:
+            _logger.exception("the signatures of the registry could not be renewed")
+        await asyncio.sleep(EVERY_S)
+
+
+def _renew_signatures(service: Service) -> None:
+    """Renew what the registry is signed with, in good time."""
+    key = service.settings.signing_key
+    if key is not None:
+        from starcat.releases.metadata import signing_with
+        from starcat.releases.signing import renew_if_old
+
+        if renew_if_old(service.paths.registry, signing_with([key])):
+            _logger.info("renewed the signatures of the registry")
+
+
+def _remove_jobs(service: Service, before_s: float) -> int:
+    marks = ", ".join("?" for _ in ENDED)
+    with service.records.writing() as connection:
+        rows = connection.execute(
+            f"DELETE FROM jobs WHERE state IN ({marks}) AND ended_s < ? AND kind != ? RETURNING id",
+            (*ENDED, before_s, QUERY),
+        ).fetchall()
+    for row in rows:
+        shutil.rmtree(service.paths.job(row["id"]), ignore_errors=True)
+    return len(rows)
+
+
+def _remove_entries(folder: Path, before_s: float) -> int:
+    removed = 0
+    for path in folder.iterdir():
+        if path.lstat().st_mtime >= before_s:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        removed += 1
+    return removed

@@ -1,0 +1,249 @@
+"""Processes that are kept for the next request, and query sessions in them."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as OutOfTime
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Generic, ParamSpec, Protocol, TypeVar
+
+from starcat.errors import QueryError, QueryLimitError
+from starcat.query.engine import Allowance, warm_up
+from starcat.query.session import Limits, Session, open_session
+from starcat_service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
+from starcat_service.settings import Settings
+
+IDLE = 2 * SHORT_PLACES
+"""Query sessions that are kept while nobody asks; those used longest ago are closed first. SQL and
+TAP have different ones of the same database, and each may want all places for a moment."""
+
+SPARE = 2
+"""Processes that are started before it is known what they are to open, which takes less time."""
+
+BACK_S = 0.2
+"""Seconds in which a process that others use may come back, before another is started."""
+
+BEGINNING = 2
+"""Processes with the same key that are started at the same time."""
+
+DISK_GB = 4.0
+"""Gigabytes of disk that a query may take for what does not fit into its memory."""
+
+GIB_IN_GB = 2**30 / 1e9
+
+P = ParamSpec("P")
+T = TypeVar("T")
+K = TypeVar("K")
+
+
+class Process(Protocol):
+    """What a `Pool` lends."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it can be lent again."""
+
+
+ProcessT = TypeVar("ProcessT", bound=Process)
+
+
+Lent = tuple[K, ProcessT, ExitStack]
+"""A process with its key, and what closes it."""
+
+
+class Pool(Generic[K, ProcessT]):
+    """Processes that are kept for the next request with the same key.
+
+    One that an error was raised with is closed, unless the error is one of ``harmless``; the
+    processes that were used longest ago are closed where more than ``most_idle`` are idle.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[K], AbstractContextManager[ProcessT]],
+        most_idle: int,
+        harmless: tuple[type[Exception], ...] = (),
+    ) -> None:
+        self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
+        self._idle: list[Lent[K, ProcessT]] = []
+        self._lent: list[Lent[K, ProcessT]] = []
+        self._wanted: list[tuple[K, Future[Lent[K, ProcessT]]]] = []
+        self._beginning: list[K] = []  # keys of the processes that are being started
+        self._lock = threading.Lock()
+        self._is_closed = False
+        weakref.finalize(self, _close, self._idle)
+
+    @contextmanager
+    def lend(self, key: K) -> Iterator[ProcessT]:
+        """Give a process that nobody else uses meanwhile."""
+        lent = self._obtained(key)
+        is_reusable = False
+        try:
+            yield lent[1]
+            is_reusable = True
+        except self._harmless:
+            is_reusable = True
+            raise
+        finally:
+            with self._lock:
+                self._lent.remove(lent)
+            self._give_back(lent, is_reusable and lent[1].is_running)
+
+    def forget(self, is_gone: Callable[[K], bool]) -> None:
+        """Close the idle processes whose key fits."""
+        with self._lock:
+            gone = [one for one in self._idle if is_gone(one[0])]
+            self._idle[:] = [one for one in self._idle if one not in gone]
+        _close(gone)
+
+    def close(self) -> None:
+        """Close all processes; whoever uses one finds that it has ended."""
+        with self._lock:
+            self._is_closed = True
+            lent = list(self._lent)
+        self.forget(lambda _: True)
+        _close(lent)
+
+    def _obtained(self, key: K) -> Lent[K, ProcessT]:
+        """Return the process that is free first: one that others give back, or a new one."""
+        with self._lock:
+            found = self._idle_one(key)
+            if found is not None:
+                self._lent.append(found)
+                return found
+            waiting: Future[Lent[K, ProcessT]] = Future()
+            self._wanted.append((key, waiting))
+            is_used = key in self._beginning or any(one[0] == key for one in self._lent)
+        with suppress(OutOfTime):
+            return waiting.result(BACK_S if is_used else 0.0)
+        with self._lock:
+            self._begin_wanted(key)
+        return waiting.result()
+
+    def _begin_wanted(self, key: K) -> None:
+        wanted = sum(one == key for one, _ in self._wanted)
+        if self._beginning.count(key) < min(wanted, BEGINNING):
+            self._beginning.append(key)
+            threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+
+    def _begin_one(self, key: K) -> None:
+        made: Lent[K, ProcessT] | BaseException
+        try:
+            with ExitStack() as closing:
+                made = key, closing.enter_context(self._begin(key)), closing.pop_all()
+        except BaseException as error:
+            made = error
+        with self._lock:
+            self._beginning.remove(key)
+            if isinstance(made, BaseException):
+                waiting = self._next_wanted(key)
+                if waiting is not None:
+                    waiting.set_exception(made)
+        if not isinstance(made, BaseException):
+            self._give_back(made, True)
+        with self._lock:
+            self._begin_wanted(key)
+
+    def _next_wanted(self, key: K) -> Future[Lent[K, ProcessT]] | None:
+        for number, (one, waiting) in enumerate(self._wanted):
+            if one == key:
+                del self._wanted[number]
+                return waiting
+        return None
+
+    def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
+        for number in range(len(self._idle) - 1, -1, -1):
+            if self._idle[number][0] == key:
+                found = self._idle.pop(number)
+                if found[1].is_running:
+                    return found
+                _close([found])
+        return None
+
+    def _give_back(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
+        gone = [] if is_reusable else [lent]
+        with self._lock:
+            waiting = self._next_wanted(lent[0]) if is_reusable else None
+            if waiting is not None:
+                self._lent.append(lent)
+                waiting.set_result(lent)
+            elif is_reusable:
+                self._idle.append(lent)
+            while len(self._idle) > (0 if self._is_closed else self._most_idle):
+                gone.append(self._idle.pop(0))
+        _close(gone)
+
+
+def _close(idle: list[Lent[K, ProcessT]]) -> None:
+    while idle:
+        idle.pop()[-1].close()
+
+
+Key = tuple[tuple[str, int, int], ...]  # path, inode and time of each target
+
+
+class QueryPool:
+    """Query sessions, which are kept for the next query about the same targets.
+
+    Each is a process of its own with the guard of `starcat.query`; `run` calls what uses `session`
+    in a thread, when there is a place for it.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        memory_gb = settings.query_memory_gib * GIB_IN_GB
+        self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
+        self._lanes = Lanes(SHORT_PLACES, settings.queries)
+        # What was interrupted is lent again: a process that has not heard in time is gone.
+        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError, Overdue))
+        self.close = self._open.close
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that only reads: where it takes long, it may be called again."""
+        return await self._lanes.run(self._limits.time_s, function, *args, **kwargs)
+
+    @contextmanager
+    def session(
+        self, targets: Sequence[str | Path], time_s: float | None = None
+    ) -> Iterator[Session]:
+        """Give a session about some targets, which nobody else uses meanwhile.
+
+        All that it is asked has one time together.
+        """
+        limits = replace(self._limits, time_s=time_s or self._limits.time_s)
+        place = lease.get()
+        with (
+            nullcontext() if place is None else place.used(),
+            self._open.lend(tuple(map(_identity, targets))) as one,
+        ):
+            time_of = Allowance if place is None else place.allowance
+            try:
+                yield replace(one, limits=limits, allowance=time_of(limits.time_s))
+            except QueryLimitError as error:
+                if place is not None and place.is_overdue:
+                    raise Overdue from error
+                raise
+
+    def forget(self, target: str | Path) -> None:
+        """Close the sessions about a target that is to be removed and that nobody uses."""
+        name = str(target)
+        self._open.forget(lambda key: name in [text for text, *_ in key])
+
+    @contextmanager
+    def _begin(self, key: Key) -> Iterator[Session]:
+        with open_session([text for text, *_ in key], self._limits) as session:
+            warm_up(SPARE)
+            yield session
+
+
+def _identity(target: str | Path) -> tuple[str, int, int]:
+    """Return what tells a target from another that takes its place."""
+    try:
+        found = Path(target).stat()
+    except OSError:
+        return str(target), 0, 0
+    return str(target), found.st_ino, found.st_mtime_ns

@@ -1,0 +1,224 @@
+"""How much of a request is taken: its size, its shape, its body, and how often it is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import shutil
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import unquote_to_bytes
+
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
+from starlette.types import Message, Receive, Scope
+
+from starcat_service.problems import Problem
+from starcat_service.settings import Settings
+
+MOST_HEADERS, MOST_HEADER_BYTES, MOST_TARGET_BYTES = 100, 32_768, 16_384
+
+CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+UPWARDS = re.compile(r"(^|[/\\])\.{1,2}($|[/\\])")
+METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
+
+TEXT_MIB = 1.0
+"""Size of a form or of JSON at most: whoever sends more has a file, and may upload that."""
+
+TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
+MIB, GIB = 2**20, 2**30
+
+LEAST_FREE_GIB = 0.01
+"""Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
+
+FILLING = ("/tap/async",)
+"""Where a POST makes something that stays on the disk; jobs see to their room themselves."""
+
+CONNECTIONS = 1_000
+"""Connections at the same time; of more, the server says that it is busy."""
+
+OWN_CONNECTIONS = CONNECTIONS // 5
+"""Connections of one address, and requests of one user, at the same time."""
+
+MOST_BUCKETS = 10_000
+"""Keys that are remembered; of more, those that were quiet for longest are forgotten."""
+
+
+class Buckets:
+    """A bucket for each key: full at first, emptied by one each time, filled again steadily."""
+
+    def __init__(self, per_minute: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._per_s = per_minute / 60.0
+        self._size = per_minute
+        self._clock = clock
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def take(self, key: str) -> float:
+        """Take one out of the bucket of a key."""
+        now_s = self._clock()
+        left, then_s = self._left.pop(key, (self._size, now_s))
+        left = min(self._size, left + (now_s - then_s) * self._per_s)
+        wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
+        self._left[key] = (left if wait_s else left - 1.0), now_s
+        if len(self._left) > MOST_BUCKETS:
+            self._left.popitem(last=False)
+        return wait_s
+
+
+class Shares:
+    """How many requests of each user are answered at the same time, and how many may be."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._running: Counter[str] = Counter()
+
+    @contextmanager
+    def one(self, who: str) -> Iterator[None]:
+        """Count a request while it is answered; a `Problem` where there are too many."""
+        if self._running[who] >= self._most:
+            raise Problem(
+                429,
+                f"{self._most} of your requests are being answered; ask again when some are",
+                headers=later(1.0),
+            )
+        self._running[who] += 1
+        try:
+            yield
+        finally:
+            self._running[who] -= 1
+            if not self._running[who]:
+                del self._running[who]
+
+
+def later(wait_s: float) -> Mapping[str, str]:
+    """Return the header that says after how many seconds to ask again, at least one."""
+    return {"Retry-After": str(max(1, math.ceil(wait_s)))}
+
+
+def address_of(scope: Scope) -> str:
+    """Return the address that a request came from, as far as the server knows it."""
+    client = HTTPConnection(scope).client
+    return client.host if client is not None else "unknown"
+
+
+def check_shape(scope: Scope) -> None:
+    """Refuse requests that are too long, hold control characters, or climb out of folders."""
+    headers: list[tuple[bytes, bytes]] = scope["headers"]
+    path, query = scope["path"], scope["query_string"]
+    if scope["method"] not in METHODS:
+        allowed = ", ".join(METHODS)
+        raise Problem(
+            405, f"the method is none of {allowed}; use one of them", headers={"Allow": allowed}
+        )
+    if len(scope.get("raw_path") or b"") + len(query) > MOST_TARGET_BYTES:
+        raise Problem(
+            414, f"the address has more than {MOST_TARGET_BYTES:,} bytes; send a long query by POST"
+        )
+    size = sum(len(name) + len(value) for name, value in headers)
+    if len(headers) > MOST_HEADERS or size > MOST_HEADER_BYTES:
+        raise Problem(
+            431,
+            f"the request has {len(headers)} headers of {size:,} bytes; at most {MOST_HEADERS} of "
+            f"{MOST_HEADER_BYTES:,} bytes together are taken",
+        )
+    if CONTROL.search(path) or UPWARDS.search(path) or "\\" in path:
+        raise Problem(
+            400, "the path holds '.', '..', a backslash or a control character; send a plain one"
+        )
+    if b"\x00" in unquote_to_bytes(query) or _is_doubtful(value for _, value in headers):
+        raise Problem(
+            400, "the query or a header holds a character that none may hold; leave it out"
+        )
+
+
+def _is_doubtful(values: Iterable[bytes]) -> bool:
+    return any(b"\x00" in value or b"\n" in value or b"\r" in value for value in values)
+
+
+class BodyLimits:
+    """How large a body may be, in what time it has to come, and that the disk has room for it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+
+    def limited(self, scope: Scope, receive: Receive) -> Receive:
+        """Return a function that receives a body as far as it may go."""
+        if scope["method"] in ("GET", "HEAD", "OPTIONS"):
+            return receive
+        headers = Headers(scope=scope)
+        kind = headers.get("content-type", "").strip().lower()
+        most_mib = self.settings.upload_mib
+        most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
+        length = headers.get("content-length")
+        if length is not None and not (length.isascii() and length.isdigit()):
+            raise Problem(400, "the header Content-Length is no number")
+        if length is not None and int(length) > most:
+            raise Problem(413, too_large(most))
+        fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
+        if fills and scope["method"] != "DELETE":
+            check_disk(self.settings)
+        return _limited(receive, most, self.settings.upload_time_s)
+
+
+def check_disk(settings: Settings) -> None:
+    """Refuse what would add to a disk that is nearly full."""
+    short = disk_shortage(settings)
+    if short is not None:
+        raise Problem(507, short)
+
+
+def disk_shortage(settings: Settings) -> str | None:
+    """Return what to say where the disk is nearly full."""
+    free, least = free_gib(settings.root), max(settings.free_gib, LEAST_FREE_GIB)
+    if free >= least:
+        return None
+    return (
+        f"the disk of the service has {free:.2f} GiB free, and {least:g} have to be left "
+        "(free_gib); remove unused databases or results, or ask the operator"
+    )
+
+
+def free_gib(folder: Path) -> float:
+    """Return the room that is left on the disk of a folder, GiB."""
+    return shutil.disk_usage(folder).free / GIB
+
+
+def too_large(most: int) -> str:
+    """Return what is said of a body with more bytes than it may have."""
+    return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
+
+
+def _limited(receive: Receive, most: int, time_s: float) -> Receive:
+    """Return a function that receives what another does, so much and so long at most.
+
+    What it raises reaches the client as any other refusal of a handler does.
+    """
+    got, is_whole, until_s = 0, False, asyncio.get_running_loop().time() + time_s
+
+    async def receive_limited() -> Message:
+        nonlocal got, is_whole
+        if is_whole:  # nothing more comes but the end of the connection, whenever that is
+            return await receive()
+        try:
+            async with asyncio.timeout_at(until_s):
+                message = await receive()
+        except TimeoutError:
+            raise HTTPException(
+                408,
+                f"the body took more than {time_s:g} s to arrive; send less, or on a faster line",
+                {"Connection": "close"},
+            ) from None
+        if message["type"] != "http.request":
+            return message
+        got += len(message.get("body", b""))
+        is_whole = not message.get("more_body", False)
+        if got > most:
+            raise HTTPException(413, too_large(most), {"Connection": "close"})
+        return message
+
+    return receive_limited

@@ -1,0 +1,250 @@
+"""The web server: one for each root."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from starcat.errors import ConfigError, OutputError, reason
+from starcat.storage.atomic import make_folder
+from starcat.storage.locks import locked
+from starcat_service.access import network_of
+from starcat_service.app import make_app
+from starcat_service.jobs.slots import JobSlots
+from starcat_service.paths import ServicePaths
+from starcat_service.security.middleware import log_settings
+from starcat_service.security.request_limits import (
+    CONNECTIONS,
+    MOST_HEADER_BYTES,
+    MOST_TARGET_BYTES,
+    OWN_CONNECTIONS,
+)
+from starcat_service.security.tokens import TokenStore
+from starcat_service.service import Service
+from starcat_service.settings import Role, Settings
+
+SWITCH_S = 0.001
+"""Seconds until a thread that works lets others in, five times less than usual: the event loop is
+one of them, and each request waits for it several times."""
+
+FIRST = "operator"
+"""Name of the token that the first start makes."""
+
+Announce = Callable[[str], None]
+"""Takes the address that people open, when the server listens."""
+
+
+TOO_MANY = (
+    b"HTTP/1.1 429 Too Many Requests\r\nConnection: close\r\nRetry-After: 1\r\n"
+    b"Content-Type: text/plain\r\nContent-Length: 46\r\n\r\n"
+    b"too many connections of this address; use less"
+)
+
+HEAD_S = 15.0
+"""Seconds in which the head of a request has to be there, and what is left of the one before."""
+
+
+class OurProtocol(H11Protocol):
+    """The protocol of the server, with an end to its patience between requests.
+
+    While a request is answered its handler decides how long that takes; `BodyLimits` sees to the
+    time of what it reads. An address has a share of the connections; behind a proxy all have that
+    of the proxy, and what is counted there are requests (`Shares`).
+    """
+
+    _waiting: asyncio.TimerHandle | None = None
+    _network = ""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        self._network = network_of(self.client[0]) if self.client else ""
+        others = (one for one in self.connections if isinstance(one, OurProtocol))
+        own = sum(one._network == self._network for one in others)
+        if own > OWN_CONNECTIONS and not self.config.proxy_headers:
+            transport.write(TOO_MANY)
+            transport.close()
+            return
+        self._watch()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what has come."""
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no longer."""
+        self._forget()
+        super().connection_lost(exc)
+
+    def _watch(self) -> None:
+        if self._is_answering():
+            self._forget()
+        elif self._waiting is None:
+            self._waiting = self.loop.call_later(HEAD_S, self._lose)
+
+    def _is_answering(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _forget(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+
+    def _lose(self) -> None:
+        self._waiting = None
+        if not self._is_answering() and not self.transport.is_closing():
+            self.transport.close()
+
+
+def run_server(settings: Settings, announce: Announce) -> None:
+    """Serve until a signal ends it."""
+    paths = ServicePaths(settings.root)
+    if not settings.is_private and not paths.records.exists():
+        raise _without_token(settings)  # before anything is made
+    with _only_server(paths):
+        shutil.rmtree(paths.scratch, ignore_errors=True)
+        _serve(settings, announce)
+
+
+@contextmanager
+def _only_server(paths: ServicePaths) -> Iterator[None]:
+    with ExitStack() as stack:
+        try:
+            make_folder(paths.root)
+            stack.enter_context(locked(paths.lock, wait=False))
+        except BlockingIOError:
+            raise ConfigError(
+                f"another server runs with --root {paths.root}; stop it, or choose another root",
+                key="root",
+                value=str(paths.root),
+            ) from None
+        except OSError as error:
+            raise OutputError(
+                f"{paths.root}: cannot be used ({reason(error)}); choose another --root",
+                path=paths.root,
+            ) from error
+        yield
+
+
+def _serve(settings: Settings, announce: Announce) -> None:
+    sys.setswitchinterval(SWITCH_S)
+    app = make_app(settings)
+    _see_to_tokens(app.state.identities.tokens, settings)
+    listening = listen(settings)
+    config = uvicorn.Config(
+        app,
+        http=OurProtocol,
+        log_config=log_settings(),
+        access_log=False,
+        server_header=False,
+        proxy_headers=settings.public_url is not None,
+        limit_concurrency=CONNECTIONS,
+        h11_max_incomplete_event_size=MOST_HEADER_BYTES + MOST_TARGET_BYTES,
+        timeout_graceful_shutdown=round(settings.shutdown_s),
+    )
+    with _signals_end_nothing_else():
+        _Server(config, app, announce).run([listening])
+
+
+class _Server(uvicorn.Server):
+    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
+        super().__init__(config)
+        self._service: Service = app.state.service
+        self._slots: JobSlots = app.state.slots
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
+        await super().startup(sockets)
+        if self.started and sockets:
+            self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop: streams of events end at once, requests and jobs within the time that they have."""
+        self._service.stopping.set()
+        self._slots.begin_stop()
+        await super().shutdown(sockets)
+
+
+def _address(settings: Settings, port: int) -> str:
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"{(settings.public_url or f'http://{host}:{port}').rstrip('/')}/"
+
+
+def listen(settings: Settings) -> socket.socket:
+    """Return the socket that the server listens at."""
+    try:
+        [(family, _, _, _, address), *_] = socket.getaddrinfo(
+            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        listening = socket.create_server(address[:2], family=family, backlog=2048)
+        # asyncio sets it only for sockets that name their protocol, as this one does not. Without
+        # it, the end of a short answer waits 40 ms for the acknowledgement of its head.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot listen at {settings.host}, port {settings.port}: {reason(error)}; choose "
+            "another with --host and --port, or end what uses it",
+            key="port",
+            value=settings.port,
+        ) from error
+    return listening
+
+
+@contextmanager
+def _signals_end_nothing_else() -> Iterator[None]:
+    """See that a signal that has ended the server in good order is not an error of the command."""
+    known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in known:
+            signal.signal(number, lambda number, frame: None)
+        yield
+    finally:
+        for number, handler in known.items():
+            signal.signal(number, handler)
+
+
+def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
+    """See that somebody can do more than read: make the first token, or say how."""
+    if tokens.has_valid():
+        return
+    if not settings.is_private:
+        raise _without_token(settings)
+    if settings.anonymous_role >= Role.PUBLISHER:
+        return
+    if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
+        how = _how_to_make_one(settings)
+        _say(f"no token exists yet, so nobody can build or publish; create one: {how}")
+        return
+    _, text = tokens.create(FIRST, Role.PUBLISHER)
+    _say(f"the first token, shown once: {text}\nuse it to sign in on the page, or with curl")
+
+
+def _without_token(settings: Settings) -> ConfigError:
+    return ConfigError(
+        f"others are to reach {settings.public_url or settings.host}, and no token exists; "
+        f"make one first: {_how_to_make_one(settings)}",
+        key="host",
+        value=settings.host,
+    )
+
+
+def _how_to_make_one(settings: Settings) -> str:
+    return f"starcat token create NAME --role publisher --root {settings.root}"
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()

@@ -1,0 +1,65 @@
+"""The one object that handlers reach everything through."""
+
+from __future__ import annotations
+
+import threading
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from starcat_service.catalogs import Catalogs
+from starcat_service.jobs.job import JobStore
+from starcat_service.library import Library
+from starcat_service.paths import ServicePaths
+from starcat_service.records import Records
+from starcat_service.sandbox.pool import QueryPool
+from starcat_service.sandbox.sandbox import Sandbox
+from starcat_service.settings import Settings
+from starcat_service.vo.tap_jobs import QueryJobs
+from starcat_service.vo.tap_queries import Tap
+
+GIB = 2**30
+
+
+class Service:
+    """A running service: its folders and records, and what works with them."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.paths = ServicePaths(settings.root)
+        self.paths.make()
+        self.records = Records(self.paths.records)
+        self.library = Library(self.paths)
+        self.jobs = JobStore(self.records)
+        self.job_queued = threading.Condition()  # notified when a job waits
+        self.query_pool = QueryPool(settings)
+        self.sandbox = Sandbox(settings, self.paths.scratch)
+        self.tap = Tap(settings, self.paths, self.library, self.query_pool, self.sandbox)
+        self.query_jobs = QueryJobs(self.records, self.paths, self.tap, self.wake_slots)
+        self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
+        self.stopping = threading.Event()
+
+    def wake_slots(self) -> None:
+        """Have an idle slot look for jobs now."""
+        with self.job_queued:
+            self.job_queued.notify_all()
+
+    def close(self) -> None:
+        """Close sessions, processes and records."""
+        self.catalogs.close()
+        self.query_pool.close()
+        self.sandbox.close()
+        self.records.close()
+
+
+def service_of(request: Request) -> Service:
+    """Return the service that a request came to."""
+    service: Service = request.app.state.service
+    return service
+
+
+async def _service_of(request: Request) -> Service:
+    return service_of(request)  # in the event loop: FastAPI sends plain functions to a thread
+
+
+TheService = Annotated[Service, Depends(_service_of)]

@@ -1,0 +1,243 @@
+"""Files that come and go: uploads in scratch folders, files and ranges of them, tar archives.
+
+Starlette sends the bytes. What a request asks for is decided here: a range that cannot be
+understood, or several at once, is the whole file, as RFC 9110 has it.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+import shutil
+import tarfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import IO, TYPE_CHECKING, Any
+
+from fastapi import Request
+from fastapi.responses import FileResponse, Response
+from starlette.datastructures import MutableHeaders
+
+from starcat.errors import QueryLimitError, TargetMissing
+from starcat.exchange.columns import FirstRows
+from starcat.exchange.formats import FILE_FORMATS, FORMATS
+from starcat.releases.tree import Blob
+from starcat_service.paths import ServicePaths
+from starcat_service.problems import Problem, refusals
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+IMMUTABLE = "private, max-age=31536000, immutable"
+"""What lies under its digest never changes."""
+
+REVALIDATED = "private, no-cache"
+"""What may change is asked for anew each time, and not sent again where it did not."""
+
+SMALL_BYTES = 1 << 20
+"""Files that are sent as a whole, and not bit by bit."""
+
+TYPES = {
+    **{FORMATS[name].suffix: FORMATS[name].media_type for name in FILE_FORMATS},
+    ".h5": "application/x-hdf5",
+    ".html": "text/html; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".toml": "application/toml",
+}
+"""Content types by suffix; all else are bytes."""
+
+BYTES = "application/octet-stream"
+
+CHUNK_BYTES = 1 << 18
+
+MAX_BYTES = 4 << 30
+"""Size of a result that is held on disk until it is sent."""
+
+CONTENTS: dict[str, dict[str, object]] = {
+    kind: {} for kind in sorted({BYTES, *(kind.partition(";")[0] for kind in TYPES.values())})
+}
+"""All of them, as OpenAPI has them."""
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": CONTENTS, "description": "The file."},
+    206: {"content": CONTENTS, "description": "The range that was asked for."},
+    304: {"description": "The same as you have (``If-None-Match``)."},
+    **refusals({416: "The range lies outside of the file."}),
+}
+"""For ``responses=`` of what answers with files."""
+
+_RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
+
+
+def file_answer(
+    request: Request,
+    path: Path,
+    sha256: str,
+    *,
+    file_name: str,
+    cache: str = IMMUTABLE,
+    content_type: str | None = None,
+) -> Response:
+    """Answer with a file."""
+    try:
+        found = path.stat()
+    except OSError:
+        raise TargetMissing(f"{file_name} is not there any more; look at the list again") from None
+    headers = {"ETag": f'"{sha256}"', "Cache-Control": cache}
+    if has_already(request, sha256):
+        return Response(status_code=304, headers=headers)
+    kind = content_type or type_of(file_name)
+    answer = FileResponse(
+        path, headers=headers, media_type=kind, filename=file_name, stat_result=found
+    )
+    part = _part(request, found.st_size, answer.headers)
+    if part is None:  # Starlette is not to send one either
+        del MutableHeaders(scope=request.scope)["range"]
+    if request.method == "HEAD" or found.st_size > SMALL_BYTES:
+        return answer
+    return _at_once(path.read_bytes(), part, dict(answer.headers))
+
+
+def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, str]) -> Response:
+    """Answer with a small file: to open, read and close it in other threads takes longer."""
+    status = 200
+    if part is not None:
+        status, (start, end) = 206, part
+        headers["content-range"] = f"bytes {start}-{end - 1}/{len(content)}"
+        content = content[start:end]
+    del headers["content-length"]
+    return Response(content, status_code=status, headers=headers)
+
+
+def has_already(request: Request, sha256: str) -> bool:
+    """Return whether who asks has the same content already."""
+    given = request.headers.get("if-none-match", "")
+    tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
+    return "*" in tags or f'"{sha256}"' in tags
+
+
+def body_type(request: Request) -> str:
+    """Return the content type of a request's body without parameters; empty if not given."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def type_of(file_name: str) -> str:
+    """Return the content type of a file.
+
+    Examples
+    --------
+    >>> type_of("stars.parquet")
+    'application/vnd.apache.parquet'
+    """
+    return TYPES.get(PurePosixPath(file_name).suffix.lower(), BYTES)
+
+
+def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
+    """Return which bytes are to be sent, if not all; refuse what lies outside of the file."""
+    found = _RANGE.fullmatch(request.headers.get("range", ""))
+    if request.method != "GET" or found is None or found[1] == found[2] == "":
+        return None
+    known = request.headers.get("if-range")
+    if known is not None and known not in (headers["etag"], headers["last-modified"]):
+        return None
+    start = int(found[1]) if found[1] else max(size - int(found[2]), 0)
+    end = min(int(found[2]) + 1, size) if found[1] and found[2] else size
+    if found[1] and found[2] and int(found[2]) < start:
+        return None
+    if start >= size:
+        raise Problem(
+            416,
+            f"the range begins at byte {start:,}, and the file has {size:,}; ask for less",
+            headers={"Content-Range": f"bytes */{size}"},
+        )
+    return start, end
+
+
+def archive_bytes(folder: str, files: Mapping[str, Blob]) -> int:
+    """Return the size of an archive."""
+    parts = (len(_head(folder, name, blob)) + _whole(blob.bytes) for name, blob in files.items())
+    return sum(parts) + 2 * tarfile.BLOCKSIZE
+
+
+def archive_chunks(folder: Path, files: Mapping[str, Blob]) -> Iterator[bytes]:
+    """Give the bytes of an archive, the same for the same files."""
+    for name, blob in files.items():
+        yield _head(folder.name, name, blob)
+        left = blob.bytes
+        with (folder / name).open("rb") as file:
+            while left:
+                chunk = file.read(min(left, CHUNK_BYTES))
+                if not chunk:
+                    raise OSError(f"{name}: {left} bytes are missing")
+                left -= len(chunk)
+                yield chunk
+        yield bytes(_whole(blob.bytes) - blob.bytes)
+    yield bytes(2 * tarfile.BLOCKSIZE)
+
+
+def _head(folder: str, name: str, blob: Blob) -> bytes:
+    facts = tarfile.TarInfo(f"{folder}/{name}")
+    facts.size = blob.bytes
+    return facts.tobuf(tarfile.PAX_FORMAT)
+
+
+def _whole(size: int) -> int:
+    """Return a size in whole blocks."""
+    return -(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+
+
+_UNUSUAL = re.compile(r"[^A-Za-z0-9_-]+", re.ASCII)
+
+
+@contextmanager
+def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
+    """Give a new folder, which is removed afterwards."""
+    folder = paths.scratch / secrets.token_hex(16)
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str:
+    """Return a file name that an upload may be kept under.
+
+    Examples
+    --------
+    >>> safe_name("../../a b.PNG", (".png",), "frame"), safe_name("x.exe", (".png",), "frame")
+    ('a_b.png', 'x_exe')
+    >>> safe_name("....", (".png",), "frame")
+    'frame'
+    """
+    name = (given or "").replace("\\", "/").rpartition("/")[2]
+    suffix = PurePosixPath(name).suffix.lower()
+    known = suffix if suffix in suffixes else ""
+    stem = name[: -len(known)] if known else name
+    return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + known
+
+
+def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:
+    """Write the first rows as an Arrow stream; return their number, and whether there are more."""
+    import pyarrow as pa
+
+    count = size = 0
+    first = FirstRows(batches, most)
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, batches.schema) as stream:
+        for part in first:
+            stream.write_batch(part)
+            count, size = count + part.num_rows, size + part.nbytes
+            if size > MAX_BYTES and not first.were_more:
+                raise QueryLimitError(
+                    f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
+                )
+    return count, first.were_more
+
+
+def chunks_of(file: IO[bytes]) -> Iterator[bytes]:
+    """Give the rest of an open file, and close it."""
+    with file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk

@@ -1,0 +1,377 @@
+"""TAP: queries that are answered at once, and what the service tells of itself.
+
+What its handlers share is here too: parameters of a request wherever they stand, and errors as
+VOTable.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import AsyncIterator, Generator, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import chain
+from pathlib import Path
+from tempfile import SpooledTemporaryFile
+from typing import Annotated, Any, Literal
+
+from anyio import CancelScope, to_thread
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
+from starlette.types import Receive, Scope, Send
+
+from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
+from starcat.query.engine import CLOCK_TIMES
+from starcat_service.access import Reader
+from starcat_service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
+from starcat_service.protocols.documents import (
+    MEDIA_TYPE,
+    VOTABLE_TYPE,
+    availability,
+    capabilities,
+    error_votable,
+    examples_page,
+    for_tap_plus,
+    table_document,
+    tableset,
+)
+from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, Question, question
+from starcat_service.sandbox.places import SHORT_S, Lease, Overdue, lease
+from starcat_service.service import Service, TheService, service_of
+from starcat_service.transfers import body_type, scratch_folder
+
+PREFIX = "/tap"
+
+MAX_PARAMETERS = 100
+MAX_PARAMETER_BYTES = 1 << 20
+
+READ_BYTES = 1 << 18
+
+HELD_BYTES = 4 << 20
+"""What an answer may take of the memory; a larger one is held in a file without a name."""
+
+LOOK_S = 1.0
+"""How often a reader that waits looks whether the answer has ended."""
+
+TICK_S = 0.02
+"""How often it is looked whether an answer has got a place where it may take long."""
+
+TAP_PLUS = ("tables", "only_tables", "share_accessible")
+"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+
+_STARTED = datetime.now(UTC)
+
+_FORMS = ("application/x-www-form-urlencoded", "multipart/form-data")
+
+_PARAMETERS: tuple[tuple[str, str, object, str], ...] = (
+    ("QUERY", "string", "SELECT TOP 5 * FROM tap_schema.tables", "The query, in ADQL 2.1."),
+    ("LANG", "string", "ADQL", "ADQL, ADQL-2.0 or ADQL-2.1."),
+    ("RESPONSEFORMAT", "string", "csv", "A format of the capabilities; VOTable by default."),
+    ("MAXREC", "integer", 1000, "Rows at most; VOTable says where there were more."),
+    ("RUNID", "string", "mine", "What the client calls it."),
+    ("UPLOAD", "string", "mine,param:file1", "Tables that come along, as parts of the form."),
+)
+
+FORM: dict[str, Any] = {
+    "requestBody": {
+        "content": {
+            kind: {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        name: {"type": type_, "description": told, "example": example}
+                        for name, type_, example, told in _PARAMETERS
+                    },
+                }
+            }
+            for kind in _FORMS
+        }
+    }
+}
+"""For ``openapi_extra=``: the parameters of TAP in a form."""
+
+
+def in_address(
+    parameters: Sequence[tuple[str, str, object, str]], required: Sequence[str]
+) -> dict[str, Any]:
+    """Return for ``openapi_extra=`` parameters that a handler takes from the address itself.
+
+    Each has a name, a type, an example and a description.
+    """
+    return {
+        "parameters": [
+            {
+                "name": name,
+                "in": "query",
+                "required": name in required,
+                "description": told,
+                "schema": {"type": kind},
+                "example": example,
+            }
+            for name, kind, example, told in parameters
+        ]
+    }
+
+
+class VOTableRoute(RenderingRoute):
+    """A route whose errors are VOTables, but for those of who may do what."""
+
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return an error as the protocol has it."""
+        problem = problem_of(error)
+        if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
+            return as_json(error)
+        answer = self.votable(error, problem)
+        answer.headers.update(getattr(error, "headers", {}))
+        return answer
+
+    def votable(self, error: Exception, problem: ProblemDetails) -> Response:
+        """Return an error as TAP has it."""
+        return Response(error_votable(problem.detail), problem.status, media_type=VOTABLE_TYPE)
+
+
+@dataclass(frozen=True)
+class TapRequest:
+    """What a request says, in its address and its body."""
+
+    parameters: Parameters
+    uploads: dict[str, UploadFile]  # parts of the body that are files, by their names
+
+    def keep(self, folder: Path) -> dict[str, Path]:
+        """Copy the files of the request into a folder."""
+        kept = {}
+        for number, (name, upload) in enumerate(self.uploads.items()):
+            kept[name] = folder / f"upload-{number}.vot"
+            upload.file.seek(0)
+            with kept[name].open("wb") as stream:
+                shutil.copyfileobj(upload.file, stream)
+        return kept
+
+
+async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
+    """Give what a request says; its files are there while it is answered."""
+    given = list(request.query_params.multi_items())
+    kind = body_type(request)
+    if request.method != "POST" or not kind:
+        yield TapRequest(Parameters(given), {})
+        return
+    if kind not in _FORMS:
+        raise Problem(415, f"the body is {kind[:60]}; send one of {', '.join(_FORMS)}")
+    form = await _form(request)
+    try:
+        given += [(name, value) for name, value in form.multi_items() if isinstance(value, str)]
+        uploads = {name: one for name, one in form.items() if isinstance(one, UploadFile)}
+        yield TapRequest(Parameters(given), uploads)
+    finally:
+        await form.close()
+
+
+TheRequest = Annotated[TapRequest, Depends(tap_request)]
+
+
+async def _form(request: Request) -> FormData:
+    try:
+        return await request.form(
+            max_files=MAX_UPLOADS, max_fields=MAX_PARAMETERS, max_part_size=MAX_PARAMETER_BYTES
+        )
+    except HTTPException as error:
+        if error.status_code != 400:  # too large, or too slow
+            raise
+        raise ConfigError(f"the form cannot be read: {error.detail}") from error
+
+
+def base_url(request: Request) -> str:
+    """Return the address of TAP as the client sees it."""
+    own = service_of(request).settings.public_url or str(request.base_url)
+    return own.rstrip("/") + PREFIX
+
+
+router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=VOTableRoute)
+
+
+class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
+    """Nobody waits for the answer any more."""
+
+
+class Spool:
+    """An answer on its way: made as fast as the query gives it, sent as fast as the client reads.
+
+    What is not taken yet waits in a file, so a client that reads slowly keeps no query from being
+    answered.
+    """
+
+    def __init__(
+        self, parts: Generator[bytes, None, None], scratch: Path, gone: threading.Event
+    ) -> None:
+        self._parts = parts
+        self._gone = gone
+        self._written = 0
+        self._is_done = False
+        self._error: BaseException | None = None
+        self._changed = threading.Condition()
+        # Closed by `close`. A disk that a long query writes to keeps no short answer waiting.
+        self._file: SpooledTemporaryFile[bytes]
+        self._file = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
+        self._thread = threading.Thread(target=self._make, name="tap-answer", daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Give the bytes in order; what failed is raised behind the last that were made."""
+        at = 0
+        while True:
+            with self._changed:
+                while self._written == at and not self._is_done:
+                    self._changed.wait(LOOK_S)
+                if self._written == at:
+                    if self._error is not None:
+                        raise self._error
+                    return
+                self._file.seek(at)
+                part = self._file.read(min(READ_BYTES, self._written - at))
+            at += len(part)
+            yield part
+
+    def settle(self, place: Lease) -> None:
+        """Wait until the answer is whole, or has a place where it may take long.
+
+        Until then it can still be begun again, for which `Overdue` is raised: nothing was sent.
+        """
+        until_s = time.monotonic() + CLOCK_TIMES * SHORT_S
+        with self._changed:
+            while not (self._is_done or place.is_long or time.monotonic() > until_s):
+                self._changed.wait(TICK_S)
+        if isinstance(self._error, Overdue):
+            raise self._error
+        if not (self._is_done or place.prolong()):
+            raise Overdue
+
+    def close(self) -> None:
+        """End the making, and forget what was made."""
+        self._gone.set()
+        self._thread.join()
+        self._file.close()
+
+    def _make(self) -> None:
+        try:
+            for part in self._parts:
+                if self._gone.is_set():
+                    break
+                with self._changed:
+                    self._file.seek(self._written)
+                    self._file.write(part)
+                    self._written += len(part)
+                    self._changed.notify_all()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._parts.close()
+            with self._changed:
+                self._is_done = True
+                self._changed.notify_all()
+
+
+class _Closing(StreamingResponse):
+    """A stream that is let go when it ends, also where the client went away."""
+
+    def __init__(self, first: bytes, rest: Spool, media_type: str) -> None:
+        super().__init__(chain([first], rest), media_type=media_type)
+        self._rest = rest
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            with CancelScope(shield=True):
+                await to_thread.run_sync(self._rest.close)
+
+
+@router.get(  # an upload needs a form
+    "/sync", summary="Answer a query in ADQL", openapi_extra=in_address(_PARAMETERS[:-1], ["QUERY"])
+)
+@router.post(
+    "/sync", summary="Answer a query in ADQL, perhaps about uploaded tables", openapi_extra=FORM
+)
+async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
+    """Answer a query; parameters as TAP 1.1 has them."""
+    asked = question(given.parameters, service.settings.max_rows)
+    first, rest = await service.query_pool.run(_begun, service, asked, given, who.name)
+    answer = _Closing(first, rest, asked.form.tap_type)
+    name = f"result{asked.form.suffix}"
+    answer.headers["Content-Disposition"] = f'inline; filename="{name}"'
+    return answer
+
+
+def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> tuple[bytes, Spool]:
+    """Return the first part of an answer, and what gives the others."""
+    gone = threading.Event()
+
+    def watch(*_: object) -> None:
+        if gone.is_set():
+            raise ClientGone
+
+    with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
+        files = given.keep(folder) if folder else {}
+        files |= service.query_jobs.answers(asked.uploads, owner)
+        parts = service.tap.answer(asked, files, progress=watch)
+        # What came is read before the first part of the answer is there.
+        first = next(parts, b"")
+    rest = Spool(parts, service.paths.scratch, gone)
+    place = lease.get()
+    if place is not None:
+        try:
+            rest.settle(place)
+        except Overdue:
+            rest.close()
+            raise
+    return first, rest
+
+
+@router.get("/capabilities", summary="What the service can do (VOSI)")
+def get_capabilities(request: Request, service: TheService) -> Response:
+    """Return languages, formats and limits."""
+    return Response(capabilities(base_url(request), service.tap.limits), media_type=MEDIA_TYPE)
+
+
+@router.get("/availability", summary="Whether the service answers (VOSI)")
+def get_availability() -> Response:
+    """Return that the service is there, and since when."""
+    return Response(availability(_STARTED), media_type=MEDIA_TYPE)
+
+
+@router.get("/tables", summary="All tables (VOSI)")
+def get_tables(
+    request: Request,
+    service: TheService,
+    who: Reader,
+    detail: Annotated[Literal["min", "max"], Query(description="min without columns")] = "max",
+) -> Response:
+    """Return schemas, tables and columns."""
+    given = request.query_params
+    found = service.tap.state().tables
+    if "tables" in given:
+        found = found.chosen(given["tables"].split(","))
+    content = tableset(found, detail == "max" and given.get("only_tables") != "true")
+    # TapPlus is the one client that does not say its name.
+    if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
+        content = for_tap_plus(content)
+    return Response(content, headers={"Vary": "User-Agent"}, media_type=MEDIA_TYPE)
+
+
+@router.get("/tables/{name}", summary="A table (VOSI)")
+def get_table(name: str, service: TheService, who: Reader) -> Response:
+    """Return a table with its columns."""
+    for table in service.tap.state().tables.chosen([name]):
+        return Response(table_document(table), media_type=MEDIA_TYPE)
+    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
+
+
+@router.get("/examples", summary="Queries to begin with (DALI)")
+def get_examples(service: TheService, who: Reader) -> Response:
+    """Return queries that run on the tables that there are."""
+    page = examples_page(service.tap.state().tables)
+    return Response(page, media_type="application/xhtml+xml")

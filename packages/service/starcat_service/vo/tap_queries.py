@@ -1,0 +1,197 @@
+"""What TAP may be asked about, and a question from its parameters to the bytes of its answer."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcat.errors import ConfigError, StarcatError
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
+from starcat.progress import Progress, no_progress
+from starcat.store.layout import is_store
+from starcat_service.library import Library
+from starcat_service.paths import ServicePaths
+from starcat_service.protocols.adql import ask, translate
+from starcat_service.protocols.documents import ServiceLimits
+from starcat_service.protocols.parameters import Question, Upload
+from starcat_service.protocols.tables import (
+    NAME,
+    UPLOADS,
+    Schema,
+    Table,
+    Tables,
+    own_schema,
+    session_schemas,
+    write_tap_schema,
+)
+from starcat_service.protocols.uploads import table_of_facts
+from starcat_service.sandbox.pool import QueryPool
+from starcat_service.sandbox.sandbox import Sandbox
+from starcat_service.settings import Settings
+from starcat_service.transfers import chunks_of, scratch_folder, write_rows
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DAY_S = 86_400
+
+_LABEL = Label("result")
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TapState:
+    """What there is to be asked."""
+
+    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA and uploads at the end
+    tables: Tables  # all tables, with those of TAP_SCHEMA and uploads
+
+
+class Tap:
+    """What TAP grants, the tables of a service as they are now, and answers about them."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        paths: ServicePaths,
+        library: Library,
+        query_pool: QueryPool,
+        sandbox: Sandbox,
+    ) -> None:
+        self.limits = ServiceLimits(
+            run_s=int(settings.job_time_s),
+            keep_s=int(settings.keep_results_days * DAY_S),
+            rows=settings.max_rows,
+            upload_bytes=int(settings.upload_mib * 2**20),
+        )
+        self._paths = paths
+        self._library = library
+        self._query_pool = query_pool
+        self._sandbox = sandbox
+        self._looking = threading.Lock()
+        self._state: tuple[str, TapState] | None = None
+
+    def state(self) -> TapState:
+        """Return what there is to be asked."""
+        about = self._found()
+        key = _digest(list(about))
+        with self._looking:
+            known = self._state
+            # What lies in scratch for long is removed.
+            if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
+                known = self._state = key, self._looked_at(about, key)
+            return known[1]
+
+    def _found(self) -> dict[Path, str]:
+        """Return what there is on disk, and what each is."""
+        found = {
+            database.folder: f"Guide-star database {database.name}, version {database.version}"
+            for database in self._library.databases()
+        }
+        for path in sorted(self._paths.catalogs.iterdir()):
+            is_table = path.suffix == ".parquet" and not path.stem.endswith("rejected")
+            if path.is_file() and is_table:
+                found[path] = f"Stars of the catalog {path.stem}"
+            elif path.is_dir() and (is_store(path) or any(path.glob("*.parquet"))):
+                found[path] = f"Stars of the catalog {path.name}"
+        return found
+
+    def _looked_at(self, about: dict[Path, str], key: str) -> TapState:
+        try:
+            return self._opened(about, key)
+        except StarcatError as error:
+            _logger.warning("a table cannot be shown by TAP: %s", error)
+        return self._opened({path: told for path, told in about.items() if self._opens(path)}, key)
+
+    def _opens(self, path: Path) -> bool:
+        try:
+            with self._query_pool.session([path]):
+                return True
+        except StarcatError:
+            return False
+
+    def _opened(self, about: dict[Path, str], key: str) -> TapState:
+        own = own_schema()
+        folder = self._paths.scratch / f"tap-{key}" / NAME
+        schemas: tuple[Schema, ...] = ()
+        if about:
+            with self._query_pool.session(list(about)) as session:
+                names = [target.name for target in session.targets]
+                told = dict(zip(names, about.values(), strict=True))
+                schemas = session_schemas(session, told)
+        tables = Tables((*schemas, own))
+        write_tap_schema(tables, folder)
+        return TapState((*about, folder), tables)
+
+    def answer(
+        self,
+        asked: Question,
+        files: Mapping[str, Path],
+        time_s: float | None = None,
+        progress: Progress | Callable[..., None] = no_progress,
+    ) -> Generator[bytes, None, None]:
+        """Yield the answer to a question."""
+        with self._state_with(asked.uploads, files) as state:
+            translated = translate(asked.query, state.tables)
+            with self._query_pool.session(state.targets, time_s) as session:
+                batches = ask(session, translated, asked.max_rows, progress)
+                yield from self._chunks(batches, asked.form, asked.max_rows)
+
+    def _chunks(
+        self, batches: pa.RecordBatchReader, form: Format, max_rows: int
+    ) -> Iterator[bytes]:
+        """Yield an answer in a format; FITS, held in memory as a whole, is another process's."""
+        if form.name != "fits":
+            scratch = self._paths.scratch
+            yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
+            return
+        with scratch_folder(self._paths) as folder:
+            rows, result = folder / "rows.arrow", folder / "result.fits"
+            write_rows(batches, rows, max_rows)
+            self._sandbox.convert(rows, result, "fits")
+            chunks = chunks_of(result.open("rb"))
+        yield from chunks
+
+    @contextmanager
+    def _state_with(
+        self, uploads: tuple[Upload, ...], files: Mapping[str, Path]
+    ) -> Iterator[TapState]:
+        """Give what there is to be asked, with the tables that came with a question."""
+        if not uploads:
+            yield self.state()
+            return
+        for one in uploads:
+            if one.part and one.part not in files:
+                raise ConfigError(
+                    f"UPLOAD of {one.table}: the request has no file {one.part!r}; send it as a "
+                    "part of multipart/form-data with that name",
+                    key="UPLOAD",
+                )
+        with scratch_folder(self._paths) as scratch:
+            folder = scratch / UPLOADS
+            folder.mkdir()
+            tables = tuple(
+                self._read(files[one.part or one.job_id], one, folder) for one in uploads
+            )
+            uploaded = Schema(UPLOADS, "Tables that came with the query", tables)
+            state = self.state()
+            yield TapState((*state.targets, folder), state.tables.with_schema(uploaded))
+
+    def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
+        given = {"path": str(file), "name": upload.table, "folder": str(folder)}
+        return table_of_facts(self._sandbox.call("upload", given))
+
+
+def _digest(paths: list[Path]) -> str:
+    """Return a name for a state of what there is."""
+    told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]

@@ -1,0 +1,286 @@
+"""Simple cone searches: the stars that brute force finds, as the standard wants them told."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.io.votable import parse
+from astropy.table import Table
+from fastapi.testclient import TestClient
+from pyvo.dal import DALQueryError, conesearch
+from served import serve
+from services import DATABASE, client_of
+
+from starcat.artifact.reader import open_artifact
+from starcat.errors import ConfigError
+from starcat_service.protocols.cone import ConeRequest, cone_request
+
+PLACES = [
+    (83.6, -5.4, 10.0),
+    (0.0, 0.0, 15.0),
+    (359.9, 30.0, 12.0),
+    (10.0, 90.0, 20.0),
+    (200.0, -90.0, 14.5),
+    (120.0, 45.0, 0.001),
+    (0.0, 0.0, 180.0),
+]
+
+
+@pytest.fixture(scope="module")
+def root(root: Path, small_artifact: Path) -> Path:
+    """The folder of a service with one database and catalogs that were read."""
+    catalogs = root / "catalogs"
+    (catalogs / "unfinished").mkdir(parents=True)
+    (catalogs / "bright").mkdir()
+    for name in ("bright/stars.parquet", "faint.parquet", f"sao-{'0a' * 8}.parquet"):
+        shutil.copyfile(small_artifact / "stars.parquet", catalogs / name)
+    return root
+
+
+@pytest.fixture(scope="module")
+def stars(small_artifact: Path) -> dict[str, np.ndarray]:
+    table = open_artifact(small_artifact).table("stars")
+    names = ("designation", "star_id", "ra_deg", "dec_deg", "mag")
+    return {name: np.array(table[name].to_pylist()) for name in names}
+
+
+def near(stars: dict[str, np.ndarray], ra_deg: float, dec_deg: float, sr: float) -> list[str]:
+    """Return the stars within a radius, the nearest first, by other means than starcat's."""
+    places = SkyCoord(stars["ra_deg"] * units.deg, stars["dec_deg"] * units.deg)
+    apart = places.separation(SkyCoord(ra_deg * units.deg, dec_deg * units.deg)).deg
+    order = [k for k in np.argsort(apart) if apart[k] <= sr]
+    return [str(stars["designation"][k]) for k in order]
+
+
+def ask(client: TestClient, catalog: str = DATABASE, **parameters: Any) -> Any:
+    return client.get(f"/scs/{catalog}", params={"RA": 83.6, "DEC": -5.4, "SR": 20, **parameters})
+
+
+def fields_of(content: bytes) -> list[Any]:
+    # astropy calls the UCDs that the standard asks for out of date.
+    return list(parse(io.BytesIO(content), verify="ignore").get_first_table().fields)
+
+
+# The stars ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("ra_deg", "dec_deg", "sr"), PLACES)
+def test_a_search_finds_what_brute_force_finds(client, stars, ra_deg, dec_deg, sr):
+    answer = ask(client, RA=ra_deg, DEC=dec_deg, SR=sr)
+    assert (answer.status_code, answer.headers["content-type"]) == (
+        200, "text/xml;content=x-votable"
+    )  # fmt: skip
+    found = parse(io.BytesIO(answer.content)).get_first_table().array
+    assert found["designation"].tolist() == near(stars, ra_deg, dec_deg, sr)
+    if sr == 180.0:
+        assert len(found) == len(stars["mag"]) > 300
+        apart = found["separation_deg"].data
+        assert (np.diff(apart) >= 0).all()
+        assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
+
+
+@pytest.mark.parametrize(
+    "catalog",
+    [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"sao-{'0a' * 8}.parquet"],
+)
+def test_a_catalog_has_several_names(client, stars, catalog):
+    found = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
+    assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
+
+
+def test_columns_have_the_ucds_of_the_standard(client):
+    for verbosity in (1, 2, 3):
+        fields = fields_of(ask(client, VERB=verbosity).content)
+        for ucd, datatypes in (
+            ("ID_MAIN", {"char", "unicodeChar"}),
+            ("POS_EQ_RA_MAIN", {"double"}),
+            ("POS_EQ_DEC_MAIN", {"double"}),
+        ):
+            [field] = [one for one in fields if one.ucd == ucd]
+            assert field.datatype in datatypes
+            assert ucd == "ID_MAIN" or str(field.unit) == "deg"
+            assert ucd == "ID_MAIN" or field.ref == "starcat.icrs"
+
+
+def test_verbosity_chooses_columns(client, small_artifact):
+    names = {v: [f.name for f in fields_of(ask(client, VERB=v).content)] for v in (1, 2, 3)}
+    assert names[1] == ["designation", "ra_deg", "dec_deg", "separation_deg"]
+    assert [f.name for f in fields_of(ask(client).content)] == names[2]
+    assert {"mag", "band", "pm_dec_mas_yr", "star_id"} <= set(names[2])
+    assert "source_line" not in names[2]
+    every = open_artifact(small_artifact).table("stars").column_names
+    assert sorted(names[3]) == sorted([*every, "separation_deg"])
+    assert set(names[1]) < set(names[2]) < set(names[3])
+
+
+def test_a_radius_of_nothing_gives_the_columns_only(client):
+    found = parse(io.BytesIO(ask(client, SR=0).content))
+    assert len(found.get_first_table().array) == 0
+    assert [f.name for f in found.get_first_table().fields] == [
+        f.name for f in fields_of(ask(client).content)
+    ]
+    assert [info.value for info in found.resources[0].infos if info.name == "QUERY_STATUS"] == [
+        "OK"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("maxrec", "rows", "is_over"), [(0, 0, True), (3, 3, True), (999, 0, False)]
+)
+def test_a_search_is_cut_and_says_so(client, stars, maxrec, rows, is_over):
+    answer = ask(client, MAXREC=maxrec)
+    expected = near(stars, 83.6, -5.4, 20.0)
+    found = parse(io.BytesIO(answer.content)).get_first_table().array
+    assert found["designation"].tolist() == expected[: maxrec if is_over else None]
+    assert (b'value="OVERFLOW"' in answer.content) == is_over
+
+
+def test_other_formats(client, stars, root):
+    expected = near(stars, 83.6, -5.4, 20.0)
+    text = ask(client, RESPONSEFORMAT="csv", responseformat_=1)
+    assert text.headers["content-type"].startswith("text/csv")
+    rows = list(csv.DictReader(io.StringIO(text.text)))
+    assert [row["designation"] for row in rows] == expected
+    fits = ask(client, responseformat="fits")
+    assert Table.read(io.BytesIO(fits.content), format="fits")["designation"].tolist() == expected
+    binary = ask(client, RESPONSEFORMAT="application/x-votable+xml;serialization=BINARY2")
+    assert b"<BINARY2>" in binary.content
+    assert not list((root / "scratch").iterdir())
+
+
+def test_the_document_is_of_the_artifact(client):
+    found = parse(io.BytesIO(ask(client).content))
+    infos = {info.name: info.value for info in found.resources[0].infos}
+    assert infos == {"QUERY_STATUS": "OK", "artifact": "small", "version": "1.0.0"}
+    [system] = found.resources[0].coordinate_systems
+    assert (system.system, system.epoch) == ("ICRS", "J2026")
+
+
+# Refusals ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "status", "words"),
+    [
+        ({"RA": "x"}, 400, "RA is 'x'; give decimal degrees from 0 to 360"),
+        ({"RA": "361"}, 400, "RA is '361'; give decimal degrees from 0 to 360"),
+        ({"RA": "nan"}, 400, "RA is 'nan'"),
+        ({"RA": "1_0"}, 400, "RA is '1_0'"),
+        ({"RA": "inf"}, 400, "RA is 'inf'"),
+        ({"DEC": "-90.1"}, 400, "DEC is '-90.1'; give decimal degrees from -90 to 90"),
+        ({"SR": "-1"}, 400, "SR is '-1'; give decimal degrees from 0 to 180"),
+        ({"SR": "1) UNION SELECT"}, 400, "SR is '1) UNION SELECT'"),
+        ({"SR": ""}, 400, "SR is ''"),
+        ({"VERB": "4"}, 400, "VERB is '4'; give a whole number from 1 to 3"),
+        ({"MAXREC": "-1"}, 400, "MAXREC is '-1'; give a whole number from 0"),
+        ({"MAXREC": "9" * 30}, 400, "MAXREC is "),
+        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is not known"),
+        ({"ra": "1"}, 400, "RA is given twice"),
+    ],
+)
+def test_what_is_wrong_is_told_in_a_votable(client, parameters, status, words):
+    answer = ask(client, **parameters)
+    assert (answer.status_code, answer.headers["content-type"]) == (
+        status, "text/xml;content=x-votable"
+    )  # fmt: skip
+    check_error(answer.content, words)
+
+
+def check_error(content: bytes, words: str) -> None:
+    """Check that a document is an error of the standard: an INFO directly under VOTABLE."""
+    root = ElementTree.fromstring(content)
+    space = "{http://www.ivoa.net/xml/VOTable/v1.3}"
+    [info] = root.findall(f"{space}INFO")
+    assert info.get("name") == "Error"
+    assert words in (info.get("value") or "")
+    assert not root.findall(f".//{space}TABLE")
+
+
+@pytest.mark.parametrize("missing", ["RA", "DEC", "SR"])
+def test_what_is_missing_is_told(client, missing):
+    given = {name: "1" for name in ("RA", "DEC", "SR") if name != missing}
+    answer = client.get("/scs/small", params=given)
+    assert answer.status_code == 400
+    check_error(answer.content, f"{missing} is missing")
+
+
+@pytest.mark.parametrize(
+    "catalog",
+    ["nothing", "unfinished", "sa", "glob('/*')", "0" * 16, "..%2f..%2fetc%2fpasswd", "bright%00",
+     "records.sqlite", "x" * 300],
+)  # fmt: skip
+def test_a_catalog_that_is_not_there(client, catalog):
+    answer = ask(client, catalog)
+    assert answer.status_code in (400, 404)
+    assert b"root:" not in answer.content
+    if catalog in ("nothing", "unfinished", "sa", "0" * 16):
+        check_error(answer.content, "no database and no catalog is called")
+
+
+def test_who_may_not_read_gets_nothing(root):
+    with client_of(root, anonymous="none") as client:
+        assert ask(client).status_code == 401
+
+
+def test_parameters_as_they_are_checked():
+    asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
+    assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)
+    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "votable/td")
+    edge = cone_request([("RA", "360"), ("DEC", "-90"), ("SR", "180"), ("VERB", "")])
+    assert isinstance(edge, ConeRequest)
+    with pytest.raises(ConfigError, match="RA is"):
+        cone_request([("RA", str(math.nextafter(360.0, 361.0))), ("DEC", "0"), ("SR", "1")])
+
+
+# Clients of others -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def address(root: Path) -> Iterator[str]:
+    """Where the service listens."""
+    with serve(root, root.parent / "log") as served:
+        yield f"{served.address}/scs/small"
+
+
+def test_pyvo_searches(address, stars):
+    found = conesearch(address, pos=(83.6, -5.4), radius=20.0, verbosity=1)
+    expected = near(stars, 83.6, -5.4, 20.0)
+    assert [row.id for row in found] == expected
+    first = list(stars["designation"]).index(expected[0])
+    assert found[0].pos.ra.deg == stars["ra_deg"][first]
+    assert found[0].pos.dec.deg == stars["dec_deg"][first]
+
+
+def test_pyvo_is_told_what_is_wrong(address):
+    assert len(conesearch(address, pos=(0.0, 0.0), radius=90.0, maxrec=5)) == 5
+    with pytest.raises(DALQueryError, match="VERB is '7'; give a whole number from 1 to 3"):
+        conesearch(address, pos=(0.0, 0.0), radius=1.0, verbosity=7)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
+def test_stilts_searches(address, stars, tmp_path):
+    out, asked = tmp_path / "found.csv", tmp_path / "asked.csv"
+    asked.write_text("ra,dec\n83.6,-5.4\n0,90\n", encoding="ascii")
+    subprocess.run(
+        ["stilts", "coneskymatch", f"in={asked}", "ifmt=csv", "ra=ra", "dec=dec", "sr=20",
+         f"serviceurl={address}", "servicetype=cone", "verb=3", "find=all", f"out={out}",
+         "ofmt=csv"],
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO(out.read_text(encoding="utf-8"))))
+    expected = near(stars, 83.6, -5.4, 20.0) + near(stars, 0.0, 90.0, 20.0)
+    assert sorted(row["designation"] for row in rows) == sorted(expected)

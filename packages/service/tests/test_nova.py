@@ -1,0 +1,182 @@
+"""The interface of nova.astrometry.net: its clients have their pictures solved by the service."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from artifact_copies import copied
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.wcs import WCS
+from rendered import picture_of
+from served import serve
+from services import add_database, client_of, token_of
+
+from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.matcher.database import open_database
+from starcat.pipeline.build import build
+from starcat.pipeline.starter import starter_spec
+from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.specs.build_spec import CameraSpec
+from starcat_service.api.nova import calibration_of
+
+
+def sent(client, address, given, **files):
+    """Send what nova's clients send: JSON in a field of a form."""
+    return client.post(address, data={"request-json": json.dumps(given)}, files=files or None)
+
+
+@pytest.fixture(scope="module")
+def frame(small_artifact):
+    """A frame with many stars of the small database."""
+    known = open_database(small_artifact)
+    frames = simulate_frames(known.directions, known.camera, 10, Noise(noise_px=0.05), 5, known.mag)
+    return max(frames, key=lambda one: len(one.mag))
+
+
+@pytest.fixture(scope="module")
+def client(small_artifact, tmp_path_factory):
+    """A client of a service that everybody may read, with the small database."""
+    root = tmp_path_factory.mktemp("nova")
+    add_database(root, small_artifact)
+    with client_of(root, requests_per_minute=1_000_000) as client:
+        yield client
+
+
+def test_a_picture_is_solved(client, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    session = sent(client, "/api/login", {"apikey": "any"}).json()["session"]
+    answer = sent(
+        client, "/api/upload", {"session": session}, file=("a.fits", picture_of(frame, camera))
+    ).json()
+    assert answer["status"] == "success"
+    number = answer["subid"]
+    assert client.get(f"/api/submissions/{number}").json()["jobs"] == [number]
+    assert client.get(f"/api/jobs/{number}").json() == {"status": "success"}
+    found = client.get(f"/api/jobs/{number}/calibration/").json()
+    ra_deg, dec_deg, _ = radec_roll_from_matrix(frame.matrix)
+    truth = SkyCoord(ra_deg, dec_deg, unit="deg")
+    assert truth.separation(SkyCoord(found["ra"], found["dec"], unit="deg")).arcsec < 60
+    assert found["width_arcsec"] / 3600 == pytest.approx(
+        np.degrees(camera.width_px / camera.focal_length_px), rel=0.01
+    )
+    info = client.get(f"/api/jobs/{number}/info/").json()
+    assert info["calibration"] == found
+    assert len(info["objects_in_field"]) >= 4
+    assert client.get(f"/api/jobs/{number}/objects_in_field/").json() == {
+        "objects_in_field": info["objects_in_field"]
+    }
+    wcs = WCS(fits.Header.fromstring(client.get(f"/wcs_file/{number}").text), naxis=2)
+    for star in client.get(f"/api/jobs/{number}/annotations/").json()["annotations"]:
+        assert star["names"][0] in info["objects_in_field"]
+        assert 0 < star["pixelx"] <= camera.width_px
+    middle = wcs.pixel_to_world(0.5 * camera.width_px - 0.5, 0.5 * camera.height_px - 0.5)
+    assert truth.separation(middle).arcsec < 60
+
+
+def test_centroids_are_solved_whichever_way_y_counts(client, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    x, y = frame.centroids_px.T + 0.5
+    size = {"image_width": camera.width_px, "image_height": camera.height_px}
+    for rows in (y, camera.height_px + 1 - y):
+        answer = sent(client, "/api/upload", {"x": x.tolist(), "y": rows.tolist(), **size}).json()
+        found = client.get(f"/api/jobs/{answer['subid']}/calibration").json()
+        ra_deg, dec_deg, _ = radec_roll_from_matrix(frame.matrix)
+        truth = SkyCoord(ra_deg, dec_deg, unit="deg")
+        assert truth.separation(SkyCoord(found["ra"], found["dec"], unit="deg")).arcsec < 60
+
+
+@pytest.mark.parametrize("turn_deg", [-170.0, -30.0, 0.0, 75.0])
+@pytest.mark.parametrize("parity", [1.0, -1.0])
+def test_a_calibration_says_where_up_is(turn_deg, parity):
+    """Up is the second axis; its position angle by astropy is what nova calls orientation."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN", "DEC--TAN"], [40.0, 20.0]
+    wcs.wcs.crpix = [500.5, 400.5]
+    turn = np.radians(turn_deg)
+    flip = np.diag([parity, 1.0]) * 0.01
+    wcs.wcs.cd = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) @ flip
+    header = wcs.to_header()
+    header["IMAGEW"], header["IMAGEH"] = 1000, 800
+    found = calibration_of(header.tostring())
+    assert (found["ra"], found["dec"]) == pytest.approx((40.0, 20.0))
+    assert found["pixscale"] == pytest.approx(36.0)
+    assert found["parity"] == parity
+    centre, above = wcs.pixel_to_world(499.5, 399.5), wcs.pixel_to_world(499.5, 400.5)
+    up_deg = centre.position_angle(above).deg
+    assert (found["orientation"] - up_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("address", "given", "files", "status", "said"),
+    [
+        ("/api/upload", {}, {}, 422, "send a picture as 'file'"),
+        ("/api/upload", {"x": [1, 2], "y": [1]}, {}, 422, "lists 'x' and 'y' of a length"),
+        ("/api/upload", {"x": [1, "a"], "y": [1, 2]}, {}, 422, "expected numbers"),
+        ("/api/upload", [], {}, 422, "expected an object"),
+        ("/api/upload", {}, {"file": ("a.fits", b"nothing")}, 422, "a.fits"),
+        ("/api/url_upload", {"url": "http://127.0.0.1/"}, {}, 422, "fetches nothing"),
+    ],
+)
+def test_what_cannot_be_solved_is_told(client, address, given, files, status, said):
+    answer = sent(client, address, given, **files)
+    assert answer.status_code == status
+    assert answer.json()["status"] == "error"
+    assert said in answer.json()["errormessage"]
+
+
+def test_a_picture_without_stars_is_a_failure(client, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
+    buffer = io.BytesIO()
+    fits.PrimaryHDU(image.astype(np.float32)).writeto(buffer)
+    number = sent(client, "/api/upload", {}, file=("a.fits", buffer.getvalue())).json()["subid"]
+    assert client.get(f"/api/jobs/{number}/info").json()["status"] == "failure"
+    assert client.get(f"/api/submissions/{number}").json()["job_calibrations"] == []
+    for path in (f"/wcs_file/{number}", f"/api/jobs/{number}/calibration"):
+        answer = client.get(path)
+        assert answer.status_code == 404
+        assert "not solved" in answer.json()["errormessage"]
+    assert client.get("/api/jobs/1").status_code == 404
+
+
+def test_where_tokens_are_needed_the_key_is_one(small_artifact, tmp_path, frame):
+    add_database(tmp_path, small_artifact)
+    token = token_of(tmp_path, "me")
+    picture = ("a.fits", picture_of(frame, open_database(small_artifact).camera))
+    with client_of(tmp_path, anonymous="none") as client:
+        assert sent(client, "/api/upload", {}, file=picture).status_code == 401
+        assert sent(client, "/api/login", {"apikey": "wrong"}).status_code == 401
+        assert sent(client, "/api/upload", {"session": "wrong"}, file=picture).status_code == 401
+        session = sent(client, "/api/login", {"apikey": token}).json()["session"]
+        answer = sent(client, "/api/upload", {"session": session}, file=picture)
+        assert answer.json()["status"] == "success"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(500)
+def test_astroquery_solves_photographs(tmp_path, nights):
+    """Twenty photographs, blind among fields of 20 to 60 deg, with only another address."""
+    from astroquery.astrometry_net import AstrometryNet
+
+    spec = starter_spec("levels", CameraSpec(width_px=1024, height_px=1024, fov_x_deg=20.0)).spec
+    content = spec.model_dump(mode="json", exclude_defaults=True)
+    content["products"] = {"levels": {"enabled": True, "widest_fov_x_deg": 60.0}}
+    content["self_test"] = {"frames": 20}
+    folder = build(type(spec).model_validate(content), {}, tmp_path / "built").folder
+    root = tmp_path / "root"
+    copied(folder, root / "databases" / "0123456789abcdef")
+    right = 0
+    with serve(root, tmp_path / "log.txt") as served:
+        client = AstrometryNet()
+        client.URL, client.API_URL, client.api_key = served.address, f"{served.address}/api", "any"
+        for path in sorted((nights / "spel").iterdir())[:20]:
+            found = client.solve_from_image(path, verbose=False)
+            wcs = WCS(found, naxis=2)
+            width = found["IMAGEW"]
+            left, other = wcs.pixel_to_world([0, width - 1], [0, 0])
+            right += 40 < left.separation(other).deg < 60
+    assert right == 20

@@ -1,0 +1,465 @@
+"""Pages of the service: they answer, escape what they show, and bring all they need with them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import urljoin
+
+import pytest
+from fastapi.testclient import TestClient
+from services import DATABASE, SPEC, add_database, client_of
+
+import starcat_service
+from starcat.specs.reading import preset, preset_names, read_spec
+from starcat_service.jobs.job import Attempt, Outcome, begin_next
+from starcat_service.pages.draft import draft_of_form, draft_of_text
+from starcat_service.pages.rendering import DIGEST, FILES
+
+PAGE = f"/databases/{DATABASE}"
+SETTINGS = {"anonymous": "publisher"}
+LATER = "fedcba9876543210"
+
+PAGES = [
+    *("/", "/databases", PAGE, f"{PAGE}/coverage", f"{PAGE}/sql?query=FROM+stars+LIMIT+2"),
+    *(f"{PAGE}/compare?other={LATER}", "/identify", "/releases"),
+]
+"""Pages of databases."""
+
+HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
+
+
+@pytest.fixture(scope="module")
+def root(root: Path, artifact_version) -> Path:
+    add_database(root, artifact_version("1.1.0"), LATER)
+    return root
+
+
+@pytest.fixture(scope="module")
+def job(client: TestClient) -> str:
+    """A job that failed: its address."""
+    address = _asked(client, "hostile")
+    records = client.app.state.service.records
+    attempt = Attempt(records, begin_next(records, ["build"]))
+    attempt.report_stage("read gaia", 5_000_000, 19_000_000)
+    attempt.log("warning", f"a line {HOSTILE}")
+    attempt.report_stage(f"self-test {HOSTILE}", 3, 400)
+    problem = {"title": "Unprocessable Content", "status": 422, "detail": f"why {HOSTILE}"}
+    attempt.end(Outcome("failed", problem))
+    return address
+
+
+def _asked(client: TestClient, name: str) -> str:
+    text = SPEC.replace('"small"', f'"{name}"')
+    answer = client.post(
+        "/new", data={"toml": text, "toml-before": "", "do": "build"}, follow_redirects=False
+    )
+    assert answer.status_code == 303, answer.text
+    return answer.headers["location"]
+
+
+class Page(HTMLParser):
+    """What a page is made of."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.inline: list[str] = []
+        self._in: str | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._in = tag if tag in ("script", "style") else None
+
+    def handle_endtag(self, tag):
+        self._in = None
+
+    def handle_data(self, data):
+        if self._in and data.strip():
+            self.inline.append(data)
+
+    def addresses(self) -> Iterator[str]:
+        for tag, attributes in self.tags:
+            for name in ("href", "src", "action", "data-preview", "data-tiling", "data-events"):
+                if attributes.get(name) and not (tag == "image" and name == "href"):
+                    yield attributes[name]
+
+
+@pytest.fixture(scope="module")
+def pages(client: TestClient, job: str) -> dict[str, str]:
+    """All pages of this part by address."""
+    addresses = ["/new", "/new?preset=sao-12deg-512", f"/new?job={job[6:]}", "/jobs", job]
+    addresses += ["/jobs?state=failed", "/jobs?state=done", "/sign-in", "/jobs/nothing"]
+    addresses += ["/api/docs", *PAGES]
+    return {address: client.get(address).text for address in addresses}
+
+
+def test_every_page_is_a_whole_page_with_one_heading_and_landmarks(pages):
+    for address, text in pages.items():
+        tags = [tag for tag, _ in Page(text).tags]
+        assert text.startswith("<!doctype html>"), address
+        for one in ("h1", "main", "header", "footer"):
+            assert tags.count(one) == 1, (address, one)
+        assert '<a class="skip" href="#content">' in text
+        assert 'lang="en"' in text
+
+
+def test_nothing_in_a_page_is_a_script_or_a_style_of_its_own(pages):
+    for address, text in pages.items():
+        page = Page(text)
+        assert page.inline == [], address
+        for tag, attributes in page.tags:
+            assert "style" not in attributes, (address, tag)
+            assert not [name for name in attributes if name.startswith("on")], (address, tag)
+            assert tag not in ("style", "iframe", "object", "embed", "base"), address
+
+
+def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, client):
+    others = ("/databases", "/identify", "/releases", "/sign-out", "/")
+    known = {}
+    for address, text in pages.items():
+        for found in Page(text).addresses():
+            if found.startswith("data:application/x-ipynb+json"):
+                continue  # a file that the page holds
+            assert found.startswith(("/", "#", "?")), (address, found)
+            assert not found.startswith("//"), (address, found)
+            path = urljoin(address, found).partition("#")[0]
+            is_ours = path not in others and not path.startswith(("/databases/", "/api/v1/"))
+            if (
+                is_ours
+                and found[0] != "#"
+                and not path.endswith(("/cancel", "/retry", "/preview", "/tiling"))
+            ):
+                known.setdefault(path, client.get(path).status_code)
+    assert {path: status for path, status in known.items() if status != 200} == {}
+    assert len(known) > 8
+
+
+def test_what_others_have_written_is_text(pages, job):
+    for text in pages.values():
+        assert "<script>alert" not in text
+        assert "<img src=x" not in text
+    assert pages[job].count("&lt;script&gt;alert(1)") >= 3
+
+
+@pytest.mark.parametrize(
+    "address",
+    [f"/jobs/{HOSTILE}", f"/new?preset={HOSTILE}", f"/jobs?state={HOSTILE}", "/jobs?page=0"],
+)
+def test_a_wrong_address_is_told_on_a_page(client, address):
+    answer = client.get(address, headers={"Accept": "text/html"})
+    assert answer.status_code in (404, 422)
+    assert answer.headers["content-type"].startswith("text/html")
+    assert '<div class="notice bad" role="alert">' in answer.text
+    assert "<script>alert" not in answer.text
+
+
+def test_static_files_stay_and_nothing_else_is_given(client):
+    for name, content in FILES.items():
+        answer = client.get(f"/static/{DIGEST}/{name}")
+        assert answer.status_code == 200
+        assert answer.content == content
+        assert "immutable" in answer.headers["cache-control"]
+    for path in (f"/static/{DIGEST}/nothing.css", "/static/0/starcat.css"):
+        assert client.get(path).status_code == 404
+    for path in ("..%2f__init__.py", "%2e%2e/rendering.py", "..\\rendering.py"):
+        assert client.get(f"/static/{DIGEST}/{path}").status_code in (400, 404)
+
+
+def test_static_files_ask_for_nothing_elsewhere():
+    for name, content in FILES.items():
+        found = re.findall(rb"https?://[^\s\"')]+", content)
+        assert [one for one in found if one != b"http://www.w3.org/2000/svg"] == [], name
+
+
+def test_styles_and_scripts_of_the_pages_are_in_the_package():
+    folder = Path(starcat_service.__file__).parent / "pages"
+    used = {
+        name
+        for path in (folder / "templates").glob("*.html")
+        for name in re.findall(r"static\('([^']+)'\)", path.read_text(encoding="utf-8"))
+    }
+    imported = {
+        name
+        for content in FILES.values()
+        for name in re.findall(r'from "\./([^"]+)"', content.decode())
+    }
+    assert used | imported <= set(FILES)
+    assert set(FILES) <= used | imported
+
+
+def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
+    with client_of(tmp_path, anonymous="none") as client:
+        client.headers["Accept"] = "text/html"
+        answer = client.get("/jobs", follow_redirects=False)
+        assert answer.status_code == 303
+        assert answer.headers["location"] == "/sign-in?next=/jobs"
+        page = client.get(answer.headers["location"])
+        assert page.status_code == 200
+        assert 'name="next" value="/jobs"' in page.text
+        assert "shows nothing without a token" in page.text
+
+
+@pytest.mark.slow
+def test_who_may_only_read_sees_what_a_build_needs(client, root):
+    jobs = client.app.state.service.jobs.count()
+    with client_of(root, anonymous="reader") as reader:
+        assert "Sign in to build" in reader.get("/new").text
+        sent = {"toml": SPEC, "toml-before": "", "do": "build"}
+        answer = reader.post("/new", data=sent, follow_redirects=False)
+        assert answer.status_code == 403
+        assert "needs the role builder" in answer.text
+        assert client.app.state.service.jobs.count() == jobs
+
+
+# The draft: a form and a text that follow each other
+
+
+def _form(text: str, **changes: str) -> dict[str, str]:
+    draft = draft_of_text(text)
+    form = {**draft.values, "lens": draft.lens, "products": "shown"}
+    form |= {f"products.{name}.enabled": "on" for name, on in draft.products.items() if on}
+    return {**form, "toml": draft.text, "toml-before": draft.text, **changes}
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_form_that_comes_back_unchanged_leaves_the_text_as_it_is(name, tmp_path):
+    from starcat_service.pages.draft import draft_of_content, without_defaults
+
+    draft = draft_of_content(without_defaults(preset(name).recorded()))
+    assert draft.error is None
+    assert draft.spec == preset(name)
+    assert draft_of_form(_form(draft.text)).text == draft.text
+    (tmp_path / "spec.toml").write_text(draft.text, encoding="utf-8")
+    assert read_spec(tmp_path / "spec.toml") == preset(name)
+
+
+def test_a_field_changes_its_key_and_no_other():
+    text = SPEC + "\n[self_test]\nframes = 7\n"
+    draft = draft_of_form(_form(text, **{"selection.faint_limit_mag": "5.25"}))
+    assert draft.spec is not None
+    assert draft.spec.selection.faint_limit_mag == 5.25
+    assert draft.spec.self_test.frames == 7
+    assert "5.25" in draft.text
+    assert "doubles" not in draft.text
+
+
+def test_a_text_that_was_edited_wins_over_the_fields():
+    form = _form(SPEC, **{"selection.faint_limit_mag": "3"})
+    draft = draft_of_form({**form, "toml": SPEC.replace("4.5", "5.5  # mine")})
+    assert draft.values["selection.faint_limit_mag"] == "5.5"
+    assert "# mine" in draft.text
+
+
+def test_a_text_that_cannot_be_read_leaves_the_fields_as_they_were():
+    form = _form(SPEC, **{"selection.faint_limit_mag": "3"})
+    draft = draft_of_form({**form, "toml": "name = "})
+    assert list(draft.errors) == ["toml"]
+    assert draft.values["selection.faint_limit_mag"] == "3"
+    assert draft.bands == ("G",)
+
+
+def test_a_camera_changes_between_its_field_and_its_lens():
+    draft = draft_of_form(_form(SPEC, lens="focal"))
+    assert draft.spec is not None
+    assert draft.spec.camera.fov_x_deg is None
+    assert draft.spec.camera.pixel_um == 5.5
+    assert draft.spec.camera.camera().fov_x_deg == pytest.approx(30.0, abs=1e-3)
+    back = draft_of_form(_form(draft.text, lens="field"))
+    assert back.spec is not None
+    assert back.spec.camera.fov_x_deg == pytest.approx(30.0, abs=1e-3)
+
+
+def test_a_product_is_left_out_and_taken_again():
+    form = _form(SPEC)
+    del form["products.grid.enabled"]
+    draft = draft_of_form(form)
+    assert draft.spec is not None
+    assert not draft.spec.products.grid.enabled
+    again = _form(draft.text, **{"products.grid.enabled": "on"})
+    assert "grid" not in draft_of_form(again).text
+
+
+def test_another_catalog_takes_its_own_band():
+    text = SPEC.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
+    draft = draft_of_form(_form(text, **{"catalog.source": "sao"}))
+    assert draft.values["catalog.band"] == "V"
+    assert draft.bands == ("V", "P")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("selection.faint_limit_mag", "99", "less than or equal to 40"),
+        ("selection.faint_limit_mag", "", "missing"),
+        ("selection.faint_limit_mag", "bright", "found 'bright'"),
+        ("camera.width_px", "1.5", "found '1.5'"),
+        ("name", "Not A Name", "found 'Not A Name'"),
+        ("selection.bright_limit_mag", "9", "they may be swapped"),
+    ],
+)
+def test_an_error_is_told_beside_its_field_in_the_words_of_the_command(key, value, told, tmp_path):
+    draft = draft_of_form(_form(SPEC, **{key: value}))
+    assert list(draft.errors) == [key]
+    assert told in draft.errors[key]
+    assert draft.values[key] == value
+    from starcat.errors import ConfigError
+
+    (tmp_path / "spec").write_text(draft.text, encoding="utf-8")
+    with pytest.raises(ConfigError) as raised:
+        read_spec(tmp_path / "spec")
+    assert str(raised.value).removeprefix("spec: ") == draft.errors[key]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "name = ",
+        "[" * 5000,
+        'name = "a"\nname = "b"',
+        "x = 1e999999999999\n" * 2,
+        "a" * 200_000,
+        "selection = 1",
+        "name = 2020-01-01\n[[camera]]\nx = [{a = 1}]",
+        "faint = nan\n",
+        f"epoch_jyear = 0x{'f' * 5000}\n",
+        f"a{'.a' * 20_000} = 1\n",
+    ],
+)
+def test_a_text_that_is_no_spec_is_told_and_nothing_is_lost(text):
+    draft = draft_of_text(text)
+    assert draft.error is not None
+    assert draft.spec is None
+    assert draft.text == text
+    again = draft_of_form({**_form(SPEC), "toml": text, "toml-before": text})
+    assert (again.error is None) == (again.spec is not None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# mine\n" + SPEC.replace("faint_limit_mag = 4.5", "faint_limit_mag = 4.5  # seen"),
+        SPEC.replace("[selection]\nfaint_limit_mag = 4.5", "") + "[selection]  # mine\n"
+        "faint_limit_mag = 4.5\n",
+    ],
+)
+def test_a_form_changes_its_keys_and_keeps_comments(text):
+    known = draft_of_text(text)
+    assert known.spec is not None
+    changes = {"selection.faint_limit_mag": "4", "selection.max_stars_per_field": "20"}
+    draft = draft_of_form(_form(text, **changes))
+    assert draft.error is None
+    assert "# mine" in draft.text
+    assert draft.spec.selection.faint_limit_mag == 4.0
+    assert draft.spec.selection.max_stars_per_field == 20
+
+
+def test_a_form_changes_any_way_to_write_a_spec():
+    text = (
+        'name = "mycam"\nversion = "1.0.0"\nepoch_jyear = 2016.0\ncatalog.source = "gaia"\n'
+        "selection.faint_limit_mag = 6.0\n"
+        "camera = { width_px = 1024, height_px = 1024, fov_x_deg = 12.0 }\n"
+    )
+    changes = {"catalog.source": "sao", "selection.faint_limit_mag": "5", "camera.width_px": "512"}
+    form = _form(text, **changes, lens="focal")
+    del form["products.grid.enabled"]
+    draft = draft_of_form(form)
+    assert draft.error is None
+    assert (draft.spec.catalog.band, draft.spec.camera.width_px) == ("V", 512)
+    assert draft.spec.camera.fov_x_deg is None
+    assert not draft.spec.products.grid.enabled
+
+
+# What the page answers
+
+
+def _sent(client: TestClient, address: str, form: dict[str, str]):
+    """Send a form, again while the catalog is being read: a busy machine takes long for it."""
+    answer = client.post(address, data=form)
+    while "being read, which takes longer" in answer.text:
+        answer = client.post(address, data=form)
+    return answer
+
+
+def test_a_page_works_without_scripts(client):
+    sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4", "do": "preview"}
+    page = _sent(client, "/new", sent)
+    assert page.status_code == 200
+    assert "faint_limit_mag = 4.0" in page.text
+    assert re.search(r"\d+ guide stars", page.text)
+    assert "data:image/png;base64," in page.text
+
+
+def test_a_script_is_told_what_the_form_has_become(client):
+    sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4"}
+    sent["camera.fov_x_deg"] = "40"
+    state = _sent(client, "/new/preview", sent).json()
+    assert state["errors"] == {}
+    assert state["values"]["camera.fov_x_deg"] == "40"
+    assert len(state["stars"]) == 300
+    tiling = client.get("/new/tiling?count=300").json()
+    assert len(tiling["ra_deg"]) == len(tiling["dec_deg"]) == 300
+    assert "<svg" in state["result"]
+    wrong = _sent(client, "/new/preview", {**sent, "camera.fov_x_deg": "500"}).json()
+    assert list(wrong["errors"]) == ["camera.fov_x_deg"]
+    assert not wrong["is_known"]
+    assert "To the field" in wrong["wrong"]
+    assert wrong["values"]["camera.fov_x_deg"] == "500"
+
+
+def test_a_catalog_that_is_not_here_is_told(client, monkeypatch):
+    monkeypatch.setenv("STARCAT_CACHE", "/nonexistent")
+    monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
+    text = SPEC.replace('"gaia"', '"sao"')
+    page = client.post("/new", data={"toml": text, "toml-before": "", "do": "preview"})
+    assert page.status_code == 422
+    told = re.search(r'id="catalog.source-error">([^<]*)<', page.text)
+    assert told is not None
+    assert "no file found" in told[1]
+    assert "starcat fetch sao" in told[1]
+    assert "--input" not in page.text
+
+
+def test_every_address_of_the_rest_interface_is_explained(client, pages):
+    document = client.get("/api/openapi.json").json()
+    text = pages["/api/docs"]
+    for path, methods in document["paths"].items():
+        assert f"<code>{path}</code>" in text
+        for method in methods:
+            assert f"{method.upper()}" in text
+
+
+def test_the_same_spec_gives_the_same_job(client):
+    assert _asked(client, "twice") == _asked(client, "twice")
+
+
+def test_a_job_shows_its_steps_and_why_it_failed(pages, job):
+    text = pages[job]
+    assert "It failed." in text
+    assert re.findall(r'<li class="(\w+)" data-words', text) == [
+        "done", "done", "failed", "open", "open",
+    ]  # fmt: skip
+    assert "Try again" in text
+    assert "&#34;hostile&#34;" in text
+
+
+def test_a_job_is_cancelled_and_tried_again(client):
+    address = _asked(client, "cancelled")
+    assert ">Cancel<" in client.get(address).text
+    answer = client.post(f"{address}/cancel", follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, address)
+    page = client.get(address).text
+    assert "It was cancelled." in page
+    assert ">Cancel<" not in page
+    client.post(f"{address}/retry")
+    assert "Waits for a worker." in client.get(address).text
+
+
+def test_jobs_are_listed_by_state_and_page(client, job):
+    assert f'href="{job}"' in client.get("/jobs?state=failed").text
+    assert f'href="{job}"' not in client.get("/jobs?state=queued").text
+    assert "No job is running" in client.get("/jobs?state=running").text
+    assert client.get("/jobs?page=1000").status_code == 200

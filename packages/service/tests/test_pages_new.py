@@ -1,0 +1,388 @@
+"""The page *New database*: designs as addresses, names that follow, suggestions and verdicts."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from fastapi.testclient import TestClient
+from services import SPEC as SMALL
+from services import client_of, token_of
+
+from starcat.errors import ConfigError
+from starcat.specs.reading import preset_names
+from starcat_service.pages.design import differences, draft_of_query, pinned_draft, query_of
+from starcat_service.pages.draft import Draft, draft_of_form, draft_of_text, draft_with
+from starcat_service.pages.response import keys_of_file
+
+SETTINGS = {"anonymous": "builder"}
+
+SPEC = SMALL.replace('"small"', '"mine"').replace("30.0", "20.0")
+
+
+def _sent(client: TestClient, address: str, text: str, **more: str):
+    """Send a text, again while the catalog is being read: a busy machine takes long for it."""
+    sent = {"toml": text, "toml-before": "", **more}
+    answer = client.post(address, data=sent)
+    while "being read, which takes longer" in answer.text:
+        answer = client.post(address, data=sent)
+    return answer
+
+
+# The address
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_preset_has_a_short_address(name):
+    is_default = name == preset_names()[0]
+    draft = draft_of_query({"preset": name})
+    assert query_of(draft, name) == ("" if is_default else f"?preset={name}")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera.fov_x_deg": 20.0, "selection.faint_limit_mag": 5.6},
+        {"catalog.motions": ["tycho2"], "products.grid.enabled": False},
+        {"name": "12", "description": 'a "b" & c=d; ü #1'},
+        {"camera.fov_x_deg": None, "camera.focal_length_mm": 25.0, "camera.pixel_um": 5.5},
+        {"selection.faint_limit_mag": 99.0, "epoch_jyear": "soon"},
+        {"selection.nothing": 3, "catalog.band": ""},
+        {
+            "epoch_jyear": [2027.0, 2042.0],
+            "selection.thinning": "voronoi",
+            "selection.neighbours.psf_sigma_px": 0.9,
+            "camera.response.name": "mine",
+            "camera.response.per": "energy",
+            "camera.response.wavelength_nm": [400.0, 450.0, 500.0],
+            "camera.response.value": [0.0, 1.0, 0.5],
+        },
+    ],
+    ids=[
+        "numbers",
+        "a list",
+        "texts",
+        "another lens",
+        "wrong values",
+        "an unknown key",
+        "a sensor",
+    ],
+)
+def test_an_address_gives_the_design_again(changes):
+    for base in ("gaia-12deg", "sao-12deg-512"):
+        draft = draft_with(draft_of_query({"preset": base}), changes)
+        again = pinned_draft(query_of(draft, base))
+        assert again.content == draft.content
+        assert again.errors == draft.errors
+
+
+@pytest.mark.parametrize(
+    "text",
+    [f"# mine\n{SPEC}", "name = ", f"{SPEC}[a.'b.c']\nd = 1\n", "", "preset = 3\n"],
+    ids=["a comment", "no TOML", "a dotted name", "nothing", "a name of the address"],
+)
+def test_a_text_that_is_more_than_keys_is_in_the_address_as_it_is(text):
+    assert pinned_draft(query_of(draft_of_text(text), "gaia-12deg")).text == text
+
+
+def test_a_design_that_is_too_long_for_an_address_has_none(client):
+    nm = [300.0 + k * 1.123456789 for k in range(350)]
+    table = {"wavelength_nm": nm, "value": [0.1234567890123456] * len(nm)}
+    changes = {f"camera.response.{key}": value for key, value in table.items()}
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 500.0, **changes})
+    assert query_of(draft, "") is None
+    sent = {"toml": draft.text, "toml-before": "", "do": "pin", "pinned": ""}
+    state = client.post("/new/preview", data=sent).json()
+    assert (state["address"], state["pinned_query"]) == ("", "")
+    assert "too long to be pinned" in state["wrong"]
+
+
+def test_an_address_of_no_design_is_told(client):
+    with pytest.raises(ConfigError, match=r"the address is of no design: name\.x"):
+        draft_of_query({"name.x": "3"})
+    answer = client.get("/new?name.x=3")
+    assert answer.status_code == 422
+    assert "of no design" in answer.text
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_design_of_its_address_and_gives_it_back(client):
+    text = client.get("/new?preset=sao-12deg&camera.fov_x_deg=16").text
+    assert "fov_x_deg = 16" in text
+    assert 'href="/new?preset=sao-12deg&amp;camera.fov_x_deg=16"' in text
+    state = _sent(client, "/new/preview", SPEC).json()
+    again = pinned_draft(state["address"].partition("?")[2])
+    assert again.spec == draft_of_text(SPEC).spec
+
+
+def test_a_reader_signs_in_and_comes_back_to_the_design(reader):
+    page = reader.get("/new?camera.fov_x_deg=16").text
+    [address] = re.findall(r'class="button" href="(/sign-in[^"]*)">Sign in to build', page)
+    form = reader.get(address.replace("&amp;", "&")).text
+    [kept] = re.findall(r'name="next" value="([^"]*)"', form)
+    assert kept == "/new?camera.fov_x_deg=16"
+    sent = {"token": reader.token, "next": kept}
+    reader.headers["Origin"] = str(reader.base_url)
+    answer = reader.post("/sign-in", data=sent)
+    assert answer.url.path == "/new"
+    assert "fov_x_deg = 16" in answer.text
+    assert re.search(r'<button [^>]*id="build"', answer.text)
+
+
+@pytest.fixture
+def reader(tmp_path):
+    token = token_of(tmp_path, "anna")
+    with client_of(tmp_path, anonymous="reader") as client:
+        client.token = token
+        yield client
+
+
+# The sensor
+
+
+def _changed(text: str, **changes: str) -> Draft:
+    known = draft_of_text(text)
+    form = {**known.values, "toml": known.text, "toml-before": known.text}
+    return draft_of_form(form | {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def test_the_years_of_a_mission_and_the_rules_of_the_sensor_are_fields():
+    rule = "selection__neighbours__"
+    draft = _changed(
+        SPEC,
+        epoch_jyear="2027-2042",
+        selection__max_drift_arcsec="2",
+        selection__thinning="information",
+        selection__max_stars_per_field="12",
+        **{f"{rule}psf_sigma_px": "0.9", f"{rule}max_offset_px": "0.05", f"{rule}action": "merge"},
+    )
+    assert draft.errors == {}
+    assert draft.spec.epoch_jyear == (2027.0, 2042.0)
+    assert draft.values["epoch_jyear"] == "2027-2042"
+    own = draft.spec.selection
+    assert (own.max_drift_arcsec, own.thinning, own.neighbours.action) == (
+        2.0, "information", "merge",
+    )  # fmt: skip
+    assert _changed(draft.text).text == draft.text
+    assert _changed(draft.text, epoch_jyear="2030").spec is None  # one year has no drift
+    wrong = _changed(SPEC, epoch_jyear="2042-2027", selection__neighbours__action="keep")
+    assert set(wrong.errors) == {"epoch_jyear", "selection.neighbours.psf_sigma_px"}
+
+
+def test_a_response_is_picked_and_another_takes_the_table_of_the_first_away():
+    csv = b"# counts: energy\nwavelength_nm,response\n400,0\n450,1\n500,0.5\n"
+    draft = draft_with(draft_of_text(SPEC), keys_of_file("My sensor (2).csv", csv, "photon"))
+    assert draft.spec.camera.response.response().counts == "energy"
+    assert draft.values["camera.response.name"] == "My-sensor-2"
+    assert draft.responses[-1] == ("My-sensor-2", "My-sensor-2: from a file")
+    assert _changed(draft.text).text == draft.text
+    shipped = _changed(draft.text, camera__response__name="silicon-cmos")
+    assert shipped.spec.camera.response.response().name == "silicon-cmos"
+    assert "wavelength_nm" not in shipped.text
+    none = _changed(draft.text, camera__response__name="")
+    assert none.spec == draft_of_text(SPEC).spec
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"wavelength_nm,value\n4000,1\n4500,1\n25000,1\n", "angstroms: divide them by 10"),
+        (b"a,b,c\n1,2,3\n", "line 1: found 'a,b,c'"),
+        (b"\xff\xfe\x00", "it is no text"),
+        (b"400,1\n" * 100_000, "more than 500,000 bytes"),
+    ],
+    ids=["angstroms", "three columns", "a picture", "too large"],
+)
+def test_a_file_that_is_no_response_is_told_beside_its_field(client, content, told):
+    sent = {"toml": SPEC.replace("20.0", "500.0"), "toml-before": "", "response_per": "photon"}
+    file = {"response_file": ("sensor.csv", content, "text/csv")}
+    state = client.post("/new/preview", data=sent, files=file).json()
+    assert told in state["errors"]["response_file"]
+    assert "sensor.csv" in state["errors"]["response_file"]
+    assert not state["can_build"]
+    assert "camera.response" not in state["toml"]
+
+
+@pytest.mark.slow
+def test_a_dropped_response_changes_the_magnitudes_that_are_counted(client):
+    csv = "\n".join(f"{nm},{1.0 if nm < 500 else 0.0}" for nm in range(380, 561, 20)).encode()
+    sent = {"toml": SPEC, "toml-before": SPEC, "response_per": "photon", "do": "preview"}
+    before = _sent(client, "/new/preview", SPEC).json()
+    while True:  # the catalog is read again, in the band
+        file = {"response_file": ("blue.csv", csv, "text/csv")}
+        state = client.post("/new/preview", data=sent, files=file).json()
+        if not state["is_busy"]:
+            break
+    assert state["errors"] == {}
+    assert draft_of_text(state["toml"]).spec.camera.response.name == "blue"
+    assert "camera.response.wavelength_nm" in state["address"]
+    assert state["stars"] != before["stars"]
+
+
+# Names
+
+
+def test_name_and_description_of_a_preset_follow_the_camera():
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
+    assert draft.values["name"] == "gaia-20deg"
+    told = "gaia, G <= 6, for a 20 x 20 deg camera of 1024 x 1024 px"
+    assert draft.values["description"] == told
+    wrong = draft_with(draft, {"camera.fov_x_deg": 500.0})
+    assert wrong.values["description"] == told
+    again = draft_with(wrong, {"camera.fov_x_deg": 7.25, "selection.faint_limit_mag": 7.0})
+    assert again.values["name"] == "gaia-7-25deg"
+    assert "G <= 7, for a 7.25 x 7.25 deg" in again.values["description"]
+
+
+def test_an_address_is_short_where_the_name_follows():
+    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
+    assert query_of(draft, "") == "?camera.fov_x_deg=20.0"
+    assert draft_of_query({"camera.fov_x_deg": "20.0"}).content == draft.content
+    stale = draft_of_text(draft.text.replace("gaia-20deg", "gaia-12deg"))
+    assert pinned_draft(query_of(stale, "")).values["name"] == "gaia-12deg"
+
+
+def test_what_somebody_has_called_a_design_stays():
+    mine = {"name": "polaris", "description": "For the second flight."}
+    draft = draft_with(draft_with(draft_of_query({}), mine), {"camera.fov_x_deg": 20.0})
+    assert {key: draft.values[key] for key in mine} == mine
+    draft = draft_with(draft_of_query({}), {"version": "1.0.1"})
+    assert draft.values["description"].startswith("Embedded sky (Gaia DR3")
+
+
+def test_a_second_database_of_one_name_and_version_is_refused(client):
+    first = client.post(
+        "/new", data={"toml": SPEC, "toml-before": "", "do": "build"}, follow_redirects=False
+    )
+    assert first.status_code == 303
+    other = SPEC.replace("4.5", "4.4")
+    page = _sent(client, "/new", other, do="build")
+    assert page.status_code == 422
+    told = re.search(r'id="version-error">([^<]*)<', page.text)
+    assert told is not None
+    assert "mine 1.0.0 is there already" in told[1]
+    assert "such as 1.0.1" in told[1]
+    wish = {"kind": "build", "spec": other}
+    answer = client.post("/api/v1/jobs", json=wish)
+    assert (answer.status_code, answer.json()["key"]) == (409, "version")
+    again = client.post("/api/v1/jobs", json={"kind": "build", "spec": SPEC})
+    assert again.status_code == 200  # the same database: the job that makes it
+    later = other.replace("1.0.0", "1.0.1")
+    assert client.post("/api/v1/jobs", json={"kind": "build", "spec": later}).status_code == 201
+
+
+# What it would give
+
+
+@pytest.mark.slow
+def test_limits_are_suggested_for_the_camera(client):
+    state = _sent(client, "/new/preview", SPEC.replace("4.5", "3"), do="suggest").json()
+    draft = draft_of_text(state["toml"])
+    assert draft.spec is not None
+    assert draft.spec.selection.faint_limit_mag == 5.2
+    assert draft.spec.selection.max_stars_per_field == 12
+    assert draft.spec.boresights.count == 2000
+    assert draft.spec.name == "mine"
+    assert "For 20 x 20 deg: faint limit 5.2" in state["wrong"]
+    assert "Good: 99 % of the fields have 12 guide stars" in state["result"]
+    page = _sent(client, "/new", SPEC, do="suggest")  # without scripts
+    assert "faint_limit_mag = 5.2" in page.text
+
+
+def test_no_limits_are_suggested_for_a_wrong_camera(client):
+    state = _sent(client, "/new/preview", SPEC.replace("20.0", "500"), do="suggest").json()
+    assert "before the fields of the camera are right" in state["wrong"]
+    assert "500" in state["toml"]
+
+
+@pytest.mark.parametrize(
+    ("limit", "level", "words"),
+    [
+        ("3.5", "bad", r"\d\d % of the sky is blind: .* a build fails .*90 % .* Go to G 5\.2\."),
+        ("4.3", "bad", r"^\d(\.\d)? % of the sky is blind: [^,]*guide stars\. Go to G 5\.2\."),
+        ("4.9", "warn", r"Thin: 1 % of the fields have 7 .* Go to G 5\.2\."),
+        ("5.5", "good", r"Good: 99 % of the fields have \d\d guide stars"),
+        ("6.7", "good", r"more than are needed: G 5\.2, or a limit of stars per field"),
+    ],
+)
+def test_an_estimate_has_a_verdict_in_words(client, limit, level, words):
+    text = SPEC.replace("4.5", limit).replace("mine", "judged")
+    text = text.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
+    state = _sent(client, "/new/preview", text).json()
+    told = re.search(r'<p class="verdict (\w+)" id="verdict">([^<]*)<', state["result"])
+    assert told is not None
+    assert told[1] == level
+    assert re.search(words, told[2]), told[2]
+    assert state["can_build"] == ("a build fails" not in told[2]), state["summary"]
+
+
+def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
+    text = f"{SPEC}brightest = 3\n".replace("4.5", "6.0\nmax_stars = 400")
+    state = _sent(client, "/new/preview", text).json()
+    assert "is faint enough: the other rules remove the stars" in state["result"]
+
+
+def test_presets_of_catalogs_that_are_not_here_are_grey(client, monkeypatch):
+    monkeypatch.setenv("STARCAT_CACHE", "/nonexistent")
+    monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
+    text = client.get("/new").text
+    assert 'href="/new?preset=gaia-12deg"' in text
+    assert 'href="/new?preset=sao-12deg"' not in text
+    assert 'aria-describedby="presets-lack">sao-12deg<' in text
+    assert "gets each with starcat fetch sao and starcat fetch hipparcos" in text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "keys"),
+    [
+        ("", []),
+        ("faint_limit_mag = 99", ["selection.faint_limit_mag"]),
+        ("faint_limit_mag = 99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
+        ("faint_limit_mag = -28", ["selection.faint_limit_mag"]),
+        ("faint_limit_mag = 7.5", ["selection.max_stars_per_field"]),
+        ("faint_limit_mag = 5", []),
+    ],
+    ids=["as it is", "one", "two", "no star is left", "too much memory", "another"],
+)
+def test_nothing_is_built_while_anything_is_wrong(client, wrong, keys):
+    text = SPEC.replace("mine", "checked").replace(
+        "faint_limit_mag = 4.5", wrong or "faint_limit_mag = 4.6"
+    )
+    state = _sent(client, "/new/preview", text).json()
+    assert state["can_build"] == (not keys)
+    assert len(state["errors"]) == len([key for key in keys if key])
+    assert set(keys) - {None} <= set(state["errors"])
+    page = _sent(client, "/new", text, do="preview").text
+    [button] = re.findall(r'<button [^>]*id="build"[^>]*>', page)
+    assert ("disabled" in button) == bool(keys)
+    for key in state["errors"]:
+        assert re.search(rf'id="{re.escape(key)}-error">[^<]+<', page), key
+
+
+def test_a_pinned_design_is_compared_with_the_present_one(client):
+    pinned = _sent(client, "/new/preview", SPEC, do="pin").json()
+    query = pinned["pinned_query"]
+    assert "It is the same as this one" in pinned["result"]
+    text = SPEC.replace("4.5", "5.5")
+    state = _sent(client, "/new/preview", text, pinned=query).json()
+    row = re.search(r"selection.faint_limit_mag</th><td>(.*?)</td><td>(.*?)</td>", state["result"])
+    assert row is not None
+    assert row.groups() == ("5.5", "4.5")
+    assert state["result"].count("data:image/png") == 2
+    legends = re.findall(r'<ul class="legend".*?</ul>', state["result"], re.DOTALL)
+    assert legends[0] == legends[1]  # the colours mean the same
+    assert "pinned=" in state["address"]
+    page = client.get(state["address"]).text
+    assert "faint_limit_mag = 5.5" in page
+    assert re.search('id="pinned" value="[^"]*name=mine', page)
+    gone = _sent(client, "/new/preview", text, pinned=query, do="unpin").json()
+    assert gone["result"].count("data:image/png") == 1
+    assert "pinned" not in gone["address"]
+
+
+def test_designs_differ_by_their_keys():
+    mine, other = draft_of_text(SPEC), draft_of_text(SPEC.replace("4.5", "5").replace("300", "400"))
+    assert differences(mine, other) == [
+        ("selection.faint_limit_mag", "4.5", "5"),
+        ("boresights.count", "300", "400"),
+    ]

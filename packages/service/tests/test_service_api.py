@@ -1,0 +1,300 @@
+"""The REST interface about databases, the registry and releases, on a small database."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from artifact_copies import copied, seal
+from fastapi.testclient import TestClient
+from services import DATABASE, add_database, client_of, waiting_build
+
+from starcat.artifact.verify import verify_artifact
+from starcat.errors import ConfigError
+from starcat.releases.lockfile import pull_wanted
+from starcat.releases.pulling import pull_release
+from starcat.releases.registry import FolderRegistry
+from starcat.storage.download import DownloadOptions
+from starcat.storage.keys import new_key
+from starcat_service.jobs.cluster import unpack
+from starcat_service.settings import read_settings
+
+SETTINGS = {"anonymous": "publisher"}
+OTHER = "fedcba9876543210"
+API = f"/api/v1/databases/{DATABASE}"
+
+
+@pytest.fixture
+def own_root(tmp_path: Path, small_artifact: Path) -> Path:
+    add_database(tmp_path / "service", small_artifact)
+    return tmp_path / "service"
+
+
+@pytest.fixture
+def own(own_root: Path) -> Iterator[TestClient]:
+    """A client of a service of the test's own."""
+    with client_of(own_root, **SETTINGS) as client:
+        yield client
+
+
+def manifest_of(folder: Path) -> dict:
+    return json.loads((folder / "manifest.json").read_bytes())
+
+
+def test_databases_are_listed_with_their_facts(client, small_artifact):
+    [one] = client.get("/api/v1/databases").json()["databases"]
+    manifest = manifest_of(small_artifact)
+    assert one["id"] == DATABASE
+    assert one["title"] == "small-1.0.0"
+    assert one["stars"] == manifest["products"]["stars"]["rows"]
+    assert one["manifest_sha256"] == manifest["manifest_sha256"]
+    assert client.get(API).json() == one
+
+
+def test_a_database_that_is_not_there_is_not_found(client):
+    for database in ("0" * 16, "..", "0123456789ABCDEF", "%2e%2e%2f", "x" * 500):
+        for what in ("", "/manifest", "/files", "/coverage", "/archive"):
+            answer = client.get(f"/api/v1/databases/{database}{what}")
+            assert answer.status_code in (400, 404), (database, what)
+            assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_manifest_comes_once(client, small_artifact):
+    answer = client.get(f"{API}/manifest")
+    data = (small_artifact / "manifest.json").read_bytes()
+    assert answer.content == data
+    assert answer.headers["etag"] == f'"{hashlib.sha256(data).hexdigest()}"'
+    again = client.get(f"{API}/manifest", headers={"If-None-Match": answer.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_report_and_coverage_are_those_of_the_build(client, small_artifact):
+    report = client.get(f"{API}/report").json()
+    assert report == json.loads((small_artifact / "report" / "report.json").read_bytes())
+    coverage = client.get(f"{API}/coverage")
+    fields = coverage.json()["fields"]
+    summary = coverage.json()["summary"]
+    assert summary == report["coverage"]
+    assert len(fields["stars"]) == summary["fields"] == 200
+    assert min(fields["stars"]) == summary["stars"]["minimum"]
+    tag = {"If-None-Match": coverage.headers["etag"]}
+    assert client.get(f"{API}/coverage", headers=tag).status_code == 304
+
+
+def test_every_file_of_the_list_can_be_had(client, small_artifact):
+    listed = client.get(f"{API}/files").json()
+    on_disk = {str(p.relative_to(small_artifact)) for p in small_artifact.rglob("*") if p.is_file()}
+    assert {one["path"] for one in listed} == on_disk
+    for one in listed:
+        answer = client.get(f"{API}/files/{one['path']}")
+        assert hashlib.sha256(answer.content).hexdigest() == one["sha256"]
+        assert answer.headers["etag"] == f'"{one["sha256"]}"'
+        assert answer.headers["content-type"] == one["content_type"]
+        assert answer.headers["content-disposition"].startswith("attachment")
+        assert "immutable" in answer.headers["cache-control"]
+        head = client.head(f"{API}/files/{one['path']}")
+        assert (head.content, int(head.headers["content-length"])) == (b"", one["bytes"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "end"),
+    [("bytes=0-9", 0, 10), ("bytes=10-", 10, None), ("bytes=-7", -7, None), ("Bytes = 5-5", 5, 6)],
+)
+def test_a_range_is_a_part(client, small_artifact, asked, start, end):
+    data = (small_artifact / "stars.parquet").read_bytes()
+    answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (206, data[start:end])
+    first = start % len(data)
+    assert answer.headers["content-range"] == f"bytes {first}-{(end or len(data)) - 1}/{len(data)}"
+
+
+def test_what_is_no_single_range_is_the_whole_file(client, small_artifact):
+    data = (small_artifact / "stars.parquet").read_bytes()
+    no_single = "bytes=9-3 bytes=a-b lines=1-2 bytes bytes=0-1,5-6 bytes=- bytes=1_0-"
+    for asked in no_single.split(" "):
+        answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
+        assert (answer.status_code, answer.content) == (200, data), asked
+
+
+def test_a_range_beyond_the_end_is_told(client, small_artifact):
+    size = (small_artifact / "stars.parquet").stat().st_size
+    for asked in (f"bytes={size}-", "bytes=-0"):
+        answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
+        assert answer.status_code == 416
+        assert answer.headers["content-range"] == f"bytes */{size}"
+        assert answer.json()["status"] == 416
+
+
+def test_a_range_of_another_content_is_the_whole_file(client):
+    path = f"{API}/files/stars.parquet"
+    tag = client.head(path).headers["etag"]
+    asked = {"Range": "bytes=0-9", "If-Range": tag}
+    assert client.get(path, headers=asked).status_code == 206
+    assert client.get(path, headers={**asked, "If-Range": '"another"'}).status_code == 200
+
+
+def test_only_files_of_the_manifest_are_there(own, own_root):
+    (own_root / "databases" / DATABASE / "small-1.0.0" / "secret.txt").write_text("secret")
+    for path in (
+        "../small-1.0.0.build.json",
+        "..%2f..%2f..%2frecords.sqlite",
+        "%2e%2e/%2e%2e/%2e%2e/records.sqlite",
+        "/etc/passwd",
+        "report",
+        "report%2f..%2fstars.parquet",
+        "stars.parquet%00.json",
+        "STARS.parquet",
+        "secret.txt",
+    ):
+        assert own.get(f"{API}/files/{path}").status_code in (400, 404), path
+
+
+def test_a_link_is_no_file(own, own_root, tmp_path):
+    path = own_root / "databases" / DATABASE / "small-1.0.0" / "stars.parquet"
+    (tmp_path / "elsewhere").write_bytes(path.read_bytes())
+    path.unlink()
+    path.symlink_to(tmp_path / "elsewhere")
+    assert own.get(f"{API}/files/stars.parquet").status_code == 404
+    path.unlink()
+    assert own.get(f"{API}/files/stars.parquet").status_code == 404
+
+
+def test_the_archive_is_the_artifact(client, tmp_path):
+    answer = client.get(f"{API}/archive")
+    assert int(answer.headers["content-length"]) == len(answer.content)
+    unpack(answer.content, tmp_path / "out")
+    assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+    assert client.get(f"{API}/archive").content == answer.content
+
+
+def test_two_databases_are_compared(own, own_root, artifact_version):
+    add_database(own_root, artifact_version("1.1.0"), OTHER)
+    found = own.get(f"{API}/diff/{OTHER}").json()
+    assert [change["name"] for change in found["spec"]] == ["version"]
+    assert found["counts"] == {"came": 0, "went": 0, "moved": 0}
+    assert own.get(f"{API}/diff/{DATABASE}").json()["is_same"]
+    assert own.get(f"{API}/diff/{'0' * 16}").status_code == 404
+
+
+def test_a_removed_database_is_gone_and_its_release_stays(own, own_root):
+    own.post("/api/v1/releases", json={"database": DATABASE})
+    assert own.delete(API).status_code == 204
+    assert own.get(API).status_code == 404
+    assert not (own_root / "databases" / DATABASE).exists()
+    assert not list((own_root / "scratch").iterdir())
+    assert own.get("/api/v1/releases/small/1.0.0").status_code == 200
+
+
+def test_a_database_that_a_job_makes_is_not_removed(own):
+    job = waiting_build(own.app.state.service, DATABASE)
+    answer = own.delete(API)
+    assert answer.status_code == 409
+    assert job.id in answer.json()["detail"]
+    assert own.get(API).status_code == 200
+
+
+def test_who_may_only_read_neither_removes_nor_publishes(own_root):
+    with client_of(own_root) as client:
+        assert client.delete(API).status_code == 401
+        assert client.post("/api/v1/releases", json={"database": DATABASE}).status_code == 401
+        assert client.get(API).status_code == 200
+    with client_of(own_root, anonymous="none") as client:
+        for path in (API, f"{API}/files/stars.parquet", "/registry/index.json", "/api/v1/releases"):
+            assert client.get(path).status_code == 401
+
+
+def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
+    first = own.post("/api/v1/releases", json={"database": DATABASE, "note": "<b>first</b>"})
+    assert (first.status_code, first.json()["outcome"]) == (201, "published")
+    again = own.post("/api/v1/releases", json={"database": DATABASE, "note": "again"})
+    assert (again.status_code, again.json()["outcome"]) == (200, "unchanged")
+    [listed] = own.get("/api/v1/releases").json()["releases"]
+    assert (listed["note"], listed["owner"]) == ("<b>first</b>", "anonymous")
+    assert listed == own.get("/api/v1/releases/small/1.0.0").json()
+    [release] = FolderRegistry(own_root / "registry").releases()
+    assert release.title == "small-1.0.0"
+    pull_release(FolderRegistry(own_root / "registry"), release, tmp_path / "out")
+    assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+
+
+def test_what_the_service_publishes_is_signed_with_its_operators_key(
+    own_root, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    private, public = new_key(tmp_path / "service")
+    with client_of(own_root, **SETTINGS, signing_key=private) as client:
+        ran = client.post("/api/v1/releases", json={"database": DATABASE})
+        assert ran.status_code == 201
+        timestamp = client.get("/registry/metadata/timestamp.json")
+        assert "no-cache" in timestamp.headers["cache-control"]
+        assert client.get("/registry/metadata/1.targets.json").status_code == 200
+        for path in ("1.snapshots.json", "../service.toml", "0.root.json", "root.json.key", ""):
+            assert client.get(f"/registry/metadata/{path}").status_code == 404
+    places = {"output": tmp_path / "out", "lock": tmp_path / "lock"}
+    registry = str(own_root / "registry")
+    one = pull_wanted("small", registry, options=DownloadOptions(), trust=public, **places)
+    assert (one.folder.name, one.signed) == ("small-1.0.0", "checked")
+    with client_of(own_root, **SETTINGS) as client:
+        ran = client.post("/api/v1/releases", json={"database": DATABASE})
+        assert ran.status_code == 422
+        assert "its operator sets signing_key in service.toml" in ran.json()["detail"]
+
+
+def test_a_key_among_the_files_of_the_service_is_refused(tmp_path):
+    (tmp_path / "root").mkdir()
+    private, public = new_key(tmp_path / "root" / "service")
+    with pytest.raises(ConfigError, match=r"signing_key: .* is in the root"):
+        read_settings(tmp_path / "root", signing_key=private)
+    with pytest.raises(ConfigError, match="a public key, which only checks"):
+        read_settings(tmp_path / "other", signing_key=public)
+
+
+def test_another_content_under_a_published_version_is_refused(
+    own, own_root, tmp_path, artifact_version
+):
+    own.post("/api/v1/releases", json={"database": DATABASE})
+    other = copied(artifact_version("1.0.0"), tmp_path)
+    page = other / "report" / "index.html"
+    page.write_bytes(page.read_bytes() + b"<!-- other -->")
+    seal(other)
+    add_database(own_root, other, OTHER)
+    answer = own.post("/api/v1/releases", json={"database": OTHER})
+    assert answer.status_code == 409
+    assert "raise the version" in answer.json()["detail"]
+    [listed] = own.get("/api/v1/releases").json()["releases"]
+    assert listed["database"] == DATABASE
+
+
+def test_the_registry_is_its_own_files_only(own, own_root):
+    assert own.get("/registry/index.json").status_code == 404
+    own.post("/api/v1/releases", json={"database": DATABASE})
+    (own_root / "registry" / ".lock").touch()
+    index = own.get("/registry/index.json")
+    assert index.content == (own_root / "registry" / "index.json").read_bytes()
+    assert "no-cache" in index.headers["cache-control"]
+    tag = {"If-None-Match": index.headers["etag"]}
+    assert own.get("/registry/index.json", headers=tag).status_code == 304
+    release = own.get("/registry/versions/small/1.0.0.json").json()
+    digest = release["manifest"]["sha256"]
+    path = f"/registry/blobs/sha256/{digest[:2]}/{digest}"
+    blob = own.get(path)
+    assert hashlib.sha256(blob.content).hexdigest() == digest
+    assert "immutable" in blob.headers["cache-control"]
+    part = own.get(path, headers={"Range": "bytes=3-"})
+    assert (part.status_code, part.content) == (206, blob.content[3:])
+    assert own.head(path).status_code == 200
+    for other in (
+        ".lock",
+        "",
+        "..%2frecords.sqlite",
+        "versions/%2e%2e%2findex.json",
+        "versions/small/..%2f..%2findex.json",
+        "versions/small/01.0.0.json",
+        f"blobs/sha256/00/{'0' * 64}",
+        f"blobs/sha256/ab/{'0' * 64}",
+        ".incoming/x",
+    ):
+        assert own.get(f"/registry/{other}").status_code in (400, 404), other

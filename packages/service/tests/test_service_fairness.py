@@ -1,0 +1,328 @@
+"""The service under pressure: places that are shared, and what one user cannot take from others."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi")
+
+from fastapi.testclient import TestClient
+from served import serve
+from services import DATABASE, add_database, client_of
+
+from starcat.errors import QueryLimitError
+from starcat.query.engine import Engine
+from starcat.query.session import open_session
+from starcat_service.jobs.job import QUERY, begin_next
+from starcat_service.problems import Problem
+from starcat_service.sandbox import places
+from starcat_service.sandbox.places import Lanes, Overdue, Places, asker, lease
+from starcat_service.sandbox.pool import QueryPool
+from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
+from starcat_service.settings import Settings
+from starcat_service.vo import tap_jobs
+
+ENDLESS = "SELECT sum(a.i * b.j + c.i) FROM pairs a, pairs b, pairs c"
+LONG = "SELECT sum(sqrt(a.range * b.range)) FROM range(8000) a, range(10000) b"
+
+
+@pytest.fixture
+def pool(tmp_path: Path) -> Iterator[QueryPool]:
+    opened = QueryPool(Settings(root=tmp_path, queries=2, query_time_s=30.0))
+    yield opened
+    opened.close()
+
+
+# Places.
+
+
+def test_a_user_has_another_place_only_where_more_are_free_and_half_at_most():
+    shared = Places(4)
+    assert [shared.try_take("greedy") for _ in range(3)] == [True, True, False]
+    assert [shared.try_take("anna") for _ in range(2)] == [True, False]
+    assert shared.try_take("bob")
+    shared.release("greedy")
+    assert not shared.try_take("greedy")
+    assert shared.try_take("carl")
+
+
+def test_who_asks_what_takes_long_has_one_place_for_what_is_short():
+    lanes = Lanes(8, 2)
+    assert lanes.long.try_take("greedy")
+    assert [lanes.short.try_take("greedy") for _ in range(2)] == [True, False]
+    assert [lanes.short.try_take("anna") for _ in range(2)] == [True, True]
+
+
+def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_longest():
+    shared, order = Places(2), list[str]()
+    shared.take("greedy", 1.0)
+    shared.take("anna", 1.0)
+
+    def wait(who: str) -> None:
+        shared.take(who, 10.0)
+        order.append(who)
+        shared.release(who)
+
+    threads = []
+    for number, who in enumerate(["greedy", "greedy", "greedy", "anna", "bob"], start=1):
+        threads.append(threading.Thread(target=wait, args=(who,)))
+        threads[-1].start()
+        while sum(map(shared.waiting, ("greedy", "anna", "bob"))) < number:
+            time.sleep(0.001)
+    shared.release("anna")
+    for thread in threads[-2:]:
+        thread.join(10.0)
+    assert order[:2] == ["bob", "anna"], "greedy asked before both, and holds a place"
+    shared.release("greedy")
+    for thread in threads:
+        thread.join(10.0)
+    assert order[2:] == ["greedy"] * 3
+
+
+def test_who_waits_too_long_is_told_to_come_again():
+    shared = Places(1)
+    shared.take("anna", 1.0)
+    with pytest.raises(Problem, match="ask again later") as caught:
+        shared.take("bob", 0.01)
+    assert caught.value.status == 503
+    assert int(caught.value.headers["Retry-After"]) >= 1
+    with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as own:
+        asyncio.run(shared.take_later("anna", 0.01))
+    assert own.value.status == 429
+    shared.release("anna")
+    assert shared.try_take("bob"), "nobody who went away has the place"
+
+
+def test_a_client_that_goes_while_it_waits_takes_no_place():
+    shared = Places(1)
+
+    async def go() -> None:
+        shared.take("anna", 1.0)
+        waiting = asyncio.create_task(shared.take_later("bob", 10.0))
+        await asyncio.sleep(0.01)
+        waiting.cancel()
+        await asyncio.gather(waiting, return_exceptions=True)
+        shared.release("anna")
+
+    asyncio.run(go())
+    assert shared.try_take("carl")
+
+
+def test_what_is_not_short_is_begun_again_where_it_may_take_long():
+    lanes, seen = Lanes(1, 1), list[bool]()
+
+    def function() -> str:
+        place = lease.get()
+        assert place is not None
+        seen.append(place.is_long)
+        if not place.is_long:
+            assert not place.prolong()
+            raise Overdue
+        return "done"
+
+    async def go() -> str:
+        lanes.long.take("other", 1.0)
+        running = asyncio.create_task(lanes.run(10.0, function))
+        while not lanes.long.waiting(""):
+            await asyncio.sleep(0.001)
+        assert lanes.short.try_take("anna"), "it waits in the long lane only"
+        lanes.long.release("other")
+        return await running
+
+    assert asyncio.run(go()) == "done"
+    assert seen == [False, True]
+    assert lanes.long.try_take("anna")
+
+
+def test_a_user_may_have_so_many_long_queries_waiting(monkeypatch):
+    monkeypatch.setattr(places, "MOST_WAITING", 0)
+    lanes = Lanes(1, 1)
+
+    def function() -> None:
+        raise Overdue
+
+    with pytest.raises(Problem, match="wait for one that takes long") as caught:
+        asyncio.run(lanes.run(10.0, function))
+    assert caught.value.status == 429
+
+
+# Queries.
+
+
+def ask(pool: QueryPool, target: Path, query: str) -> list[tuple[Any, ...]]:
+    with pool.session([target]) as session, session.ask(query) as running:
+        return running.rows(1)
+
+
+@pytest.mark.timeout(60)
+def test_short_queries_pass_those_that_take_long(pool, small_artifact):
+    """Two users ask what has no end; what is asked by others is answered meanwhile."""
+
+    async def of(who: str, query: str) -> object:
+        asker.set(who)
+        try:
+            return await pool.run(ask, pool, small_artifact, query)
+        except QueryLimitError as error:
+            return error
+
+    async def go() -> list[object]:
+        greedy = [asyncio.create_task(of(who, ENDLESS)) for who in ("a", "b", "a", "b", "a")]
+        await asyncio.sleep(3.0 * places.SHORT_S)
+        took = []
+        for number in range(12):
+            began = time.monotonic()
+            assert await of(f"user {number % 3}", f"SELECT {number}") == [(number,)]
+            took.append(time.monotonic() - began)
+        assert not any(task.done() for task in greedy), "they run, or wait"
+        pool.close()
+        for task in greedy:
+            task.cancel()
+        return took
+
+    pool._limits = type(pool._limits)(time_s=8.0, memory_gb=0.5, disk_gb=0.1)
+    assert len(asyncio.run(go())) == 12
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+def test_a_query_that_is_begun_again_has_the_same_answer(pool, small_artifact, monkeypatch):
+    monkeypatch.setattr(places, "SHORT_S", 0.05)
+    held = pool._lanes.long
+    for who in ("a", "b"):
+        held.take(who, 1.0)
+
+    async def go() -> list[tuple[Any, ...]]:
+        running = asyncio.create_task(pool.run(ask, pool, small_artifact, LONG))
+        while not held.waiting(""):
+            assert not running.done()
+            await asyncio.sleep(0.01)
+        assert len(pool._open._idle) == 1, "its process was interrupted, and serves others"
+        held.release("a")
+        return await running
+
+    found = asyncio.run(go())
+    assert found == ask(pool, small_artifact, LONG)
+    assert held.try_take("a"), "its place is given back"
+    assert pool._lanes.short.try_take("a")
+
+
+def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
+    given: list[tuple[str, object]] = []
+    own = Engine.ask
+
+    def noted(self: Engine, name: str, *arguments: Any, **options: Any) -> Any:
+        given.append((name, options.get("allowance")))
+        return own(self, name, *arguments, **options)
+
+    with open_session([str(small_artifact)]) as session:
+        monkeypatch.setattr(Engine, "ask", noted)
+        with session.ask("SELECT count(*) FROM stars") as running:
+            running.rows(1)
+    assert [name for name, _ in given] == ["check", "rows"]
+    assert given[0][1] is given[1][1] is not None
+
+
+def test_a_request_has_one_allowance(pool, small_artifact):
+    with pool.session([small_artifact], time_s=20.0) as session:
+        with session.ask("SELECT 1") as running:
+            assert running.rows(1) == [(1,)]
+        session.allowance.left_s = 0.2
+        with pytest.raises(QueryLimitError, match="stopped after 20 s"), session.ask(ENDLESS) as it:
+            it.rows(1)
+
+
+# TAP.
+
+
+@pytest.mark.timeout(60)
+def test_a_long_answer_of_tap_is_sent_as_it_is_made_and_a_short_one_when_it_is_whole(root):
+    with client_of(root, queries=2) as client:
+        found = [
+            client.get("/tap/sync", params={"QUERY": query, "FORMAT": "csv"})
+            for query in (
+                "SELECT TOP 3 i, j FROM small.pairs ORDER BY i, j",
+                "SELECT COUNT(*) AS n FROM small.pairs AS a, small.stars AS b WHERE a.i < b.mag",
+            )
+        ]
+        assert [one.status_code for one in found] == [200, 200]
+        assert [one.text.count("\n") for one in found] == [4, 2]
+        lanes = client.app.state.service.query_pool._lanes
+        assert [lane._free for lane in (lanes.short, lanes.long)] == [places.SHORT_PLACES, 2]
+
+
+def client_at(client: TestClient, address: str) -> TestClient:
+    return TestClient(client.app, base_url=client.base_url, client=(address, 50_000))
+
+
+def test_jobs_of_tap_are_shared_by_address(root, monkeypatch):
+    monkeypatch.setattr(tap_jobs, "MAX_WAITING", 2)
+    with client_of(root) as client:
+        one, other = (client_at(client, address) for address in ("192.0.2.1", "192.0.2.2"))
+        for at in (one, one, other):
+            assert at.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
+        refused = one.post("/tap/async", data={"QUERY": "SELECT 1"})
+        assert refused.status_code == 422
+        assert "2 of your jobs are not at their end" in refused.text
+        assert other.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
+        jobs = client.app.state.service.query_jobs
+        for job in jobs.jobs("anonymous"):
+            jobs.delete(job.job_id)
+
+
+def test_jobs_that_wait_are_begun_in_turns(root):
+    with client_of(root) as client:
+        jobs, records = client.app.state.service.query_jobs, client.app.state.service.records
+        client.app.state.slots.begin_stop()
+        names: dict[str, str] = {}
+        for name in ("greedy", "greedy", "greedy", "anna", "bob"):
+            asker.set(name)
+            names[jobs.create("anonymous").job_id] = name
+        for job_id in names:
+            jobs.run(job_id)
+        begun = [begin_next(records, (QUERY,)) for _ in names]
+        order = [names[job.id] for job in begun if job is not None]
+        assert order == ["greedy", "anna", "bob", "greedy", "greedy"]
+        for job_id in names:
+            jobs.delete(job_id)
+
+
+# Connections.
+
+
+def test_requests_at_the_same_time_are_counted_by_user():
+    shares = Shares(1)
+    with shares.one("anna"), shares.one("bob"):
+        with pytest.raises(Problem) as caught, shares.one("anna"):
+            pass
+        assert caught.value.status == 429
+    with shares.one("anna"):
+        pass
+
+
+def test_connections_are_shared_by_address(tmp_path, small_artifact):
+    add_database(tmp_path / "root", small_artifact)
+    with serve(tmp_path / "root", tmp_path / "log") as served:
+
+        def connection(own: str) -> socket.socket:
+            return socket.create_connection(("127.0.0.1", served.port), 10.0, (own, 0))
+
+        lines = [connection("127.0.0.1") for _ in range(OWN_CONNECTIONS)]
+        try:
+            time.sleep(0.2)
+            with connection("127.0.0.1") as refused:
+                assert refused.recv(1000).startswith(b"HTTP/1.1 429 ")
+            with connection("127.0.0.2") as other:
+                path = f"/api/v1/databases/{DATABASE}"
+                other.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                assert other.recv(1000).startswith(b"HTTP/1.1 200 ")
+        finally:
+            for line in lines:
+                line.close()

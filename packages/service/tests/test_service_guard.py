@@ -1,0 +1,506 @@
+"""What every request of the service passes: who asks, how often, how much, and from where."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import socket
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from services import waiting_build
+
+pytest.importorskip("fastapi")
+
+from fastapi import FastAPI, Request
+from prometheus_client.parser import text_string_to_metric_families
+from starlette.testclient import TestClient
+
+from starcat.errors import ConfigError, TargetMissing
+from starcat_service import access, removal
+from starcat_service.access import Reader, principal_of
+from starcat_service.app import make_app
+from starcat_service.security import request_limits
+from starcat_service.security.middleware import JsonFormatter
+from starcat_service.security.request_limits import Buckets
+from starcat_service.security.tokens import TokenStore
+from starcat_service.server import listen, run_server
+from starcat_service.settings import Role, Settings, read_settings
+
+Make = Callable[..., TestClient]
+
+
+def with_probes(app: FastAPI) -> FastAPI:
+    """Add addresses that do what handlers do: tell who asks, read a body, break."""
+
+    @app.get("/probe/who")
+    def tell(request: Request) -> dict[str, str]:
+        principal = principal_of(request)
+        return {"name": principal.name, "role": principal.role.name}
+
+    @app.get("/probe/{thing}/read")
+    def read(thing: str, who: Reader) -> str:
+        return thing
+
+    @app.post("/probe/body")
+    async def take(request: Request) -> int:
+        return len(await request.body())
+
+    @app.get("/probe/broken")
+    def broken() -> None:
+        raise RuntimeError("secret words of a library, with /a/path")
+
+    return app
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[Make]:
+    """Clients of services with settings, each named 127.0.0.1 unless told otherwise."""
+    opened = []
+
+    def make(**options: Any) -> TestClient:
+        app = with_probes(make_app(read_settings(tmp_path / "root", **options)))
+        opened.append(app)
+        return TestClient(app, base_url="http://127.0.0.1")
+
+    yield make
+    for app in opened:
+        app.state.service.records.close()
+
+
+def tokens_of(client: TestClient) -> TokenStore:
+    app: Any = client.app
+    return TokenStore(app.state.service.records)
+
+
+@pytest.fixture
+def anna(client):
+    """A client of a service, and the token of one of its readers."""
+    at = client()
+    return at, tokens_of(at).create("anna", Role.READER)[1]
+
+
+def bearer(text: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {text}"}
+
+
+def test_a_token_is_kept_as_a_digest_only(client):
+    at = client()
+    token, text = tokens_of(at).create("anna", Role.BUILDER)
+    app: Any = at.app
+    path = app.state.service.paths.records
+    app.state.service.records.close()
+    written = b"".join(one.read_bytes() for one in path.parent.glob("records.sqlite*"))
+    assert token.name.encode() in written
+    assert text.encode() not in written
+    assert text.removeprefix("starcat_").encode() not in written
+    assert text.startswith("starcat_")
+    assert len(text) == 8 + 43  # 256 bits in base 64
+
+
+def test_a_token_gives_its_role_by_each_way_to_send_it(client):
+    at = client()
+    _, text = tokens_of(at).create("anna", Role.BUILDER)
+    builder = {"name": "anna", "role": "BUILDER"}
+    assert at.get("/probe/who").json() == {"name": "anonymous", "role": "READER"}
+    assert at.get("/probe/who", headers=bearer(text)).json() == builder
+    assert at.get("/probe/who", auth=("anyone", text)).json() == builder
+    assert at.get("/probe/who", headers={"Authorization": f"Digest {text}"}).status_code == 401
+
+
+@pytest.mark.parametrize(
+    "wrong", ["starcat_", "starcat_x", "", "x" * 10_000, "starcat_\xe9", "'--"]
+)
+def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client, wrong):
+    found = client().get(
+        "/probe/who", headers={"Authorization": f"Bearer {wrong}".encode("latin-1")}
+    )
+    assert found.status_code == 401
+    assert found.headers["content-type"] == "application/problem+json"
+    assert "not valid" in found.json()["detail"]
+
+
+def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
+    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    at = client()
+    store = tokens_of(at)
+    _, short = store.create("short", Role.READER, expires_days=1.0)
+    _, text = store.create("anna", Role.READER)
+    assert at.get("/probe/who", headers=bearer(text)).status_code == 200
+    assert [token.name for token in store.revoke("anna")] == ["anna"]
+    assert at.get("/probe/who", headers=bearer(text)).status_code == 401
+    assert at.get("/probe/who", headers=bearer(short)).status_code == 200
+    tomorrow = time.time() + 86_401.0
+    monkeypatch.setattr(time, "time", lambda: tomorrow)
+    assert at.get("/probe/who", headers=bearer(short)).status_code == 401
+    with pytest.raises(TargetMissing, match="no valid token"):
+        store.revoke("anna")
+
+
+def test_a_known_token_is_believed_without_being_looked_up(anna, monkeypatch):
+    at, text = anna
+    found: list[int] = []
+    asked = TokenStore.find
+    monkeypatch.setattr(
+        TokenStore, "find", lambda self, text: (found.append(1), asked(self, text))[1]
+    )
+    for _ in range(5):
+        assert at.get("/probe/who", headers=bearer(text)).json()["name"] == "anna"
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("name", ["", "-x", "a b", "anonymous", "x" * 65, "a\n", "<b>"])
+def test_a_token_is_called_by_a_plain_name(client, name):
+    with pytest.raises(ConfigError, match="cannot be the name of a token"):
+        tokens_of(client()).create(name, Role.READER)
+
+
+def test_one_valid_token_has_a_name(client):
+    store = tokens_of(client())
+    store.create("anna", Role.READER)
+    with pytest.raises(ConfigError, match="revoke that one first: starcat token revoke anna"):
+        store.create("anna", Role.READER)
+    store.revoke("anna")
+    store.create("anna", Role.READER)
+    assert [token.state(time.time()) for token in store.all()] == ["revoked", "valid"]
+
+
+def test_guessing_is_slowed_down_and_the_right_token_still_goes_through(anna):
+    at, text = anna
+    wrong = [at.get("/probe/who", headers=bearer(f"starcat_{k}")) for k in range(15)]
+    assert [one.status_code for one in wrong] == [401] * 10 + [429] * 5
+    assert 1 <= int(wrong[-1].headers["retry-after"]) <= 6
+    form = {"token": "starcat_wrong"}
+    assert at.post("/sign-in", data=form).status_code == 429
+    assert at.get("/probe/who", headers=bearer(text)).status_code == 200
+
+
+def test_a_sign_in_is_a_cookie_that_is_not_the_token(client):
+    at = client()
+    _, text = tokens_of(at).create("anna", Role.PUBLISHER)
+    answer = at.post("/sign-in", data={"token": text, "next": "/jobs"}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/jobs")
+    cookie = answer.headers["set-cookie"]
+    assert text not in cookie
+    assert cookie.startswith("starcat=")
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
+    assert "Secure" not in cookie
+    assert at.get("/probe/who").json() == {"name": "anna", "role": "PUBLISHER"}
+    secret = at.cookies["starcat"]
+    own = {"Origin": "http://127.0.0.1"}
+    assert at.post("/sign-out", headers=own, follow_redirects=False).status_code == 303
+    at.cookies.set("starcat", secret)
+    assert at.get("/probe/who").json()["name"] == "anonymous"
+
+
+def test_a_sign_in_ends_with_its_time_and_with_its_token(client, monkeypatch):
+    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    at = client(session_hours=1.0)
+    store = tokens_of(at)
+    _, text = store.create("anna", Role.READER)
+    at.post("/sign-in", data={"token": text})
+    assert at.get("/probe/who").json()["name"] == "anna"
+    secret, later = at.cookies["starcat"], time.time() + 3601.0
+    kept = {"Cookie": f"starcat={secret}"}
+    with monkeypatch.context() as changed:
+        changed.setattr(time, "time", lambda: later)
+        assert at.get("/probe/who", headers=kept).json()["name"] == "anonymous"
+    assert at.get("/probe/who", headers=kept).json()["name"] == "anna"
+    store.revoke("anna")
+    assert at.get("/probe/who", headers=kept).json()["name"] == "anonymous"
+
+
+def test_the_cookie_is_for_https_alone_where_people_come_by_https(client):
+    at = client(public_url="https://stars.example")
+    at.base_url = "https://stars.example"  # type: ignore[assignment]
+    _, text = tokens_of(at).create("anna", Role.READER)
+    answer = at.post("/sign-in", data={"token": text}, follow_redirects=False)
+    assert answer.headers["set-cookie"].startswith("__Host-starcat=")
+    assert "Secure" in answer.headers["set-cookie"]
+    assert answer.headers["strict-transport-security"] == "max-age=31536000"
+
+
+def test_a_wrong_token_of_a_sign_in_shows_the_form_again(client):
+    found = client().post("/sign-in", data={"token": "starcat_x", "next": "//evil.example"})
+    assert found.status_code == 401
+    assert "not valid" in found.text
+    assert "evil.example" not in found.text
+    assert "set-cookie" not in found.headers
+
+
+@pytest.mark.parametrize("options", [{"host": "0.0.0.0"}, {"public_url": "https://stars.example"}])
+def test_others_than_this_machine_need_a_token_for_all_but_signing_in(client, options):
+    at = client(**options)
+    _, text = tokens_of(at).create("anna", Role.READER)
+    for path in ("/probe/who", "/metrics", "/readyz", "/api/openapi.json", "/nothing"):
+        found = at.get(path)
+        assert found.status_code == 401, path
+        assert found.headers["www-authenticate"] == 'Bearer realm="starcat"'
+    assert at.get("/tap/tables").headers["www-authenticate"].startswith("Basic ")
+    assert at.get("/healthz").status_code == 200
+    assert at.get("/tap/capabilities").status_code == 200
+    assert at.get("/sign-in").status_code == 200
+    seen = at.get("/jobs", headers={"Accept": "text/html"}, follow_redirects=False)
+    assert (seen.status_code, seen.headers["location"]) == (303, "/sign-in?next=/jobs")
+    assert at.get("/probe/who", headers=bearer(text)).json()["role"] == "READER"
+
+
+@pytest.mark.parametrize("options", [{"host": "0.0.0.0"}, {"public_url": "https://stars.example"}])
+def test_the_server_does_not_begin_where_others_could_not_get_in(tmp_path, options):
+    settings = read_settings(tmp_path / "root", **options)
+    with pytest.raises(ConfigError, match="make one first: starcat token create NAME"):
+        run_server(settings, print)
+
+
+def test_requests_of_one_address_or_token_are_limited(client):
+    at = client(requests_per_minute=1)
+    _, text = tokens_of(at).create("anna", Role.READER)
+    found = [at.get("/probe/who") for _ in range(3)]
+    assert [one.status_code for one in found] == [200, 429, 429]
+    assert 1 <= int(found[-1].headers["retry-after"]) <= 60
+    assert at.get("/healthz").status_code == 200
+    assert at.get("/probe/who", headers=bearer(text)).status_code == 200
+
+
+def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
+    now = [0.0]
+    buckets = Buckets(2.0, lambda: now[0])
+    assert [buckets.take("a") for _ in range(3)] == [0.0, 0.0, 30.0]
+    now[0] = 15.0
+    assert buckets.take("a") == 15.0
+    now[0] = 30.0
+    assert buckets.take("a") == 0.0
+    assert buckets.take("a") == 30.0
+    monkeypatch.setattr("starcat_service.security.request_limits.MOST_BUCKETS", 2)
+    buckets.take("b")
+    buckets.take("c")
+    assert buckets.take("a") == 0.0  # full again, for it was forgotten
+
+
+def test_addresses_of_one_network_are_counted_together():
+    assert access.network_of("2001:db8:0:1::1") == access.network_of("2001:db8:0:1:ffff::2")
+    assert access.network_of("2001:db8:0:2::1") != access.network_of("2001:db8:0:1::1")
+
+
+FORGED = [
+    {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
+    {"Origin": "http://127.0.0.1.evil.example"}, {"Sec-Fetch-Site": "cross-site"},
+    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat=anything"},
+]  # fmt: skip
+HONEST = [
+    {}, {"Origin": "http://127.0.0.1"}, {"Cookie": "other=1"},
+    {"Sec-Fetch-Site": "same-origin", "Origin": "http://127.0.0.1"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"), [*((one, 403) for one in FORGED), *((one, 200) for one in HONEST)]
+)
+def test_what_another_site_makes_a_browser_send_is_refused(client, headers, status):
+    at = client(anonymous="publisher")
+    assert at.post("/probe/body", headers=headers).status_code == status
+    assert at.get("/probe/who", headers=headers).status_code == 200
+
+
+PUBLIC = {"public_url": "https://stars.example"}
+HOSTS = [
+    ({}, "localhost:8000", 200), ({}, "127.0.0.1:1", 200), ({}, "[::1]:8000", 200),
+    ({}, "LOCALHOST", 200), ({}, "evil.example", 421), ({}, "localhost.evil.example", 421),
+    ({}, "127.0.0.1.evil.example:8000", 421), ({}, "a b", 400), ({}, "localhost/../x", 400),
+    ({}, "", 400), (PUBLIC, "stars.example", 200), (PUBLIC, "evil.example", 421),
+    ({"host": "0.0.0.0"}, "anything.example", 200),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "host", "status"), HOSTS)
+def test_a_name_that_is_not_ours_is_refused(client, options, host, status):
+    assert client(**options).get("/healthz", headers={"Host": host}).status_code == status
+
+
+TARGETS = [
+    ("/probe/%00/read", 400), ("/probe/%0d%0aX:y/read", 400), ("/probe/..%2f..%2fetc/read", 400),
+    ("/probe/%2e%2e/read", 400), ("/probe/..%5c..%5cx/read", 400), ("/probe/a/read?x=%00", 400),
+    ("/probe/a/read?x=" + "y" * 20_000, 414), ("/probe/a..b/read", 200),
+    ("/probe/a/read?x=%0a..", 200),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "status"), TARGETS)
+def test_addresses_that_no_honest_client_sends_are_refused(client, path, status):
+    assert client().get(path).status_code == status
+
+
+def test_too_many_headers_and_odd_methods_are_refused(client):
+    at = client()
+    many = {f"X-{k}": "v" for k in range(120)}
+    assert at.get("/healthz", headers=many).status_code == 431
+    assert at.get("/healthz", headers={"X-Long": "v" * 40_000}).status_code == 431
+    assert at.request("TRACE", "/healthz").status_code == 405
+    assert at.request("PURGE\u0130", "/healthz").status_code == 405
+
+
+def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client):
+    at = client(upload_mib=0.5)
+    large = b"x" * (2**19 + 1)
+    assert at.post("/probe/body", content=large[:-1]).json() == 2**19
+    assert at.post("/probe/body", content=large).status_code == 413
+    assert at.post("/probe/body", content=iter([large[:100], large])).status_code == 413
+    at = client()
+    json_text = {"Content-Type": "application/json"}
+    assert at.post("/probe/body", content=b"x" * (2**20 + 1), headers=json_text).status_code == 413
+    assert at.post("/probe/body", content=b"x" * (2**20 + 1)).status_code == 200
+    assert at.post("/probe/body", headers={"Content-Length": "-1"}).status_code == 400
+
+
+def test_nothing_is_added_to_a_full_disk(client, monkeypatch):
+    at = client()
+    monkeypatch.setattr(request_limits, "free_gib", lambda folder: 0.99)
+    found = at.post("/probe/body", files={"file": b"x"})
+    assert found.status_code == 507
+    assert "0.99 GiB free, and 1 have to be left" in found.json()["detail"]
+    assert at.post("/probe/body", content=b"x").status_code == 200
+    assert at.get("/probe/who").status_code == 200
+
+
+def test_a_defect_tells_the_log_and_not_the_client(client, caplog):
+    found = client().get("/probe/broken", headers={"X-Request-ID": "mine-1"})
+    assert found.status_code == 500
+    assert "secret words" not in found.text
+    assert "Traceback" not in found.text
+    assert found.headers["x-request-id"] == "mine-1"
+    assert found.headers["content-security-policy"].startswith("default-src 'self'")
+    [record] = [one for one in caplog.records if one.exc_info]
+    line = json.loads(JsonFormatter().format(record))
+    assert "secret words" in line["exception"]
+
+
+def test_the_log_is_a_line_of_json_for_each_request(anna, caplog):
+    caplog.set_level(logging.INFO, "starcat_service")
+    at, text = anna
+    caplog.clear()
+    path = "/probe/%C2%85%7B%22level%22%3A%22forged%22/read?secret=hidden"
+    at.get(path, headers={"User-Agent": "x\t{}", "X-Request-ID": "bad id\t", **bearer(text)})
+    [record] = caplog.records
+    text_line = JsonFormatter().format(record)
+    assert text_line.isascii()
+    assert len(text_line.splitlines()) == 1
+    line = json.loads(text_line)
+    assert line["level"] == "info"
+    assert (line["method"], line["status"], line["who"]) == ("GET", 200, "anna")
+    assert line["path"].startswith("/probe/\x85{")
+    assert "hidden" not in text_line
+    assert text not in text_line
+
+
+def test_a_request_has_an_id_of_its_own_where_the_given_one_is_odd(client):
+    found = client().get("/healthz", headers={"X-Request-ID": "a b"}).headers["x-request-id"]
+    assert len(found) == 16
+    assert set(found) <= set("0123456789abcdef")
+
+
+def test_metrics_count_by_template_and_say_what_there_is(client):
+    at = client()
+    at.get("/probe/a/read")
+    at.get("/probe/b/read")
+    at.get("/made-up/17")
+    families = {one.name: one for one in text_string_to_metric_families(at.get("/metrics").text)}
+    counted = {
+        (sample.labels["route"], sample.labels["status"]): sample.value
+        for sample in families["starcat_requests"].samples
+        if sample.name.endswith("_total")
+    }
+    assert counted[("/probe/{thing}/read", "200")] == 2.0
+    assert counted[("unmatched", "404")] == 1.0
+    assert {sample.labels["state"] for sample in families["starcat_jobs"].samples} == {
+        "queued", "running", "done", "failed", "cancelled",
+    }  # fmt: skip
+    assert families["starcat_disk_free_bytes"].samples[0].value > 0
+    assert families["starcat_build_info"].samples[0].labels["version"]
+
+
+def test_ready_says_what_is_wrong(client, monkeypatch):
+    at = client()
+    app: Any = at.app
+    monkeypatch.setattr(type(app.state.slots), "is_alive", False)
+    assert "a slot of jobs has ended" in " ".join(at.get("/readyz").json()["reasons"])
+    monkeypatch.setattr(type(app.state.slots), "is_alive", True)
+    found = at.get("/readyz")
+    assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
+    monkeypatch.setattr("starcat_service.security.request_limits.free_gib", lambda folder: 0.2)
+    found = at.get("/readyz")
+    assert found.status_code == 503
+    assert "0.20 GiB free, and 1 have to be left" in found.json()["reasons"][0]
+    monkeypatch.setattr("starcat_service.records.WAIT_S", 0.05)
+    other = sqlite3.connect(app.state.service.paths.records)
+    other.execute("BEGIN IMMEDIATE")
+    app.state.service.records.close()
+    assert any("records cannot be written" in one for one in at.get("/readyz").json()["reasons"])
+    other.close()
+
+
+def test_what_is_old_is_removed_and_databases_and_releases_stay(client):
+    at = client(keep_jobs_days=2.0, keep_results_days=1.0)
+    app: Any = at.app
+    service = app.state.service
+    places = service.paths
+    jobs = [waiting_build(service, f"{number}") for number in range(3)]
+    now_s = time.time()
+    with service.records.writing() as connection:
+        for job, state, days in (
+            (jobs[0], "done", 3),
+            (jobs[1], "done", 1),
+            (jobs[2], "queued", 9),
+        ):
+            connection.execute(
+                "UPDATE jobs SET state = ?, ended_s = ? WHERE id = ?",
+                (state, now_s - days * 86_400.0 if state == "done" else None, job.id),
+            )
+    for job in jobs:
+        places.job(job.id).mkdir()
+        (places.job(job.id) / "log").write_text("x")
+    for folder in (places.results, places.scratch, places.databases / ("0" * 16), places.registry):
+        folder.mkdir(exist_ok=True)
+        (folder / "file").write_text("x")
+    removed = removal.remove_old(service, now_s + 1.5 * 86_400.0)
+    assert removed == {"jobs": 2, "results": 1, "scratch": 1, "sessions": 0}
+    assert [path.name for path in places.jobs.iterdir()] == [jobs[2].id]
+    assert [job.id for job in service.jobs.all()] == [jobs[2].id]
+    assert (places.databases / ("0" * 16) / "file").exists()
+    assert (places.registry / "file").exists()
+
+
+def test_an_address_for_others_is_an_origin(tmp_path):
+    for wrong in ("stars.example", "https://stars.example/path", "https://a@b", "ftp://x"):
+        with pytest.raises(ConfigError, match="public_url"):
+            read_settings(tmp_path, public_url=wrong)
+    assert Settings(root=tmp_path, public_url="https://x:8443").is_secure
+
+
+def test_the_page_of_the_interface_names_every_address(client):
+    at = client()
+    page = at.get("/api/docs")
+    assert page.status_code == 200
+    for path, operations in at.get("/api/openapi.json").json()["paths"].items():
+        for method in operations:
+            assert re.search(rf">{method.upper()}</span> <code>{re.escape(path)}</code>", page.text)
+
+
+def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
+    with (
+        listen(Settings(root=tmp_path, port=0)) as listening,
+        socket.create_connection(listening.getsockname()),
+        listening.accept()[0] as accepted,
+    ):
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_port_that_is_taken_is_told(tmp_path):
+    with listen(Settings(root=tmp_path, port=0)) as listening:
+        port = listening.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1, port {port}: .*--port"):
+            listen(Settings(root=tmp_path, port=port))

@@ -1,0 +1,612 @@
+"""Jobs: what is asked for once is done once, and what becomes of it is remembered."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi")
+
+from fastapi.testclient import TestClient
+from services import client_of, states
+
+from starcat.artifact.verify import verify_artifact
+from starcat.errors import ConfigError, SourceMissing, TargetMissing
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.keys import spec_toml
+from starcat.specs.reading import spec_from_dict
+from starcat.storage.locks import locked
+from starcat_lab.curves import QUANTITIES
+from starcat_service.access import Principal
+from starcat_service.jobs import job as job_module
+from starcat_service.jobs.job import MAX_INTERRUPTED, Attempt, Job, Outcome, begin_next, interrupt
+from starcat_service.jobs.keys import build_key, file_digests
+from starcat_service.jobs.slots import JobSlots, recover
+from starcat_service.jobs.submission import (
+    cancel_job,
+    retry_job,
+    submit_build,
+    submit_evaluation,
+    submit_ingest,
+)
+from starcat_service.problems import Problem
+from starcat_service.records import MIGRATIONS
+from starcat_service.server import run_server
+from starcat_service.service import Service
+from starcat_service.settings import Role, Settings, read_settings
+
+JOBS = "/api/v1/jobs"
+ANNE, BOB = Principal("anne", Role.BUILDER), Principal("bob", Role.BUILDER)
+CHIEF = Principal("chief", Role.PUBLISHER)
+
+
+@pytest.fixture
+def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with SAO's file, where it is looked for first."""
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    monkeypatch.setenv("STARCAT_CATALOGS", str(folder))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
+    return folder
+
+
+@pytest.fixture
+def spec(archive: Path, small_spec: str) -> BuildSpec:
+    return spec_from_dict(tomllib.loads(small_spec), "small.toml")
+
+
+Open = Callable[..., Service]
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[Open]:
+    """Services of one root, with settings; without workers."""
+    services = []
+
+    def make(**options: Any) -> Service:
+        service = Service(Settings(root=tmp_path / "service", **options))
+        services.append(service)
+        return service
+
+    yield make
+    for service in services:
+        service.close()
+
+
+@pytest.fixture
+def service(opened: Open) -> Service:
+    return opened()
+
+
+def begin(service: Service, job: Job) -> Attempt:
+    found = begin_next(service.records, (job.kind,))
+    assert found is not None
+    assert found.id == job.id
+    return Attempt(service.records, found)
+
+
+def end(service: Service, job: Job, how: str) -> None:
+    attempt = begin(service, job)
+    if how == "failed":
+        attempt.end(Outcome("failed", {"title": "x", "status": 422, "detail": "it went wrong"}))
+    elif how == "cancelled":
+        attempt.end(Outcome("cancelled"))
+    else:
+        attempt.end(Outcome("done", {"database": job.key[:16]}))
+
+
+def test_each_job_is_begun_once_and_the_first_first(service, spec):
+    job = submit_build(service, spec, "anne").job
+    others = [submit_ingest(service, "sao", "anne", read_limit_mag=k).job for k in range(3)]
+    begun: list[Job | None] = []
+
+    def try_it() -> None:
+        begun.append(begin_next(service.records, ("build", "ingest")))
+
+    threads = [threading.Thread(target=try_it) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = [one for one in begun if one is not None]
+    assert {one.id for one in found} == {one.id for one in (job, *others)}
+    assert {(one.state, one.attempt) for one in found} == {("running", 1)}
+    assert min(found, key=lambda one: one.started_s).id == job.id
+    assert len(found) == 4
+    assert states(service, job) == ["queued", "running"]
+
+
+def test_an_attempt_that_is_over_is_not_heard(service, spec):
+    job = submit_build(service, spec, "anne").job
+    first = begin(service, job)
+    interrupt(service.records, first.job)
+    second = begin(service, job)
+    assert first.cancel_requested()
+    first.report({"stage": "read", "done": 1, "total": 2})
+    first.report({"log": "hello", "level": "info"})
+    for outcome in (Outcome("done", {"database": "0" * 16}), Outcome("failed"), Outcome("queued")):
+        first.end(outcome)
+    interrupt(service.records, first.job)
+    assert service.jobs.get(job.id) == second.job
+    assert {event.kind for event in service.jobs.events(job.id)} == {"state"}
+    assert not second.cancel_requested()
+    second.end(Outcome("done", {"database": "0" * 16}))
+    assert service.jobs.get(job.id).state == "done"
+
+
+def test_a_key_is_of_what_the_result_depends_on(service, spec, archive, small_spec):
+    key = build_key(service.records, spec)
+    written = spec_from_dict(tomllib.loads(spec_toml(spec)), "all keys")
+    recorded = spec_from_dict(json.loads(json.dumps(spec.recorded())), "recorded")
+    assert {build_key(service.records, one) for one in (spec, written, recorded)} == {key}
+    others = ('version = "1.0.1"', "epoch_jyear = 2026.5", 'name = "smaller"')
+    for text in others:
+        name = text.split()[0]
+        lines = [text if line.startswith(f"{name} ") else line for line in small_spec.splitlines()]
+        other = spec_from_dict(tomllib.loads("\n".join(lines)), "other")
+        assert build_key(service.records, other) != key
+    (archive / "elsewhere").mkdir()
+    (archive / "sao.dat").rename(archive / "elsewhere" / "sao.dat")
+    with pytest.raises(SourceMissing):
+        build_key(service.records, spec)
+    (archive / "elsewhere" / "sao.dat").rename(archive / "sao.dat")
+    assert build_key(service.records, spec) == key
+    data = (archive / "sao.dat").read_bytes()
+    (archive / "sao.dat").write_bytes(data.replace(b"A0V", b"B0V", 1))
+    assert build_key(service.records, spec) != key
+
+
+def test_a_file_is_read_once_while_it_does_not_change(service, tmp_path, monkeypatch):
+    from starcat_service.jobs import keys
+
+    read = []
+    monkeypatch.setattr(keys, "file_sha256", lambda path: read.append(path) or f"{len(read)}")
+    path = tmp_path / "file"
+    path.write_bytes(b"abc")
+    assert file_digests(service.records, [path, path]) == ["1", "1"]
+    os.utime(path, ns=(1, 1))
+    assert file_digests(service.records, [path]) == ["2"]
+    path.write_bytes(b"abcd")
+    os.utime(path, ns=(1, 1))
+    assert file_digests(service.records, [path]) == ["3"]
+
+
+def test_the_same_request_is_the_same_job(service, spec):
+    first = submit_build(service, spec, "anne")
+    assert (first.is_new, first.job.state, first.job.title) == (True, "queued", "small 1.0.0")
+    again = submit_build(service, spec, "bob")
+    assert (again.is_new, again.job) == (False, first.job)
+    begin(service, first.job)
+    assert submit_build(service, spec, "bob").job.id == first.job.id
+    assert service.jobs.count() == 1
+
+
+@pytest.mark.parametrize("how", ["failed", "cancelled", "done"])
+def test_what_has_no_result_is_done_again(service, spec, how):
+    first = submit_build(service, spec, "anne").job
+    end(service, first, how)  # of what is done, the database is not there
+    second = submit_build(service, spec, "anne")
+    assert second.is_new
+    assert second.job.id != first.id
+
+
+def test_other_kinds_have_keys_too(service, spec, archive):
+    bare = submit_ingest(service, "sao", "anne")
+    assert bare.job.request["band"] == "V"
+    assert submit_ingest(service, "sao", "bob", band="V").job.id == bare.job.id
+    assert submit_ingest(service, "sao", "anne", to="hats").is_new
+    assert submit_ingest(service, "sao", "anne", read_limit_mag=5.0).is_new
+    with pytest.raises(ConfigError, match="band"):
+        submit_ingest(service, "sao", "anne", band="Q")
+    with pytest.raises(TargetMissing, match="no database"):
+        submit_evaluation(service, "0" * 16, "anne")
+
+
+def test_users_wait_in_moderation(opened, spec):
+    service = opened(jobs_waiting=2)
+    first = submit_ingest(service, "sao", "anne").job
+    submit_ingest(service, "sao", "anne", to="hats")
+    with pytest.raises(Problem, match="2 jobs of anne are waiting, and 2 may") as refused:
+        submit_build(service, spec, "anne")
+    assert refused.value.status == 429
+    assert submit_build(service, spec, "bob").is_new
+    begin(service, first)
+    assert submit_ingest(service, "sao", "anne", read_limit_mag=5.0).is_new
+
+
+def test_a_full_disk_takes_no_job(opened, spec):
+    with pytest.raises(Problem, match=r"GiB free, and 1e\+09 have to be left") as refused:
+        submit_build(opened(free_gib=1e9), spec, "anne")
+    assert refused.value.status == 507
+    service = opened()
+    job = submit_build(service, spec, "anne").job
+    JobSlots(opened(free_gib=1e9)).run_next()
+    found = service.jobs.get(job.id)
+    assert (found.state, found.error["status"]) == ("failed", 507)
+
+
+def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
+    service = opened(disk_gib=1e-5)
+    job = submit_build(service, spec, "anne").job
+    end(service, job, "done")
+    folder = service.paths.database(job.key[:16])
+    folder.mkdir()
+    (folder / small_artifact.name).symlink_to(small_artifact)
+    with pytest.raises(Problem, match=r"the databases of anne take .* \(disk_gib\)") as refused:
+        submit_ingest(service, "sao", "anne")
+    assert refused.value.status == 409
+    assert submit_build(service, spec, "anne").job.id == job.id  # which takes nothing more
+    assert submit_ingest(service, "sao", "bob").is_new
+
+
+def test_jobs_are_ended_and_tried_again_by_those_who_may(service, spec):
+    job = submit_build(service, spec, "anne").job
+    for change in (cancel_job, retry_job):
+        with pytest.raises(Problem, match="is of anne, and bob may not") as refused:
+            change(service, job.id, BOB)
+        assert refused.value.status == 403
+        with pytest.raises(TargetMissing):
+            change(service, "0" * 32, CHIEF)
+        with pytest.raises(TargetMissing):
+            change(service, "../../etc/passwd", CHIEF)
+    with pytest.raises(Problem, match="need not be tried again: it is queued"):
+        retry_job(service, job.id, ANNE)
+    assert cancel_job(service, job.id, ANNE).state == "cancelled"
+    assert cancel_job(service, job.id, CHIEF).state == "cancelled"
+    assert begin_next(service.records, ("build",)) is None
+    assert retry_job(service, job.id, CHIEF).state == "queued"
+    attempt = begin(service, job)
+    assert cancel_job(service, job.id, ANNE).state == "running"
+    assert attempt.cancel_requested()
+    attempt.end(Outcome("cancelled"))
+    other = submit_build(service, spec, "bob").job
+    with pytest.raises(Problem, match=f"job {other.id} does the same and is queued"):
+        retry_job(service, job.id, ANNE)
+    end(service, other, "failed")
+    with pytest.raises(Problem, match="has ended already; it is failed") as refused:
+        cancel_job(service, other.id, BOB)
+    assert refused.value.status == 409
+    assert retry_job(service, other.id, BOB).error is None
+    assert states(service, job)[-1] == "cancelled"
+
+
+def test_of_each_stage_the_last_event_is_kept(service, spec):
+    attempt = begin(service, submit_build(service, spec, "anne").job)
+    for done in range(50):
+        attempt.report_stage("read", done, 50)
+    attempt.log("info", "half")
+    attempt.report_stage("self-test", 0, None)
+    attempt.report_stage("self-test", 1, None)
+    events = service.jobs.events(attempt.job.id)
+    told = [(event.number, event.kind, event.data.get("done")) for event in events]
+    assert told == [
+        (1, "state", None), (2, "state", None), (52, "stage", 49), (53, "log", None),
+        (55, "stage", 1),
+    ]  # fmt: skip
+    assert service.jobs.events(attempt.job.id, after=53) == events[-1:]
+    found = service.jobs.get(attempt.job.id)
+    assert (found.stage, found.done, found.total) == ("self-test", 1, None)
+
+
+def test_a_log_has_an_end(service, spec, monkeypatch):
+    monkeypatch.setattr(job_module, "MAX_LOG_LINES", 3)
+    attempt = begin(service, submit_build(service, spec, "anne").job)
+    for number in range(9):
+        attempt.log("info", f"line {number}")
+    lines = [e.data["text"] for e in service.jobs.events(attempt.job.id) if e.kind == "log"]
+    assert lines == ["line 0", "line 1", "line 2", "the log ends here, after 3 lines"]
+
+
+def test_a_job_that_loses_its_server_waits_again_but_not_for_ever(service, spec):
+    job = submit_build(service, spec, "anne").job
+    for attempt in range(1, MAX_INTERRUPTED + 1):
+        begun = begin(service, job).job
+        assert begun.attempt == attempt
+        interrupt(service.records, begun)
+    found = service.jobs.get(job.id)
+    assert found.state == "failed"
+    assert "the service ended 8 times while this job ran" in found.error["detail"]
+    retry_job(service, job.id, ANNE)
+    interrupt(service.records, begin(service, job).job)
+    assert service.jobs.get(job.id).state == "queued"
+    begun = begin(service, job).job
+    cancel_job(service, job.id, ANNE)
+    interrupt(service.records, begun)
+    assert service.jobs.get(job.id).state == "cancelled"
+
+
+def test_a_server_takes_up_what_another_has_left(service, spec):
+    ran = submit_build(service, spec, "anne").job
+    begin(service, ran)
+    service.paths.job_work(ran.id).mkdir(parents=True)
+    (service.paths.job_work(ran.id) / "half").write_text("")
+    service.paths.database("0" * 16).mkdir()
+    recover(service)
+    assert service.jobs.get(ran.id).state == "queued"
+    assert not service.paths.job_work(ran.id).exists()
+    assert list(service.paths.databases.iterdir()) == []
+
+
+def test_jobs_of_redis_are_told_where_they_go_now(tmp_path):
+    (tmp_path / "service.toml").write_text('queue_url = "redis://10.0.0.1:6379/0"')
+    with pytest.raises(ConfigError, match=r'write scheduler = "tcp://HOST:8786" instead'):
+        read_settings(tmp_path)
+
+
+def test_a_service_of_an_earlier_version_opens(tmp_path):
+    old = f"""
+        INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, heard_s)
+        VALUES ('{1:032x}', 'build', 'k', 'anne', 't', 'queued', '{{}}', 5.0, 6.0);
+        INSERT INTO tap_jobs VALUES ('{2:032x}', 'anne', 'ERROR', '[["QUERY", "SELECT 1"]]',
+            '{{"f": "upload-0.vot"}}', 'mine', 1.0, 2.0, 3.0, 4.0, 9e9, 60.0, 'no column', '');
+        INSERT INTO tap_jobs VALUES ('{3:032x}', 'anne', 'COMPLETED', '[]', '{{}}', '', 1.5, 2.0,
+            3.0, 4.0, 9e9, 60.0, '', 'text/csv');
+    """
+    with sqlite3.connect(tmp_path / "records.sqlite") as connection:
+        connection.executescript(";".join([*MIGRATIONS[:3], "PRAGMA user_version = 3", old]))
+    connection.close()
+    service = Service(Settings(root=tmp_path))
+    assert begin(service, service.jobs.all()[0]).job.id == f"{1:032x}"
+    assert service.jobs.count() == 1
+    csv, failed = service.query_jobs.jobs("anne")
+    assert (csv.phase, csv.media_type, csv.error) == ("COMPLETED", "text/csv", "")
+    assert (failed.phase, failed.error, failed.run_id) == ("ERROR", "no column", "mine")
+    assert failed.parameters == (("QUERY", "SELECT 1"),)
+    assert (failed.created_s, failed.ended_s, failed.limit_s) == (1.0, 4.0, 60.0)
+    service.close()
+
+
+def test_two_servers_do_not_share_a_root(tmp_path):
+    settings = Settings(root=tmp_path / "service", port=0)
+    with (
+        locked(tmp_path / "service" / "server.lock"),
+        pytest.raises(ConfigError, match=r"another server runs with --root .*service"),
+    ):
+        run_server(settings, print)
+
+
+def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
+    with client_of(tmp_path / "service", workers=1, anonymous="publisher") as client:
+        answer = client.post(JOBS, json={"kind": "build", "spec": small_spec})
+        job = answer.json()
+        assert (answer.status_code, job["state"]) == (201, "queued")
+        assert answer.headers["location"] == f"{JOBS}/{job['id']}"
+        events = sent_events(client.get(f"{JOBS}/{job['id']}/events").text)
+        told = [data["state"] for kind, _, data in events if kind == "state"]
+        assert told == ["queued", "running", "done"]
+        stages = [data["stage"] for kind, _, data in events if kind == "stage"]
+        assert "self-test" in stages
+        assert "verify" in stages
+        database = events[-1][2]["result"]["database"]
+        again = client.post(JOBS, json={"kind": "build", "spec": tomllib.loads(small_spec)})
+        assert (again.status_code, again.json()["id"]) == (200, job["id"])
+        plain = client.get(f"{JOBS}/{job['id']}/events.json").json()
+        last = plain[-2]["number"]
+        resumed = client.get(f"{JOBS}/{job['id']}/events", headers={"Last-Event-ID": str(last)})
+        assert [number for _, number, _ in sent_events(resumed.text)] == [plain[-1]["number"]]
+        log = client.get(f"{JOBS}/{job['id']}/log").text
+        assert "info: estimate: " in log
+        assert log.endswith("Z done\n")
+        wish = {"kind": "evaluate", "database": database, "frames": 4, "seed": 1}
+        measured = client.post(JOBS, json=wish).json()["id"]
+        client.get(f"{JOBS}/{measured}/events")
+        found = client.get(f"{JOBS}/{measured}").json()["result"]
+        assert [rate["frames"] for rate in found["rates"]] == [4, 4, 4, 4]
+        assert [curve["quantity"] for curve in found["curves"]] == list(QUANTITIES)
+        for curve in found["curves"]:
+            for point in curve["points"]:
+                assert point["count"] == 4
+                assert point["low_percent"] <= point["percent"] <= point["high_percent"]
+        page = client.get(f"/jobs/{measured}").text
+        headline = f"{100 * found['rates'][0]['identified_share']:.1f}"
+        assert f'id="headline">{headline}<' in page
+        assert page.count('<figure class="chart">') == 3
+        assert page.count('class="point"') == sum(len(curve["points"]) for curve in found["curves"])
+        listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
+        assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
+        service = client.app.state.service
+        folder = service.library.database(database).folder
+        assert verify_artifact(folder).findings == ()
+        assert {path.stat().st_mode & 0o222 for path in folder.iterdir() if path.is_file()} == {0}
+        assert not list(service.paths.jobs.glob("*/work"))
+
+
+def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
+    """Return kind, number and data of server-sent events."""
+    found = []
+    for block in text.strip().split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if line[0] != ":")
+        if fields:
+            found.append((fields["event"], int(fields["id"]), json.loads(fields["data"])))
+    return found
+
+
+@pytest.fixture
+def client(archive: Path, tmp_path: Path) -> Iterator[TestClient]:
+    with client_of(tmp_path / "service", anonymous="builder") as client:
+        yield client
+
+
+REFUSED = {
+    "nothing": ({}, "kind"),
+    "no such kind": ({"kind": "destroy"}, "destroy"),
+    "neither spec nor preset": ({"kind": "build"}, "give either spec or preset"),
+    "both": ({"kind": "build", "spec": "", "preset": "gaia-12deg"}, "give either"),
+    "no TOML": ({"kind": "build", "spec": "= 3"}, "not a readable TOML file"),
+    "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
+    "changes of a spec": ({"kind": "build", "spec": {}, "changes": {"a": "1"}}, "changes"),
+    "a foreign key": ({"kind": "build", "preset": "gaia-12deg", "output": "/etc"}, "output"),
+    "an unknown catalog": ({"kind": "ingest", "source": "soa"}, "did you mean 'sao'"),
+    "a path of a catalog": ({"kind": "ingest", "source": "../sao"}, "source: String should match"),
+    "too many frames": ({"kind": "evaluate", "database": "0" * 16, "frames": 10**9}, "less than"),
+}
+"""What specs are refused for is tested with them; here that a job says it."""
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_done_is_refused_at_once(client, name):
+    wish, words = REFUSED[name]
+    answer = client.post(JOBS, json=wish)
+    assert answer.status_code in (404, 422)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert words in answer.json()["detail"]
+    assert client.get(JOBS).json() == {"jobs": [], "total": 0}
+
+
+def test_jobs_are_listed_by_what_they_are(client, small_spec):
+    made = [
+        client.post(JOBS, json=wish).json()["id"]
+        for wish in (
+            {"kind": "build", "spec": small_spec},
+            {"kind": "ingest", "source": "sao"},
+            {"kind": "ingest", "source": "sao", "to": "hats"},
+        )
+    ]
+    client.post(f"{JOBS}/{made[1]}/cancel")
+
+    def listed(**wanted: object) -> list[str]:
+        return [job["id"] for job in client.get(JOBS, params=wanted).json()["jobs"]]
+
+    assert listed() == made[::-1]
+    assert listed(kind="ingest") == [made[2], made[1]]
+    assert listed(state="cancelled") == [made[1]]
+    assert listed(limit=1, offset=1) == [made[1]]
+    assert listed(owner="nobody") == []
+    assert client.post(f"{JOBS}/{made[1]}/retry").json()["state"] == "queued"
+    assert client.get(f"{JOBS}/{'0' * 32}").status_code == 404
+    assert client.get(f"{JOBS}/{'0' * 32}/events").status_code == 404
+    assert client.get(f"{JOBS}/xyz/log").status_code == 404
+
+
+def test_readers_watch_and_do_nothing_else(archive, tmp_path):
+    with client_of(tmp_path / "service", anonymous="reader") as client:
+        job = submit_ingest(client.app.state.service, "sao", "anne").job
+        for path in ("", f"/{job.id}", f"/{job.id}/events.json", f"/{job.id}/log"):
+            assert client.get(f"{JOBS}{path}").status_code == 200
+        for path in ("", f"/{job.id}/cancel", f"/{job.id}/retry"):
+            assert client.post(f"{JOBS}{path}", json={}).status_code == 401
+
+
+LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
+"""What makes a build of the small spec take minutes."""
+
+
+def long_build(service: Service, spec: BuildSpec) -> Job:
+    content = {**spec.recorded(), **LONG}
+    return submit_build(service, spec_from_dict(content, "long"), "anne").job
+
+
+def run_until(service: Service, slots: JobSlots, job: Job, then: Callable[[], None]) -> Job:
+    """Run a job, and do something as soon as it is under way."""
+    thread = threading.Thread(target=slots.run_next)
+    thread.start()
+    until_s = time.monotonic() + 40.0
+    while not service.jobs.get(job.id).stage and time.monotonic() < until_s:
+        time.sleep(0.02)
+    then()
+    thread.join(30.0)
+    assert not thread.is_alive()
+    assert not service.paths.job_work(job.id).exists()
+    assert list(service.paths.databases.iterdir()) == []
+    with locked(service.paths.job_lock(job.id), wait=False):  # its process is gone
+        return service.jobs.get(job.id)
+
+
+@pytest.mark.slow
+def test_a_job_that_runs_is_cancelled(service, spec):
+    job = long_build(service, spec)
+    ended = run_until(service, JobSlots(service), job, lambda: cancel_job(service, job.id, ANNE))
+    assert (ended.state, ended.error, ended.result) == ("cancelled", None, None)
+
+
+@pytest.mark.slow
+def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
+    slots = JobSlots(service)
+
+    def stop() -> None:
+        slots.stop_at_s = time.monotonic() + 0.3
+
+    job = long_build(service, spec)
+    assert run_until(service, slots, job, stop).state == "queued"
+    assert not slots.run_next()  # it takes no further job
+    assert service.jobs.get(job.id).state == "queued"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"job_time_s": 0.5}, "the job took more than 0.5 s (job_time_s)"),
+        ({"job_memory_gib": 0.01}, "the job took more than the 0.01 GiB of memory that it may"),
+    ],
+)
+def test_a_job_has_limits(opened, spec, limits, words):
+    service = opened(**limits)
+    job = long_build(service, spec)
+    JobSlots(service).run_next()
+    failed = service.jobs.get(job.id)
+    assert failed.state == "failed"
+    assert words in failed.error["detail"]
+    assert failed.error["status"] == 422
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_is_told_of(service, spec):
+    slots = JobSlots(service)
+    job = long_build(service, spec)
+
+    def kill() -> None:
+        for child in slots.processes.children:
+            os.kill(child.pid, signal.SIGKILL)
+
+    failed = run_until(service, slots, job, kill)
+    assert failed.state == "failed"
+    assert "ended by SIGKILL, as a system does that runs out of memory" in failed.error["detail"]
+
+
+@pytest.mark.slow
+def test_a_build_that_fails_says_why(service, spec, archive):
+    job = submit_build(service, spec, "anne").job
+    (archive / "sao.dat").write_bytes(b"no star\n" * 100)
+    JobSlots(service).run_next()
+    failed = service.jobs.get(job.id)
+    assert (failed.state, failed.error["kind"]) == ("failed", "ParseError")
+    assert "sao.dat" in failed.error["detail"]
+    assert service.paths.job_stderr(job.id).read_text() == ""
+
+
+@pytest.mark.slow
+def test_a_catalog_is_read_either_way(service, archive):
+    for to in ("parquet", "hats"):
+        job = submit_ingest(service, "sao", "anne", to=to).job
+        JobSlots(service).run_next()
+        done = service.jobs.get(job.id)
+        assert done.state == "done", done.error
+        assert done.result["rows"] == 600
+        assert (service.paths.catalogs / done.result["catalog"]).exists()
+        assert not submit_ingest(service, "sao", "bob", to=to).is_new
+
+
+@pytest.mark.slow
+def test_a_database_that_is_there_is_not_built_again(service, spec):
+    job = submit_build(service, spec, "anne").job
+    JobSlots(service).run_next()
+    database = service.library.database(job.key[:16])
+    with sqlite3.connect(service.paths.records) as records:  # killed before that was written
+        records.execute("UPDATE jobs SET state = 'queued', result = NULL")
+    records.close()
+    before = database.folder.stat()
+    JobSlots(service).run_next()
+    assert service.jobs.get(job.id).result == {"database": database.id}
+    assert os.path.samestat(database.folder.stat(), before)

@@ -1,0 +1,339 @@
+"""Specs and catalogs over REST: keys, presets, checks, estimates, the map, first specs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from services import client_of
+
+from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
+from starcat.pipeline.estimate import choose_stars
+from starcat.pipeline.starter import starter_spec
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat_service import catalogs as catalogs_module
+from starcat_service.catalogs import Catalogs
+from starcat_service.problems import Problem
+
+API = "/api/v1"
+TOML = {"content-type": "application/toml"}
+PROBLEM = "application/problem+json"
+
+
+@pytest.fixture(scope="module")
+def small(
+    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str
+) -> Iterator[BuildSpec]:
+    """A small spec, whose catalog the service finds by itself."""
+    folder = tmp_path_factory.mktemp("sao")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STARCAT_CATALOGS", str(folder))
+        patch.setenv("STARCAT_CACHE", str(folder / "no-cache"))
+        yield spec_from_dict(content_of_toml(small_spec, "small.toml"), "small.toml")
+
+
+@pytest.fixture(scope="module")
+def client(small: BuildSpec, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    with client_of(tmp_path_factory.mktemp("service")) as client:
+        yield client
+
+
+def refused(answer: Any, status: int) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == PROBLEM
+    assert "Traceback" not in answer.text
+    return answer.json()
+
+
+# --- Keys, presets, checks
+
+
+def test_the_keys_are_described(client):
+    schema = client.get(f"{API}/specs/schema").json()
+    limit = schema["$defs"]["Selection"]["properties"]["faint_limit_mag"]
+    assert limit["description"] == "fainter stars are rejected; the limit itself is kept"
+    assert (limit["minimum"], limit["maximum"]) == (-30.0, 40.0)
+
+
+def test_presets_are_listed_and_explained(client):
+    listed = client.get(f"{API}/specs/presets").json()["presets"]
+    assert tuple(one["name"] for one in listed) == preset_names()
+    one = client.get(f"{API}/specs/presets/sao-12deg").json()
+    assert one["sources"] == ["sao", "hipparcos"]
+    assert spec_from_dict(content_of_toml(one["toml"], "text"), "text") == preset("sao-12deg")
+    assert spec_from_dict(one["spec"], "json") == preset("sao-12deg")
+    wrong = refused(client.get(f"{API}/specs/presets/sao-12degs"), 422)
+    assert wrong["detail"].startswith("unknown preset 'sao-12degs'; did you mean 'sao-12deg'?")
+    assert (wrong["code"], wrong["key"]) == (2, "preset")
+
+
+def test_a_spec_is_checked_as_toml_as_json_and_as_a_changed_preset(client, small_spec, small):
+    given = [
+        {"content": small_spec, "headers": TOML},
+        {"json": {"toml": small_spec}},
+        {"json": {"spec": small.model_dump(mode="json")}},
+    ]
+    for body in given:
+        answer = client.post(f"{API}/specs/validate", **body)
+        assert answer.status_code == 200
+        assert spec_from_dict(answer.json()["spec"], "answer") == small
+        assert spec_from_dict(content_of_toml(answer.json()["toml"], "text"), "text") == small
+    changes = {"selection.faint_limit_mag": "5.5", "selection.max_stars": "100"}
+    answer = client.post(f"{API}/specs/validate", json={"preset": "gaia-12deg", "changes": changes})
+    assert spec_from_dict(answer.json()["spec"], "answer") == preset("gaia-12deg", changes)
+
+
+def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkeypatch):
+    (tmp_path / "secret.toml").write_text('password = "hunter2"')
+    monkeypatch.chdir(tmp_path)
+    spec = small_spec.replace('"sao"', '"secret.toml"')
+    for path in ("validate", "estimate", "coverage"):
+        answer = client.post(f"{API}/specs/{path}", content=spec, headers=TOML)
+        told = refused(answer, 422)
+        assert (told["key"], "hunter2" in answer.text) == ("catalog.source", False)
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "words"),
+    [
+        ("name = 'x'\n[camra]\n", "camra", "unknown key; did you mean 'camera'?"),
+        ("name = 'X Y'", "name", "found 'X Y'; String should match pattern"),
+        ("name = 'x'", "version", "missing; every spec needs it"),
+        ("[", None, "not a readable TOML file"),
+        ("a." * 20_000 + "a = 1", None, "20,000 full stops"),
+        ("a = " + "[" * 20_000, None, "nested too deep"),
+        ("x = 0x" + "f" * 50_000, "x", "unknown key"),
+        ("#" * 150_000, None, "150,000 characters"),
+        ("\ud800".encode("utf-8", "surrogatepass"), None, "not a readable TOML file"),
+    ],
+)
+@pytest.mark.timeout(10)
+def test_what_is_wrong_is_told_as_by_the_command(client, text, key, words):
+    wrong = refused(client.post(f"{API}/specs/validate", content=text, headers=TOML), 422)
+    assert words in wrong["detail"]
+    assert (wrong["code"], wrong.get("key")) == (2, key)
+    assert len(wrong["detail"]) < 2000
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "words"),
+    [
+        (b"", 422, "Invalid JSON"),
+        (b"{}", 422, "give one of toml, spec and preset"),
+        (b'{"toml": "", "preset": "gaia-12deg"}', 422, "give one of toml, spec and preset"),
+        (b'{"spec": ' + b'{"a": ' * 20_000 + b"1" + b"}" * 20_001, 422, "recursion limit"),
+        (b'{"spec": {"name": "' + b"x" * 500_000 + b'"}}', 413, "400,000 bytes"),
+        (b'{"preset": "gaia-12deg", "inputs": {"gaia": "/etc/passwd"}}', 422, "inputs"),
+        (b'{"preset": "../../../etc/passwd"}', 422, "unknown preset"),
+        (b'{"preset": "gaia-12deg", "changes": {"camera.x.y.z": "1"}}', 422, "unknown key"),
+        (b'{"preset": "gaia-12deg", "changes": {"name.x": "1"}}', 422, "not a table"),
+        (b'{"spec": {"boresights": {"count": 1e400}}}', 422, "missing"),
+    ],
+)
+@pytest.mark.timeout(10)
+def test_a_body_that_is_no_spec_is_refused(client, body, status, words):
+    answer = client.post(
+        f"{API}/specs/estimate", content=body, headers={"content-type": "application/json"}
+    )
+    assert words in refused(answer, status)["detail"]
+
+
+def test_another_type_is_refused(client):
+    answer = client.post(
+        f"{API}/specs/validate", content=b"x", headers={"content-type": "image/png"}
+    )
+    assert "application/toml" in refused(answer, 415)["detail"]
+
+
+# --- Estimates
+
+
+def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
+    answer = client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
+    assert answer.status_code == 200
+    found = answer.json()
+    read = read_snapshot(small, {})
+    choice = choose_stars(read, small)
+    assert found["guide_stars"] == len(choice.selected.guide_stars)
+    assert found["fields"]["count"] == small.boresights.count
+    assert found["fields"]["stars"]["minimum"] == choice.fields.count.min()
+    assert found["total_bytes"] == sum(found["files"].values())
+    assert found["refusals"] == []
+    assert found["filters"][-1]["stars"] == found["guide_stars"]
+    assert found["in_words"].startswith("estimate: ")
+
+
+def test_a_spec_that_leaves_no_stars_is_refused_with_the_reasons(client, small_spec):
+    body = {"toml": small_spec, "changes": {"selection.faint_limit_mag": "-20.0"}}
+    wrong = refused(client.post(f"{API}/specs/estimate", json=body), 422)
+    assert "0 guide stars left of 600" in wrong["detail"]
+    assert "Rejected: too_faint 600" in wrong["detail"]
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"boresights.count": "1000000000"}, "less than or equal to 1000000"),
+        ({"boresights.brightest": "10000"}, "less than or equal to 100"),
+        ({"boresights.count": "1000000"}, "stars, limit 4,000,000"),
+        (
+            {"products.neighbours.angle_bin_deg": "0.1", "camera.fov_x_deg": "110",
+             "products.neighbours.separation_bin_deg": "0.001"},
+            "at most 10,000,000 fit",
+        ),
+    ],
+)  # fmt: skip
+def test_a_spec_that_is_too_large_is_refused(client, small_spec, changes, words):
+    body = {"toml": small_spec, "changes": changes}
+    assert words in refused(client.post(f"{API}/specs/estimate", json=body), 422)["detail"]
+
+
+def test_a_catalog_that_is_not_here_is_told(client):
+    wrong = refused(client.post(f"{API}/specs/estimate", json={"preset": "tycho2-12deg"}), 404)
+    assert wrong["detail"].startswith("tycho2 (The Tycho-2 Catalogue): no file found")
+    assert wrong["code"] == 3
+
+
+# --- The map
+
+
+def test_the_map_says_what_each_field_has(client, small_spec):
+    answer = client.post(f"{API}/specs/coverage.svg", content=small_spec, headers=TOML)
+    assert answer.headers["content-type"] == "image/svg+xml"
+    root = ET.fromstring(answer.text)
+    space = "{http://www.w3.org/2000/svg}"
+    titles = [one.findtext(f"{space}title") for one in root.iter(f"{space}circle")]
+    assert len(titles) == 200
+    fields = client.post(f"{API}/specs/coverage", content=small_spec, headers=TOML).json()
+    assert (fields["fields"], fields["step"]) == (200, 1)
+    told = sorted(int(re.search(r": (\d+)$", title)[1]) for title in titles)
+    assert told == sorted(fields["stars"])
+    assert not {"script", "style"} & {one.tag.removeprefix(space) for one in root.iter()}
+
+
+def test_the_map_of_many_fields_is_small_and_shows_the_poorest(client, small_spec):
+    body = {"toml": small_spec, "changes": {"boresights.count": "9000", "camera.fov_x_deg": "12"}}
+    svg = client.post(f"{API}/specs/coverage.svg", json=body).text
+    assert len(svg) < 300_000
+    fields = client.post(f"{API}/specs/coverage", json=body).json()
+    told = [
+        int(found) for found in re.findall(r": (\d+)(?:, fewest of \d+)?</title></circle>", svg)
+    ]
+    assert min(told) == min(fields["stars"])
+    groups = [int(found) for found in re.findall(r"fewest of (\d+)", svg)]
+    assert sum(groups) + len(told) - len(groups) == 9000
+
+
+# --- First specs, catalogs
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.slow
+def test_a_first_spec_is_that_of_init(client):
+    camera = {"width_px": 640, "height_px": 480, "fov_x_deg": 50.0}
+    wish = {"name": "My cam", "camera": camera}
+    answer = client.post(f"{API}/specs/starter", json=wish)
+    while answer.status_code == 503:  # on a busy machine, while the sky is being read
+        time.sleep(0.2 * int(answer.headers["retry-after"]))
+        answer = client.post(f"{API}/specs/starter", json=wish)
+    assert answer.status_code == 200
+    found = answer.json()
+    expected = starter_spec("My cam", CameraSpec(**camera))
+    assert found["checked"]["spec"] == expected.spec.model_dump(mode="json")
+    assert found["thinned"]["guide_stars"] == expected.thinned.guide_stars
+    assert found["in_words"] == expected.cost.in_words
+    wrong = {**camera, "fov_x_deg": 500.0}
+    assert refused(client.post(f"{API}/specs/starter", json={"camera": wrong}), 422)
+    deep = {"camera": {**camera, "fov_x_deg": 100.0}, "faint_limit_mag": 12.0}
+    assert "limit 4,000,000" in refused(
+        client.post(f"{API}/specs/starter", json=deep), 422
+    )["detail"]  # fmt: skip
+
+
+def test_catalogs_say_whether_they_are_here_and_what_was_read(client, small_spec):
+    client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
+    found = {one["name"]: one for one in client.get(f"{API}/catalogs").json()["catalogs"]}
+    assert found["sao"]["is_here"]
+    assert found["gaia"]["is_here"]
+    assert not found["2mass"]["is_here"]
+    assert "starcat fetch 2mass" in found["2mass"]["hint"]
+    assert found["sao"]["read"][0] == {
+        "band": "V", "epoch_jyear": 2026.0, "stars": 600, "brightest_mag": 2.0,
+        "faintest_mag": 6.4,
+    }  # fmt: skip
+
+
+# --- What is kept
+
+
+def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
+    calls = []
+
+    def counted(*arguments: Any, **options: Any) -> CatalogSnapshot:
+        calls.append(arguments)
+        time.sleep(0.2)
+        return read_snapshot(*arguments, **options)
+
+    monkeypatch.setattr(catalogs_module, "read_snapshot", counted)
+    catalogs = Catalogs()
+    found: list[int] = []
+    threads = [
+        threading.Thread(target=lambda: found.append(catalogs.estimate(small).cost.stars))
+        for _ in range(6)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(calls) == 1
+    assert len(set(found)) == 1
+    assert len(found) == 6
+    assert [(one.source, one.stars) for one in catalogs.offered()[0].read] == [("sao", 600)]
+    source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
+    os.utime(source)
+    assert catalogs.estimate(small).cost.stars == found[0]
+    assert len(calls) == 2  # the file is another one
+    catalogs.close()
+
+
+def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
+    go_on = threading.Event()
+
+    def slow(*arguments: Any, **options: Any) -> CatalogSnapshot:
+        go_on.wait(20)
+        return read_snapshot(*arguments, **options)
+
+    monkeypatch.setattr(catalogs_module, "read_snapshot", slow)
+    catalogs = Catalogs(wait_s=0.05)
+    with pytest.raises(Problem) as told:
+        catalogs.estimate(small)
+    assert told.value.status == 503
+    assert told.value.headers == {"Retry-After": "5"}
+    go_on.set()
+    catalogs._wait_s = 20.0
+    assert catalogs.estimate(small).cost.stars > 0
+    catalogs.close()
+
+
+def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
+    monkeypatch.setattr(catalogs_module, "MOST_INPUT_BYTES", 1000)
+    catalogs = Catalogs()
+    with pytest.raises(Problem, match="more than an estimate reads whole") as told:
+        catalogs.estimate(small)
+    assert (told.value.status, told.value.key) == (413, "catalog.read_limit_mag")
+    content = json.loads(small.model_dump_json())
+    content["catalog"]["read_limit_mag"] = 6.2
+    assert catalogs.estimate(spec_from_dict(content, "small")).cost.stars > 0
+    catalogs.close()

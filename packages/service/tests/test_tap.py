@@ -1,0 +1,603 @@
+"""TAP: queries answered at once and later, uploads, jobs, and what the service tells of itself."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from astropy.io import fits
+from astropy.io.votable import from_table, parse_single_table
+from astropy.table import MaskedColumn, Table
+from fastapi.testclient import TestClient
+from httpx2 import Response
+from services import LOCAL, add_database, client_of
+
+from starcat.errors import QueryError
+from starcat.exchange.formats import response_format
+from starcat.query.session import open_session
+from starcat_service.app import make_app
+from starcat_service.jobs.job import QUERY, begin_next
+from starcat_service.jobs.slots import ENDED_WITH_SERVER
+from starcat_service.protocols.parameters import Question
+from starcat_service.service import Service
+from starcat_service.settings import Settings
+from starcat_service.vo.tap import ClientGone, Spool
+
+SETTINGS = {"upload_mib": 0.5, "max_rows": 1_000_000}
+BRIGHT = "SELECT star_id, ra_deg, mag FROM small.stars WHERE mag < 2.5 ORDER BY star_id"
+SLOW = "SELECT COUNT(*) AS n FROM small.pairs a, small.pairs b, small.pairs c WHERE a.i < b.j + c.i"
+UWS = {"uws": "http://www.ivoa.net/xml/UWS/v1.0", "xlink": "http://www.w3.org/1999/xlink"}
+
+
+@pytest.fixture(scope="module")
+def ask(client) -> Callable[..., Response]:
+    """Send a query to /tap/sync."""
+
+    def send(query: str, **parameters: str) -> Response:
+        return client.get("/tap/sync", params={"LANG": "ADQL", "QUERY": query, **parameters})
+
+    return send
+
+
+def table_of(answer: Response) -> Table:
+    assert answer.status_code == 200, answer.text
+    return parse_single_table(io.BytesIO(answer.content)).to_table()
+
+
+def error_of(answer: Response) -> str:
+    """Return the words of an error as DALI has it."""
+    assert answer.headers["content-type"].startswith("application/x-votable+xml")
+    tree = ElementTree.fromstring(answer.content)
+    [status] = [one for one in tree.iter() if one.get("name") == "QUERY_STATUS"]
+    assert status.get("value") == "ERROR"
+    return status.text or ""
+
+
+# Queries that are answered at once.
+
+
+@pytest.fixture(scope="module")
+def bright(small_artifact: Path) -> list[tuple[int, float, float]]:
+    """What 'starcat sql' gives for the same query."""
+    with open_session([str(small_artifact)]) as session, session.ask(BRIGHT) as asked:
+        return asked.rows(1000)
+
+
+@pytest.mark.parametrize("form", ["votable", "votable/td", "TEXT/XML", "application/x-votable+xml"])
+def test_votables_have_the_rows_of_sql(ask, bright, form):
+    answer = ask(BRIGHT, RESPONSEFORMAT=form)
+    assert answer.headers["content-type"].startswith("application/x-votable+xml")
+    found = table_of(answer)
+    assert [tuple(row) for row in found] == bright
+    assert found["mag"].unit == "mag"
+    assert found["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
+
+
+def test_other_formats_have_the_rows_of_sql(ask, bright):
+    csv = ask(BRIGHT, FORMAT="csv").text.splitlines()
+    assert csv[0] == '"star_id","ra_deg","mag"'
+    assert [tuple(map(float, line.split(","))) for line in csv[1:]] == bright
+    parquet = pq.read_table(io.BytesIO(ask(BRIGHT, FORMAT="parquet").content))
+    assert list(zip(*(column.to_pylist() for column in parquet.columns), strict=True)) == bright
+    with fits.open(io.BytesIO(ask(BRIGHT, FORMAT="fits").content)) as file:
+        assert [tuple(row) for row in file[1].data.tolist()] == bright
+
+
+def test_a_form_asks_as_an_address_does(client, bright):
+    form = {"request": "doQuery", "lang": "ADQL-2.1", "query": BRIGHT, "maxrec": "1000"}
+    assert [tuple(row) for row in table_of(client.post("/tap/sync", data=form))] == bright
+
+
+def test_rows_that_are_left_out_are_told(ask, bright):
+    answer = ask(BRIGHT, MAXREC="2")
+    assert [tuple(row) for row in table_of(answer)] == bright[:2]
+    assert 'value="OVERFLOW"' in answer.text
+    whole = ask(BRIGHT, MAXREC=str(len(bright)))
+    assert len(table_of(whole)) == len(bright)
+    assert "OVERFLOW" not in whole.text
+    assert ask(BRIGHT, MAXREC="2", FORMAT="csv").text.count("\n") == 3
+    assert "OVERFLOW" not in ask(BRIGHT, MAXREC="9" * 50).text
+
+
+def test_without_rows_there_are_columns(ask):
+    found = table_of(ask(BRIGHT, MAXREC="0"))
+    assert found.colnames == ["star_id", "ra_deg", "mag"]
+    assert len(found) == 0
+
+
+WRONG = [
+    ({"QUERY": "SELECT nothing FROM small.stars"}, 400, "no column 'nothing'"),
+    ({"QUERY": "SELECT TOP 2 star_id FROM stars LIMIT 3"}, 400, "LIMIT"),
+    ({"QUERY": f"SELECT TOP {'9' * 23} star_id FROM stars"}, 400, "TOP has 23 digits"),
+    ({"QUERY": "DROP TABLE stars"}, 400, "only reads"),
+    ({"QUERY": "SELECT * FROM '/etc/passwd'"}, 400, "no table"),
+    ({"QUERY": "SELECT CAST(designation AS INTEGER) FROM stars"}, 400, "Could not convert"),
+    ({}, 422, "QUERY is missing"),
+    ({"QUERY": BRIGHT, "LANG": "PQL"}, 422, "LANG is 'PQL'"),
+    ({"QUERY": BRIGHT, "REQUEST": "getMagic"}, 422, "REQUEST is 'getMagic'"),
+    ({"QUERY": BRIGHT, "FORMAT": "application/pdf"}, 422, "is not known; choose one of votable"),
+    ({"QUERY": BRIGHT, "MAXREC": "-1"}, 422, "MAXREC is '-1'"),
+    ({"QUERY": BRIGHT, "MAXREC": "many"}, 422, "MAXREC is 'many'"),
+    ({"QUERY": [BRIGHT, "SELECT 2"]}, 422, "QUERY is given 2 times"),
+    ({"QUERY": BRIGHT, "UPLOAD": "a,http://169.254.169.254/x"}, 422, "nothing is fetched"),
+    ({"QUERY": BRIGHT, "UPLOAD": "a,file:///etc/passwd"}, 422, "nothing is fetched"),
+    ({"QUERY": BRIGHT, "UPLOAD": "a.b,param:x"}, 422, "a name of letters"),
+    ({"QUERY": BRIGHT, "UPLOAD": "a,param:x"}, 422, "the request has no file 'x'"),
+    ({"QUERY": BRIGHT, "UPLOAD": "a,param:x;A,param:y"}, 422, "has A twice"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "status", "told"), WRONG, ids=range(len(WRONG)))
+def test_what_is_wrong_is_told_as_dali_has_it(client, parameters, status, told):
+    answer = client.get("/tap/sync", params=parameters)
+    assert answer.status_code == status
+    assert told in error_of(answer)
+
+
+def test_who_reads_slowly_keeps_nobody_waiting(root):
+    """More clients than places begin to read large answers and stop; the next is answered."""
+    with client_of(root, queries=2) as client:
+        service = client.app.state.service
+        asked = Question("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
+        spools = []
+        for _ in range(4):
+            parts = service.tap.answer(asked, {})
+            next(parts)
+            spools.append(Spool(parts, service.paths.scratch, threading.Event()))
+            next(iter(spools[-1]))
+        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+        whole = [b"".join(spool) for spool in spools]
+        assert whole[0].count(b"\n") > 1000
+        assert len(set(whole)) == 1
+        for spool in spools:
+            spool.close()
+
+
+def test_what_fails_halfway_is_raised_behind_what_was_made(tmp_path):
+    def parts() -> Generator[bytes, None, None]:
+        yield b"a"
+        raise QueryError("no more")
+
+    spool = Spool(parts(), tmp_path, threading.Event())
+    found = iter(spool)
+    assert next(found) == b"a"
+    with pytest.raises(QueryError, match="no more"):
+        next(found)
+    spool.close()
+
+
+def test_a_query_ends_when_its_client_goes(root):
+    with client_of(root, queries=1) as client:
+        service = client.app.state.service
+        gone = threading.Event()
+
+        def watch(*_: object) -> None:
+            if gone.is_set():
+                raise ClientGone
+
+        asked = Question(SLOW, response_format("csv"), 10)
+        spool = Spool(service.tap.answer(asked, {}, progress=watch), root, gone)
+        time.sleep(0.5)
+        spool.close()
+        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+
+
+# TAP_SCHEMA and VOSI.
+
+
+def test_tap_schema_has_what_released_schemas_say(ask):
+    found = table_of(
+        ask(
+            "SELECT * FROM TAP_SCHEMA.columns WHERE table_name = 'small.stars' "
+            "ORDER BY column_index"
+        )
+    )
+    by_name = {row["column_name"]: row for row in found}
+    assert found["column_name"][0] == "star_id"
+    assert '"catalog"' in by_name, "a word of ADQL stands in quotes"
+    assert by_name["pm_dec_mas_yr"]["unit"] == "mas.yr**-1"
+    assert by_name["ra_deg"]["ucd"] == "pos.eq.ra;meta.main"
+    assert by_name["star_id"]["datatype"] == "long"
+    assert by_name["star_id"]["indexed"] == by_name["mag"]["principal"] == 1
+    assert "larger is fainter" in by_name["mag"]["description"]
+
+
+def test_tap_schema_describes_itself_and_every_table(ask):
+    names = set(table_of(ask("SELECT table_name FROM tap_schema.tables"))["table_name"])
+    assert {f"tap_schema.{name}" for name in ("schemas", "tables", "columns", "keys")} < names
+    described = set(
+        table_of(ask("SELECT DISTINCT table_name FROM tap_schema.columns"))["table_name"]
+    )
+    assert described == names
+    joined = ask(
+        "SELECT k.from_table, c.from_column FROM tap_schema.keys AS k JOIN tap_schema.key_columns "
+        "AS c ON k.key_id = c.key_id WHERE k.target_table = 'tap_schema.schemas'"
+    )
+    assert [tuple(row) for row in table_of(joined)] == [("tap_schema.tables", "schema_name")]
+
+
+def test_every_column_of_every_table_can_be_asked_for(ask):
+    columns = table_of(
+        ask("SELECT table_name, column_name, datatype, unit FROM tap_schema.columns")
+    )
+    for table in sorted(set(columns["table_name"])):
+        rows = columns[columns["table_name"] == table]
+        answer = ask(f"SELECT TOP 1 {', '.join(rows['column_name'])} FROM {table}")
+        fields = parse_single_table(io.BytesIO(answer.content)).fields
+        assert [field.datatype for field in fields] == list(rows["datatype"])
+        units = ["" if field.unit is None else field.unit.to_string("vounit") for field in fields]
+        assert units == [str(unit) if unit is not np.ma.masked else "" for unit in rows["unit"]]
+
+
+def test_tables_are_told_with_and_without_columns(client):
+    whole = ElementTree.fromstring(client.get("/tap/tables").content)
+    short = ElementTree.fromstring(client.get("/tap/tables", params={"detail": "min"}).content)
+    names = [one.text for one in whole.iter("name")]
+    assert "small.stars" in names
+    assert len(list(whole.iter("column"))) > 90
+    assert not list(short.iter("column"))
+    assert [t.findtext("name") for t in whole.iter("table")] == [
+        t.findtext("name") for t in short.iter("table")
+    ]
+    one = ElementTree.fromstring(client.get("/tap/tables/small.stars").content)
+    assert one.findtext("name") == "small.stars"
+    assert client.get("/tap/tables/small.nothing").status_code == 404
+
+
+def test_tables_are_told_as_tap_plus_reads_them(client):
+    one = client.get("/tap/tables", params={"tables": "small.stars"}).text
+    assert re.findall(r"<table .*?<name>(.*?)</name>", one) == ["small.stars"]
+    assert one.count('<column esatapplus:flags="0">') == one.count("</column>") > 20
+    assert "esatapplus" not in client.get("/tap/tables").text
+    short = client.get("/tap/tables", params={"only_tables": "true"}).text
+    assert "small.stars" in short
+    assert "<column" not in short
+
+
+def test_texts_in_documents_are_escaped_once(client):
+    """Descriptions of triangles have a comparison in them."""
+    text = client.get("/tap/tables").text
+    assert "&amp;lt;" not in text
+    assert "&amp;gt;" not in text
+    assert "&amp;amp;" not in text
+
+
+def test_capabilities_name_what_there_is(client):
+    text = client.get("/tap/capabilities").text
+    for told in (
+        "features-adqlgeo", "<form>POLYGON</form>", "upload-inline", "votable-td",
+        f'use="base">{LOCAL}/tap<', "VOSI#tables-1.1", "<form>IN_UNIT</form>",
+    ):  # fmt: skip
+        assert told in text
+    available = client.get("/tap/availability")
+    assert "<available>true</available>" in available.text
+
+
+def test_every_example_runs(client, ask):
+    page = ElementTree.fromstring(client.get("/tap/examples").content)
+    queries = [one.text for one in page.iter() if one.get("property") == "query"]
+    assert len(queries) == 4
+    for query in queries:
+        assert len(table_of(ask(query))) > 0, query
+
+
+# Uploads.
+
+
+def votable(table: Table, serialization: str = "tabledata") -> bytes:
+    stream = io.BytesIO()
+    from_table(table).to_xml(stream, tabledata_format=serialization)
+    return stream.getvalue()
+
+
+UPLOADED = Table(
+    {
+        "id": MaskedColumn([1, 2, 3], mask=[False, True, False], dtype="int32"),
+        "ra": MaskedColumn([10.5, 20.0, 30.0], unit="deg"),
+        "Name": ["α Cas", "b", ""],
+        "flag": [True, False, True],
+        "group": np.array([[1, 2], [3, 4], [5, 6]], dtype=np.int16),
+        "x": np.array([1.5, 2.5, 3.5], dtype=np.float32),
+    }
+)
+
+
+def ask_with(client: TestClient, name: str, content: bytes, query: str) -> Response:
+    """Send a query together with a table."""
+    given = {"QUERY": query, "UPLOAD": f"{name},param:file1"}
+    return client.post("/tap/sync", data=given, files={"file1": ("any.vot", content)})
+
+
+@pytest.mark.parametrize("serialization", ["tabledata", "binary", "binary2"])
+def test_an_uploaded_table_comes_back(client, serialization):
+    # BINARY has no way to say that an integer is missing.
+    has_nulls = serialization != "binary"
+    sent = votable(UPLOADED if has_nulls else UPLOADED.filled(2), serialization)
+    found = table_of(
+        ask_with(client, "Group", sent, 'SELECT * FROM TAP_UPLOAD."Group" ORDER BY ra')
+    )
+    assert found.colnames == UPLOADED.colnames
+    assert np.ma.getmaskarray(found["id"]).tolist() == [False, has_nulls, False]
+    assert found["id"].dtype == np.int32
+    assert found["x"].dtype == np.float32
+    assert found["ra"].unit == "deg"
+    assert list(found["Name"]) == ["α Cas", "b", ""]
+    assert found["flag"].tolist() == [True, False, True]
+    assert [list(one) for one in found["group"]] == [[1, 2], [3, 4], [5, 6]]
+
+
+def test_an_uploaded_table_is_joined(client, bright):
+    ids = Table({"star_id": [*(row[0] for row in bright[::2]), 999_999]})
+    query = (
+        "SELECT s.star_id FROM TAP_UPLOAD.mine AS m JOIN small.stars AS s USING (star_id) "
+        "ORDER BY star_id"
+    )
+    answer = ask_with(client, "mine", votable(ids), query)
+    assert list(table_of(answer)["star_id"]) == [row[0] for row in bright][::2]
+
+
+def document(fields: str, data: str = "", **facts: object) -> bytes:
+    told = "".join(f' {name}="{value}"' for name, value in facts.items())
+    space = "http://www.ivoa.net/xml/VOTable/v1.3"
+    table = f"<TABLE{told}>{fields}<DATA>{data}</DATA></TABLE>"
+    return f'<VOTABLE version="1.4" xmlns="{space}"><RESOURCE>{table}</RESOURCE></VOTABLE>'.encode()
+
+
+def field(datatype: str, arraysize: int = 1) -> str:
+    return f'<FIELD name="a" datatype="{datatype}" arraysize="{arraysize}"/>'
+
+
+def elsewhere(address: str) -> bytes:
+    return document(field("double"), f'<BINARY><STREAM href="{address}"/></BINARY>')
+
+
+ROWS = "<TABLEDATA>" + "<TR><TD/></TR>" * 100 + "</TABLEDATA>"
+HOSTILE = [
+    (b"", 422, "is no XML"),
+    (b"a,b\n1,2\n", 422, "is no XML"),
+    (b"<html/>", 422, "cannot be read as a VOTable"),
+    (elsewhere("file:///etc/passwd"), 422, "has its rows elsewhere"),
+    (elsewhere("http://127.0.0.1/"), 422, "has its rows elsewhere"),
+    (document(field("char", 100_000_000), ROWS), 422, "give fields an"),
+    (document(field("int"), ROWS, nrows=9999999999), 422, "rows"),
+    (b'<!DOCTYPE v [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><VOTABLE>&b;</VOTABLE>', 422, "entity"),
+    (document(field("int") * 1001, ROWS), 422, "more than 1000"),
+    (document(field("int") * 2), 422, "two columns 'a'"),
+    (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is no XML"),
+    (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
+]
+
+
+@pytest.mark.parametrize(("content", "status", "told"), HOSTILE, ids=range(len(HOSTILE)))
+def test_uploads_that_must_not_be_read_are_refused(client, content, status, told):
+    answer = ask_with(client, "t", content, "SELECT * FROM TAP_UPLOAD.t")
+    assert answer.status_code == status
+    assert told in answer.text
+
+
+def test_nothing_of_an_upload_stays(client, root):
+    names = {path.name.split("-")[0] for path in (root / "scratch").iterdir()}
+    assert not names & {"upload", "sync", "answer"}
+
+
+# Jobs.
+
+
+@pytest.fixture
+def make(client) -> Callable[..., str]:
+    """Make a job; return its address."""
+
+    def made(query: str, **parameters: str) -> str:
+        data = {"LANG": "ADQL", "QUERY": query, **parameters}
+        answer = client.post("/tap/async", data=data, follow_redirects=False)
+        assert answer.status_code == 303, answer.text
+        return answer.headers["location"]
+
+    return made
+
+
+def phase_of(client: TestClient, job: str) -> str:
+    return str(client.get(f"{job}/phase").text)
+
+
+def wait_for(client: TestClient, job: str, *phases: str) -> str:
+    ends = time.monotonic() + 30.0
+    while (found := phase_of(client, job)) not in phases:
+        assert time.monotonic() < ends, found
+        client.get(job, params={"WAIT": "5", "PHASE": found})
+    return found
+
+
+def test_a_job_gives_what_a_query_gives(client, make, bright):
+    job = make(BRIGHT, RUNID="mine")
+    assert phase_of(client, job) == "PENDING"
+    seen = client.post(f"{job}/phase", data={"PHASE": "RUN"}, follow_redirects=False)
+    assert (seen.status_code, seen.headers["location"]) == (303, job)
+    assert wait_for(client, job, "COMPLETED", "ERROR") == "COMPLETED"
+    document = ElementTree.fromstring(client.get(job).content)
+    [result] = document.iterfind(".//uws:result", UWS)
+    href = result.get(f"{{{UWS['xlink']}}}href")
+    assert href == f"{job}/results/result"
+    assert [tuple(row) for row in table_of(client.get(href))] == bright
+    assert document.findtext("uws:runId", namespaces=UWS) == "mine"
+    given = {p.get("id"): p.text for p in document.iterfind(".//uws:parameter", UWS)}
+    assert given["QUERY"] == BRIGHT
+    assert client.get(f"{job}/error").status_code == 404
+    again = client.post(f"{job}/parameters", data={"QUERY": "SELECT 1"})
+    assert "COMPLETED" in error_of(again)
+
+
+def test_a_job_that_fails_says_why(client, make):
+    job = make("SELECT nothing FROM small.stars", PHASE="RUN")
+    assert wait_for(client, job, "COMPLETED", "ERROR") == "ERROR"
+    assert "no column 'nothing'" in error_of(client.get(f"{job}/error"))
+    document = ElementTree.fromstring(client.get(job).content)
+    assert "no column" in document.findtext("uws:errorSummary/uws:message", namespaces=UWS)
+    assert client.get(f"{job}/results/result").status_code == 404
+
+
+def test_a_job_takes_parameters_and_uploads_until_it_runs(client, make):
+    job = make("SELECT 1", UPLOAD="t,param:f")
+    client.post(f"{job}/parameters", data={"QUERY": "SELECT x FROM tap_upload.t"},
+                files={"f": ("f", votable(UPLOADED))})  # fmt: skip
+    parameters = client.get(f"{job}/parameters").text
+    assert "tap_upload.t" in parameters
+    assert "SELECT 1" not in parameters
+    client.post(f"{job}/phase", data={"PHASE": "RUN"})
+    assert wait_for(client, job, "COMPLETED", "ERROR") == "COMPLETED"
+    result = f"{job}/results/result"
+    assert list(table_of(client.get(result))["x"]) == [1.5, 2.5, 3.5]
+    # The answer of a job is a table for the next question, and nothing is fetched for that.
+    chained = client.get("/tap/sync", params={
+        "QUERY": "SELECT MAX(x) AS m FROM TAP_UPLOAD.u", "UPLOAD": f"u,{result}"})  # fmt: skip
+    assert list(table_of(chained)["m"]) == [3.5]
+
+
+def test_a_job_can_be_aborted(client, make):
+    job = make(SLOW, PHASE="RUN")
+    wait_for(client, job, "EXECUTING")
+    began = time.monotonic()
+    client.post(f"{job}/phase", data={"PHASE": "ABORT"})
+    assert phase_of(client, job) == "ABORTED"
+    # The next job has the process for itself.
+    next_ = make(BRIGHT, PHASE="RUN")
+    assert wait_for(client, next_, "COMPLETED", "ERROR") == "COMPLETED"
+    assert time.monotonic() - began < 20.0
+    assert phase_of(client, job) == "ABORTED"
+
+
+def test_a_job_ends_when_its_time_is_over(client, make):
+    job = make(SLOW)
+    client.post(f"{job}/executionduration", data={"EXECUTIONDURATION": "1"})
+    assert client.get(f"{job}/executionduration").text == "1"
+    client.post(f"{job}/phase", data={"PHASE": "RUN"})
+    assert wait_for(client, job, "COMPLETED", "ERROR") == "ERROR"
+    assert "stopped after 1 s" in error_of(client.get(f"{job}/error"))
+
+
+def test_jobs_are_listed_and_chosen_from(client, make):
+    jobs = [make(BRIGHT) for _ in range(3)]
+    client.post(jobs[0], data={"PHASE": "ABORT"})
+
+    def listed(**parameters: str) -> list[str]:
+        tree = ElementTree.fromstring(client.get("/tap/async", params=parameters).content)
+        return [str(one.get(f"{{{UWS['xlink']}}}href")) for one in tree]
+
+    assert listed(LAST="2") == jobs[:0:-1]
+    assert jobs[0] in listed(PHASE="ABORTED")
+    assert jobs[1] not in listed(PHASE="ABORTED")
+    assert {jobs[1], jobs[2]} <= set(listed(PHASE="PENDING"))
+    assert listed(AFTER="2999-01-01T00:00:00Z") == []
+    assert client.get("/tap/async", params={"PHASE": "WAITING"}).status_code == 422
+
+
+def test_a_job_is_deleted_with_its_answer(client, make, root):
+    for method, data in (("DELETE", None), ("POST", {"ACTION": "DELETE"})):
+        job = make(BRIGHT, PHASE="RUN")
+        wait_for(client, job, "COMPLETED")
+        folder = root / "results" / job.rpartition("/")[2]
+        assert folder.is_dir()
+        answer = client.request(method, job, data=data, follow_redirects=False)
+        assert (answer.status_code, answer.headers["location"]) == (303, f"{LOCAL}/tap/async")
+        assert client.get(job).status_code == 404
+        assert not folder.exists()
+
+
+def test_waiting_ends_with_the_phase_and_with_the_time(client, make):
+    job = make(BRIGHT)
+    began = time.monotonic()
+    client.get(job, params={"WAIT": "1"})
+    assert 0.9 < time.monotonic() - began < 10.0
+    client.get(job, params={"WAIT": "30", "PHASE": "QUEUED"})
+    assert time.monotonic() - began < 10.0, "it waits for the end of a phase that it is in only"
+
+
+def test_times_of_a_job_are_set_within_what_is_granted(client, make):
+    job = make(BRIGHT)
+    granted = client.get(f"{job}/destruction").text
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", granted)
+    client.post(f"{job}/destruction", data={"DESTRUCTION": "2999-01-01T00:00:00Z"})
+    assert client.get(f"{job}/destruction").text == granted
+    client.post(f"{job}/executionduration", data={"EXECUTIONDURATION": "99999999"})
+    assert client.get(f"{job}/executionduration").text == "3600"
+    for text, status in (("soon", 422), ("", 422), ("9999-12-31T23:59:59-23:59", 200)):
+        answer = client.post(f"{job}/destruction", data={"DESTRUCTION": text})
+        assert answer.status_code == status
+    assert client.get(f"{job}/destruction").text == granted
+    assert client.get(job, params={"WAIT": "9" * 400, "PHASE": "QUEUED"}).status_code == 200
+    assert client.post(f"{job}/phase", data={"PHASE": "STOP"}).status_code == 422
+    assert client.get(f"{job}/owner").text == "anonymous"
+    assert client.get(f"{job}/quote").text == ""
+    client.post(f"{job}/destruction", data={"DESTRUCTION": "2001-01-01T00:00:00"})
+    assert client.get(job).status_code == 404
+
+
+@pytest.mark.parametrize("job", ["0" * 32, "x" * 40, "0" * 31 + "G"])
+def test_a_job_that_is_not_there_is_not_found(client, job):
+    for path in ("", "/phase", "/results/result", "/error"):
+        assert client.get(f"/tap/async/{job}{path}").status_code == 404
+
+
+def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
+    root = tmp_path / "service"
+    add_database(root, small_artifact)
+    settings = Settings(root=root)
+    service = Service(settings)
+    jobs = service.query_jobs
+    made = [jobs.create("anonymous").job_id for _ in range(3)]
+    for job_id in made:
+        jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
+    for job_id in made[:2]:
+        jobs.run(job_id)
+    begin_next(service.records, (QUERY,))
+    service.close()
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        addresses = [f"{LOCAL}/tap/async/{job_id}" for job_id in made]
+        assert error_of(client.get(f"{addresses[0]}/error")) == ENDED_WITH_SERVER
+        assert wait_for(client, addresses[1], "COMPLETED", "ERROR") == "COMPLETED"
+        assert len(table_of(client.get(f"{addresses[1]}/results/result"))) == len(bright)
+        assert phase_of(client, addresses[2]) == "PENDING"
+
+
+@pytest.mark.slow
+def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
+    root = tmp_path / "service"
+    stars = small_artifact / "stars.parquet"
+    with client_of(root) as client:
+
+        def names() -> list[str]:
+            query = "SELECT schema_name FROM tap_schema.schemas ORDER BY schema_index"
+            return list(table_of(client.get("/tap/sync", params={"QUERY": query}))["schema_name"])
+
+        assert names() == ["tap_schema"]
+        add_database(root, small_artifact)
+        assert names() == ["small", "tap_schema"]
+        other = add_database(root, small_artifact, "fedcba9876543210")
+        catalog = f"2mass-{'0' * 16}.parquet"
+        shutil.copyfile(stars, root / "catalogs" / catalog)
+        quoted = f'"_2mass_{"0" * 16}"'
+        assert names() == ["small_1_0_0", "small_1_0_0_2", quoted, "tap_schema"]
+        query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
+        found = table_of(client.get("/tap/sync", params={"QUERY": query}))
+        assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
+        # What cannot be opened is left out, and the rest is there.
+        (other / "stars.parquet").write_bytes(b"PAR1 no table PAR1")
+        (other / "manifest.json").touch()
+        catalogs = root / "catalogs"
+        (catalogs / catalog).rename(catalogs / f"2mass-{'1' * 16}.parquet")
+        assert names() == ["small", quoted.replace("0", "1"), "tap_schema"]
+
+
+def test_without_a_role_nothing_is_told(tmp_path):
+    with client_of(tmp_path, anonymous="none") as client:
+        for path in ("sync?QUERY=x", "async", "tables", "examples", f"async/{'0' * 32}"):
+            assert client.get(f"/tap/{path}").status_code == 401
