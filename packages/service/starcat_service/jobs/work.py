@@ -305,9 +305,11 @@ def main() -> None:
         os.nice(NICENESS)
         # What answers somebody who waits gets a processor at once, where Linux can do that.
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    logger = logging.getLogger("starcat")
-    logger.setLevel(logging.INFO)
-    logger.addHandler(_Lines(messages))
+    lines = _Lines(messages)
+    for package in ("starcat", "starcat_lab", "starcat_service"):
+        logger = logging.getLogger(package)
+        logger.setLevel(logging.INFO)
+        logger.addHandler(lines)
     with locked(order.paths.job_lock(order.job_id)):
         prepare(order.kind)
         limit_memory(order.memory_bytes)

@@ -96,7 +96,7 @@ def log_settings(level: str = "INFO") -> dict[str, Any]:
         },
         "root": {"handlers": ["stderr"], "level": "WARNING"},
         "loggers": {
-            "starcat": {"level": level},
+            **{name: {"level": level} for name in ("starcat", "starcat_lab", "starcat_service")},
             "uvicorn": {"level": "WARNING"},
             "uvicorn.error": {"level": "WARNING"},
         },
