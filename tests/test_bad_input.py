@@ -1206,11 +1206,6 @@ EXPORTS: Cases = {
     "name that a format has no room for": run(EXPORT_TABLE + "fits", table({"x" * 69: [1]})),
     "column without a name": run(EXPORT_TABLE + "fits", table({"": [1]})),
     "type that no format can hold": run(EXPORT_TABLE + "csv", table({"code": [b"x"]})),
-    "peer unknown": run(f"{EXPORT} --from-peer lost"),
-    "peer's database damaged": run(
-        "export {folder}/default_database.npz --from-peer cedar-solve -o {out}",
-        {"default_database.npz": "no archive"},
-    ),
 }
 
 

@@ -1,4 +1,4 @@
-"""starcat export: files of every format, existing outputs, databases, Parquet files and peers."""
+"""starcat export: files of every format, existing outputs, databases and Parquet files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,7 +17,7 @@ from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, OutputError
-from starcat.exchange.export import export_tables, in_memory, tables_of
+from starcat.exchange.export import NamedTables, export_tables, tables_of
 from starcat.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
 from starcat.storage.schema import product_schema
 
@@ -129,20 +128,6 @@ def test_a_parquet_file(starcat: Run, small_artifact: Path, tmp_path: Path) -> N
     assert Table.read(tmp_path / "stars.ecsv")["star_id"].tolist() == wanted["star_id"].to_pylist()
 
 
-def test_a_peer_s_stars(starcat: Run, tmp_path: Path) -> None:
-    table = np.array([[1.0, 0.5, 0.0, 0.0, 0.0, 3.0]], dtype=np.float32)
-    ra, dec = table[0, :2].astype(float)
-    table[0, 2:5] = np.cos(ra) * np.cos(dec), np.sin(ra) * np.cos(dec), np.sin(dec)
-    np.savez(tmp_path / "tetra.npz", star_table=table)
-    out = tmp_path / "out"
-    peer = ["export", tmp_path / "tetra.npz", "--from-peer", "cedar-solve", "-o", out]
-    assert starcat([*peer, "--format", "parquet"]).code == 0
-    product_schema("stars").check(pq.read_table(out / "stars.parquet"))
-    wrong = starcat(["export", tmp_path / "tetra.npz", "-o", out])
-    assert wrong.code == 3
-    assert "say with --from-peer" in wrong.err
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -153,7 +138,6 @@ def test_a_peer_s_stars(starcat: Run, tmp_path: Path) -> None:
             2,
             "not a star table, it has no column star_id",
         ),
-        (["--from-peer", "lost"], 2, "peer 'lost' is unknown"),
     ],
 )
 def test_wrong_options_write_nothing(starcat, small_artifact, tmp_path, arguments, code, words):
@@ -181,7 +165,7 @@ def test_rows_without_a_position_are_told(starcat: Run, tmp_path: Path) -> None:
 
 
 def test_tables_without_stars_are_nothing_for_hats(tmp_path: Path) -> None:
-    tables = in_memory("numbers", {"numbers": pa.table({"a": [1]})})
+    tables = NamedTables("numbers", {"numbers": lambda: pa.table({"a": [1]})})
     with pytest.raises(ConfigError, match="no star table"):
         export_tables(tables, "hats", tmp_path / "out", products=None)
 

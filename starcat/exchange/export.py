@@ -42,7 +42,7 @@ COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
 
 @dataclass(frozen=True)
 class NamedTables:
-    """Tables by product, of a database, a file or a peer; each is read when needed."""
+    """Tables by product, of a database or a file; each is read when needed."""
 
     name: str  # of all of them together, such as the database's name and version
     readers: Mapping[str, Callable[[], pa.Table]]
@@ -110,18 +110,13 @@ def tables_of(path: Path) -> NamedTables:
     return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
 
 
-def in_memory(name: str, tables: Mapping[str, pa.Table]) -> NamedTables:
-    """Return tables that have been read."""
-    return NamedTables(name, {product: partial(tables.__getitem__, product) for product in tables})
-
-
 def _read_file(path: Path) -> pa.Table:
     try:
         return read_parquet(path)
     except (OSError, pa.ArrowException) as error:
         raise SourceError(
             f"{path}: not a readable Parquet file ({error}); give the folder of a database or a "
-            "Parquet file, or say with --from-peer whose file it is",
+            "Parquet file",
             path=path,
         ) from error
 
