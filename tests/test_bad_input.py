@@ -33,7 +33,6 @@ from astropy.io import fits
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from folder_bytes import bytes_of
 from genuine_records import PSC
-from hats_stores import write_catalog, write_facts
 from registry_files import blob_of, manifest_of, put_manifest
 from signed_registry import Forger, key_of, signing
 
@@ -56,7 +55,6 @@ from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
 from starcat.storage.keys import public_pem
 from starcat.store.ingest import ingest_to_store
-from starcat.store.pixels import Pixel
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
 from starcat_service.security.tokens import TokenStore
@@ -435,7 +433,6 @@ SPECS: Cases = {
 
 
 MATCH = "crossmatch {artifact}/stars.parquet {folder}/stars.parquet -o {out}/x.parquet"
-MATCH_STORE = "crossmatch {artifact}/stars.parquet {folder}/store -o {out}/x.parquet"
 
 
 def with_column(table: pa.Table, name: str, values: Any) -> pa.Table:
@@ -448,45 +445,6 @@ def text_as_column(place: Place) -> None:
     pq.write_table(table, place.folder / "stars.parquet")
 
 
-def off_the_sky(place: Place) -> None:
-    table = pq.read_table(place.artifact / "stars.parquet")
-    dec_deg = pa.array([91.0, *table["dec_deg"].to_pylist()[1:]])
-    changed = with_column(table, "dec_deg", dec_deg).cast(table.schema)
-    pq.write_table(changed, place.folder / "stars.parquet")
-    write_catalog(table, place.folder / "store", 100)
-
-
-def matched_store(change: Callable[[Path, pa.Table], object]) -> Callable[[Place], Call]:
-    """Find the stars of a good database in a store, one of whose partitions is changed."""
-
-    def damage(place: Place) -> None:
-        store = place.folder / "store"
-        write_catalog(pq.read_table(place.artifact / "stars.parquet"), store, 100)
-        part = min(store.rglob("Npix=*.parquet"))
-        change(part, pq.ParquetFile(part).read())
-
-    return run(MATCH_STORE, damage)
-
-
-def no_magnitudes(part: Path, _: pa.Table) -> None:
-    for path in part.parents[3].rglob("Npix=*.parquet"):
-        pq.write_table(pq.ParquetFile(path).read().drop_columns("mag"), path)
-
-
-def elsewhere(part: Path, table: pa.Table) -> None:
-    pixels = pa.array([12 * 4**29 - 1] * len(table))
-    pq.write_table(with_column(table, "_healpix_29", pixels), part)
-
-
-def two_of_one_place(part: Path, _: pa.Table) -> None:
-    pixels = (Pixel(0, 3), Pixel(1, 12))
-    for pixel in pixels:
-        path = part.parents[2] / pixel.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(part, path)
-    write_facts(part.parents[3], pixels, 2)
-
-
 CROSSMATCHES: Cases = {
     "star table missing": run(
         "crossmatch {artifact}/stars.parquet {folder}/none.parquet -o {out}/x.parquet"
@@ -496,25 +454,6 @@ CROSSMATCHES: Cases = {
         "crossmatch {artifact}/stars.parquet {artifact}/pairs.parquet -o {out}/x.parquet"
     ),
     "star table with a column of another type": run(MATCH, text_as_column),
-    "store to match, without a column": matched_store(no_magnitudes),
-    "store to match, with a column of another type": matched_store(
-        lambda part, table: pq.write_table(
-            with_column(table, "mag", table["mag"].cast("float")), part
-        )
-    ),
-    "store to match, with a star in another pixel": matched_store(elsewhere),
-    "store to match, with two partitions of one place": matched_store(two_of_one_place),
-    "store to match, with pixels of another order": matched_store(
-        lambda part, _: (part.parents[3] / "hats.properties").write_text(
-            "hats_col_healpix_order=19\n"
-        )
-    ),
-    "store to match, with a damaged partition": matched_store(
-        lambda part, _: part.write_bytes(part.read_bytes()[:-100])
-    ),
-    "star table to match with a store, off the sky": run(
-        "crossmatch {folder}/stars.parquet {folder}/store -o {out}/x.parquet", off_the_sky
-    ),
     "cross-identification in place of a folder": run(
         "crossmatch {artifact}/stars.parquet {artifact}/stars.parquet -o {out}/x.parquet",
         lambda place: (place.out / "x.parquet").mkdir(parents=True),

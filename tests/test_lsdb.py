@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,7 @@ import pytest
 from archive_server import Archive
 from served import in_background
 
-from starcat.pipeline.match_stores import match_stores
-from starcat.specs.product_sections import Crossmatch
+from starcat.query.session import open_session
 from starcat.storage.parquet import read_parquet
 from starcat.store import wire
 from starcat.store.ingest import ingest_to_store
@@ -88,16 +88,19 @@ def test_hats_finds_a_store_valid(stores):
 
 
 @pytest.mark.slow
-def test_lsdb_finds_the_same_pairs(stores, tmp_path):
-    wanted = Crossmatch(radius_arcsec=RADIUS_ARCSEC)
-    match_stores(*stores, tmp_path / "ours.parquet", wanted)
-    ours = read_parquet(tmp_path / "ours.parquet")
-    names = zip(ours["star_id"].to_pylist(), ours["counterpart_id"].to_pylist(), strict=True)
-    angles = dict(zip(names, ours["separation_arcsec"].to_pylist(), strict=True))
+def test_lsdb_finds_the_same_pairs(stores):
+    query = (
+        "SELECT a_star_id, b_star_id, separation_arcsec "
+        f"FROM crossmatch('first_hats', 'second_hats', {RADIUS_ARCSEC}, epoch := NULL)"
+    )
+    with open_session([str(store) for store in stores]) as session, session.ask(query) as answer:
+        rows = answer.rows(100_000).rows
+    angles = {(a_id, b_id): angle for a_id, b_id, angle in rows}
+    most = max(Counter(a_id for a_id, _ in angles).values())
     a, b = (lsdb.open_catalog(store) for store in stores)
     found = a.crossmatch(
         b,
-        n_neighbors=int(ours["n_candidates"].to_numpy().max()) + 1,
+        n_neighbors=most + 1,
         radius_arcsec=RADIUS_ARCSEC,
         suffixes=("_a", "_b"),
         suffix_method="all_columns",
@@ -109,7 +112,7 @@ def test_lsdb_finds_the_same_pairs(stores, tmp_path):
     off = [abs(theirs[pair] - angles[pair]) for pair in theirs]
     assert max(off) < TOLERANCE_ARCSEC
     # Pairs across the borders of partitions are among them.
-    edges = _across_borders(stores, ours["star_id"].to_numpy(), ours["counterpart_id"].to_numpy())
+    edges = _across_borders(stores, *np.array(list(angles)).T)
     assert edges > 50
 
 

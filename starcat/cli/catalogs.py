@@ -23,7 +23,7 @@ from starcat.errors import SourceError
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
     from starcat.catalog.table_check import Checked
-    from starcat.pipeline.match_summary import Summary
+    from starcat.pipeline.counterparts import Summary
     from starcat.store.ingest import Stored
 
 app = typer.Typer()
@@ -165,9 +165,7 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
 
 @app.command()
 def crossmatch(
-    a: Annotated[
-        Path, typer.Argument(metavar="A", help="Star table (Parquet) or catalog store (HATS).")
-    ],
+    a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet).")],
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
@@ -175,28 +173,19 @@ def crossmatch(
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
     json: Json = False,
 ) -> None:
     """Find the counterparts of stars in another catalog by position, epoch and magnitude.
 
     Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
-    Catalog stores are matched partition by partition, whatever their size.
+    For two catalog stores of any size use LSDB, or crossmatch() of 'starcat sql'.
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
     """
     from starcat.pipeline.counterparts import match_files
-    from starcat.pipeline.match_stores import match_on_cluster
     from starcat.specs.product_sections import Crossmatch
-    from starcat.store.layout import is_store
 
-    wanted = Crossmatch(radius_arcsec=radius_arcsec)
-    if is_store(a) or is_store(b):
-        with progress_bars() as progress:
-            found = match_on_cluster(a, b, output, wanted, workers, scheduler, progress)
-    else:
-        found = match_files(a, b, output, wanted)
+    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
     names = {"a": a.stem, "b": b.stem}
     facts = {**names, **found.as_dict(), "output": str(output)}
     show(json, facts, print_crossmatch, found, *names.values(), output)

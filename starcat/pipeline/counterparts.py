@@ -7,8 +7,9 @@ a time; only rows that some star may be stay in memory.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +20,7 @@ from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.other_catalogs import (
     NEEDED,
     counterparts_of,
+    matched_stars,
     moving_stars,
     table_from_matches,
 )
@@ -29,16 +31,15 @@ from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
-from starcat.errors import ParseError, SchemaError, SourceMissing
-from starcat.pipeline.match_summary import Summary, differences_of, summary_of, tally_of
-from starcat.products.crossmatch import candidate_pairs, crossmatch
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.products.crossmatch import VERDICTS, candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
-from starcat.store.layout import check_has_columns, parquet_file
+from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
 
 
@@ -67,6 +68,30 @@ def model_from_spec(wanted: Crossmatch) -> MatchModel:
     )
 
 
+@dataclass(frozen=True)
+class Summary:
+    """What a cross-identification of two catalogs found."""
+
+    stars: int
+    counterparts: int
+    radius_arcsec: float  # largest separation of a candidate
+    matched: int  # stars with a counterpart, ambiguous ones included
+    unmatched: int  # all others
+    verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
+    no_candidate: int  # stars without a candidate within the radius
+    mutual: int  # stars that are their likeliest candidate's likeliest star
+    median_separation_arcsec: float | None  # over the matched stars; None if there are none
+    median_delta_mag: float | None
+    # The figures behind the odds, given or measured:
+    position_error_arcsec: float
+    expected_delta_mag: float
+    completeness: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain values."""
+        return asdict(self)
+
+
 def match_tables(
     stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch
 ) -> tuple[pa.Table, Summary]:
@@ -75,19 +100,27 @@ def match_tables(
     model = model_from_spec(wanted)
     found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
     table = table_from_matches(found, counterparts)
-    separation_arcsec, delta_mag = differences_of(found, table)
-    return table, summary_of(
-        tally_of(found, table),
-        (len(stars), len(counterparts)),
-        wanted.radius_arcsec,
-        found.odds,
-        _median(separation_arcsec),
-        _median(delta_mag),
+    rows, first = matched_stars(table), found.rank == 1
+    delta_mag = found.delta_mag[rows]
+    return table, Summary(
+        stars=len(stars),
+        counterparts=len(counterparts),
+        radius_arcsec=wanted.radius_arcsec,
+        matched=len(rows),
+        unmatched=len(stars) - len(rows),
+        verdicts={name: found.count(name) for name in VERDICTS if name != "other"},
+        no_candidate=len(stars) - int(first.sum()),
+        mutual=int((first & (found.star_rank == 1)).sum()),
+        median_separation_arcsec=_median(found.separation_rad[rows] / ARCSEC),
+        median_delta_mag=_median(delta_mag[~np.isnan(delta_mag)]),
+        position_error_arcsec=round(found.odds.position_error_rad / ARCSEC, 6),
+        expected_delta_mag=round(found.odds.delta_mag, 6),
+        completeness=round(found.odds.completeness, 6),
     )
 
 
 def _median(values: NDArray[np.float64]) -> float | None:
-    return float(np.median(values)) if len(values) else None
+    return round(float(np.median(values)), 6) if len(values) else None
 
 
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
@@ -199,19 +232,20 @@ def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
     """Return counterparts with the number and the name of their star in front."""
     own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
     columns = [own["star_id"], own["designation"], *table.columns]
-    return pa.Table.from_arrays(columns, schema=schema_with_own_names())
-
-
-def schema_with_own_names() -> pa.Schema:
-    """Return the schema ``crossmatch`` with the number and the name of the star in front."""
     known = product_schema("stars").arrow_schema
-    own = [known.field("star_id"), known.field("designation").with_name("star_designation")]
-    return pa.schema([*own, *product_schema("crossmatch").arrow_schema])
+    names = [known.field("star_id"), known.field("designation").with_name("star_designation")]
+    schema = pa.schema([*names, *product_schema("crossmatch").arrow_schema])
+    return pa.Table.from_arrays(columns, schema=schema)
 
 
 def read_star_table(path: Path) -> pa.Table:
     """Read the columns of a star table that a cross-identification needs."""
     hint = "give a star table, as 'starcat ingest' writes it"
+    if is_store(path):
+        raise ConfigError(
+            f"{path}: is a catalog store; crossmatch reads star tables. Use crossmatch() of "
+            "'starcat sql' for pairs within a radius, or LSDB, which opens the folder"
+        )
     if not path.exists():
         raise SourceMissing(f"{path}: no such file; {hint}", path=path)
     with parquet_file(path, ParseError, hint) as file:

@@ -128,7 +128,6 @@ ingest: ingest sao -o files/sao.parquet --epoch-jyear 2026.0
 ingest-band: ingest hipparcos -o files/hipparcos.parquet --band Hp --read-limit-mag 5
 ingest-hats: ingest sao --to hats -o files/store --max-partition-rows 3000 --replace
 crossmatch: crossmatch files/sao.parquet files/hipparcos.parquet -o files/both.parquet
-crossmatch-store: crossmatch files/store files/hipparcos.parquet -o files/both-store.parquet
 build-store: build --preset sao-12deg {SMALL} --input sao=files/store -o of-store
 inspect-onboard: inspect files/onboard.img
 verify-onboard: verify files/onboard.img --against {MINE}
