@@ -94,7 +94,7 @@ def test_lsdb_finds_the_same_pairs(stores):
         f"FROM crossmatch('first_hats', 'second_hats', {RADIUS_ARCSEC}, epoch := NULL)"
     )
     with open_session([str(store) for store in stores]) as session, session.ask(query) as answer:
-        rows = answer.rows(100_000).rows
+        rows = answer.rows(100_000)
     angles = {(a_id, b_id): angle for a_id, b_id, angle in rows}
     most = max(Counter(a_id for a_id, _ in angles).values())
     a, b = (lsdb.open_catalog(store) for store in stores)
