@@ -1,17 +1,13 @@
-"""`starcat sql`: targets, views, the gallery, the formats of answers, the prompt."""
+"""`starcat sql`: targets, views, the gallery, the formats of answers."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import re
-import select
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +20,6 @@ import pytest
 from table_formats import check_read
 
 from starcat.artifact.reader import open_artifact
-from starcat.cli.queries import prompt, words
 from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
 from starcat.exchange.formats import format_of
 from starcat.query.gallery import gallery, guessed, named_query
@@ -498,73 +493,3 @@ def test_the_progress_of_a_query_is_told(session):
     assert {(stage, total) for stage, _, total in events} == {("query", 100)}
     done = [done for _, done, _ in events]
     assert done == sorted(done)
-
-
-# The prompt -----------------------------------------------------------------------------------
-
-
-def test_the_prompt_answers_until_it_ends(session, capsys, monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    lines = iter(["SELECT count(*)", "  AS stars", "FROM stars;", "", "SELECT nosuch;", ".views",
-                  ".named densest-fields count=1", ".rows 1", "FROM pairs;", ".help", ".quit",
-                  "SELECT 'not asked';"])  # fmt: skip
-    prompts: list[str] = []
-
-    def read(text: str) -> str:
-        prompts.append(text)
-        return next(lines)
-
-    prompt(session, 40, read)
-    out, err = capsys.readouterr()
-    assert prompts[:4] == ["starcat> ", "   ...> ", "   ...> ", "starcat> "]
-    assert "small.pairs" in out
-    assert "star_count" in out
-    assert "error: " in err
-    assert "the first 1 rows" in err
-    assert ".macros" in err
-    assert "not asked" not in out
-    assert (tmp_path / "starcat" / "sql_history").exists()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a terminal of POSIX")
-def test_ctrl_c_stops_a_query_of_the_prompt_and_the_next_is_answered(small_artifact, tmp_path):
-    import pty
-
-    ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
-    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "TERM": "xterm"}
-    asking = subprocess.Popen(
-        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
-        start_new_session=True,
-        # A shell starts what runs in the background with this signal ignored, tests as well.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
-    os.close(theirs)
-    try:
-        read_until(ours, b"starcat> ")
-        os.write(ours, b"SELECT sum(sin(range)) FROM range(100000000000);\n")
-        read_until(ours, b"query")  # the bar
-        os.killpg(asking.pid, signal.SIGINT)
-        read_until(ours, b"stopped", b"starcat> ")
-        os.write(ours, b"SELECT 40 + 2 AS n;\n")
-        read_until(ours, b"42")
-        os.write(ours, b".quit\n")
-        assert asking.wait(20) == 0
-    finally:
-        asking.kill()
-        asking.wait()
-        os.close(ours)
-
-
-def read_until(terminal: int, *words: bytes) -> None:
-    """Read what a terminal shows until some words are there, one after the other."""
-    shown, end = b"", time.monotonic() + 50.0
-    while not re.search(b".*".join(map(re.escape, words)), shown, re.DOTALL):
-        assert time.monotonic() < end, f"{words!r} is not in {shown[-2000:]!r}"
-        ready, _, _ = select.select([terminal], [], [], 1.0)
-        shown += os.read(terminal, 4096) if ready else b""
-
-
-def test_the_prompt_completes_what_there_is(session):
-    known = words(session)
-    assert {"stars", "small.pairs", "separation_rad", "cone(", "densest-fields"} <= set(known)

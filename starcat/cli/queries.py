@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.cli import interrupts
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
-from starcat.errors import QueryError, StarcatError
+from starcat.errors import QueryError
 from starcat.query.gallery import gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
-from starcat.storage.state import state_folder
 
 if TYPE_CHECKING:
     from starcat.query.result import ResultTable
@@ -35,14 +33,17 @@ class Question:
 
 
 def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int) -> None:
-    """Answer a question, or ask for questions where there is none."""
+    """Answer a question; without one, answer the queries of the standard input."""
     form = format_of_answer(question)
     query, values = _query(question, len(targets))
+    if query is None and sys.stdin.isatty():
+        raise QueryError(
+            "no query; write one behind the targets, or choose one with --named. For a prompt use "
+            "DuckDB's own: 'starcat sql TARGET --preamble > views.sql; duckdb -init views.sql'"
+        )
     with opened(targets, limits) as session:
         if query is not None:
             _give(session, query, values, form, question.output, rows)
-        elif sys.stdin.isatty():
-            prompt(session, rows)
         else:
             texts = session.statements(sys.stdin.read())
             if question.output is not None and len(texts) > 1:
@@ -208,126 +209,3 @@ def print_gallery(*, as_json: bool) -> None:
         values = [f"--set {v.name}={v.default}: {v.help}" for v in query.values]
         _print_entry(query.name, [query.help + needs, *values])
     say("starcat sql TARGET --named densest-fields --set count=5")
-
-
-HELP = """\
-A query ends with a semicolon. Also:
-  .views            the views      (DESCRIBE stars; tells the columns of one)
-  .macros           the macros
-  .list             the named queries
-  .named NAME [VALUE=…]   run one of them
-  .rows N           rows of a table to show
-  .quit             or Ctrl-D"""
-
-HISTORY_LINES = 2000
-
-
-def history_path() -> Path:
-    """Return the file that keeps the queries of earlier prompts."""
-    return state_folder() / "sql_history"
-
-
-def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> None:
-    """Ask for queries and answer them, until there are no more."""
-    _complete(session)
-    say("starcat sql: .help tells more, .quit or Ctrl-D ends")
-    shell = _Shell(session, rows)
-    while True:
-        try:
-            text = _read_query(read)
-        except EOFError:
-            break
-        except KeyboardInterrupt:
-            interrupts.forget()
-            say("")
-            continue
-        if text.split()[:1] in ([".quit"], [".exit"]):
-            break
-        try:
-            shell.run(text)
-        except StarcatError as error:
-            say(f"error: {error}")
-        except KeyboardInterrupt:
-            interrupts.forget()
-            say("stopped")
-    _keep_history()
-
-
-def _read_query(read: Callable[[str], str]) -> str:
-    """Read lines up to a semicolon; a line that begins with a point, or an empty one, is alone."""
-    lines: list[str] = []
-    while True:
-        line = read("   ...> " if lines else "starcat> ")
-        lines.append(line)
-        text = "\n".join(lines).strip()
-        if not text or text.startswith(".") or text.endswith(";"):
-            return text
-
-
-class _Shell:
-    """What a prompt can be told."""
-
-    def __init__(self, session: Session, rows: int) -> None:
-        self.session = session
-        self.rows = rows
-
-    def run(self, text: str) -> None:
-        """Run a query or a command."""
-        word, *rest = text.split() or [""]
-        if word == ".views":
-            print_views(self.session, as_json=False)
-        elif word == ".macros":
-            print_macros(as_json=False)
-        elif word == ".list":
-            print_gallery(as_json=False)
-        elif word == ".named" and rest:
-            query = named_query(rest[0])
-            given = dict(item.split("=", 1) for item in rest[1:] if "=" in item)
-            print_first_rows(self.session, query.text, query.with_values(given), self.rows)
-        elif word == ".rows" and rest and rest[0].isdigit():
-            self.rows = max(1, int(rest[0]))
-        elif word.startswith("."):
-            say(HELP)
-        elif text:
-            print_first_rows(self.session, text, {}, self.rows)
-
-
-def words(session: Session) -> list[str]:
-    """Return what a prompt completes."""
-    known = {".help", ".views", ".macros", ".list", ".named ", ".rows ", ".quit", *gallery()}
-    known |= {f"{macro.name}(" for macro in macros() if not macro.name.startswith("_")}
-    for target in session.targets:
-        for view in target.views:
-            known |= {view.name, f"{target.name}.{view.name}"}
-            known |= {column.name for column in (view.schema.columns if view.schema else ())}
-    return sorted(known)
-
-
-def _complete(session: Session) -> None:
-    """Let the tab key complete names, and the arrows find earlier queries."""
-    try:
-        import readline
-    except ImportError:  # Windows: the prompt works without
-        return
-    known = words(session)
-
-    def complete(text: str, state: int) -> str | None:
-        fitting = [word for word in known if word.startswith(text)]
-        return fitting[state] if state < len(fitting) else None
-
-    readline.set_completer(complete)
-    readline.set_completer_delims(" \t\n,()=<>*+/;'\"")
-    readline.parse_and_bind("tab: complete")
-    with suppress(OSError):
-        readline.read_history_file(history_path())
-
-
-def _keep_history() -> None:
-    try:
-        import readline
-    except ImportError:
-        return
-    with suppress(OSError):
-        history_path().parent.mkdir(parents=True, exist_ok=True)
-        readline.set_history_length(HISTORY_LINES)
-        readline.write_history_file(history_path())

@@ -52,7 +52,7 @@ def sql_remotely(
 
     client, output, named = service_of(context), question.output, question.named
     if question.query is None and named is None:
-        raise QueryError("--server needs the query on the line, or --named; there is no prompt")
+        raise QueryError("--server needs the query on the line, or --named")
     if not targets:
         raise QueryError("name what the query is about: the id or the title of a database")
     form = format_of_answer(question)

@@ -23,7 +23,7 @@ Arguments = Annotated[
     typer.Argument(
         metavar="TARGET... [QUERY]",
         help="Databases, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
-        "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
+        "sources; then SQL, or - to read it from stdin.",
     ),
 ]
 Values = Annotated[

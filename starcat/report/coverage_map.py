@@ -9,15 +9,14 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from html import escape
+from functools import cache
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.sphere import directions_from_radec, radec_from_directions, saff_kuijlaars
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.matcher.chance import MIN_STARS
 
 Counts = NDArray[np.int64]
@@ -291,78 +290,3 @@ def _milky_way() -> str:
 def _path(x: Array, y: Array) -> str:
     points = [f"{a:.1f} {b:.1f}" for a, b in zip(x * UNIT, -y * UNIT, strict=True)]
     return f"M{'L'.join(points)}"
-
-
-def coverage_svg(title: str, guide_stars: int, ra_deg: Array, dec_deg: Array, stars: Counts) -> str:
-    """Return a map of dots with titles, which needs no script and no style sheet.
-
-    Of a fine tiling neighbouring fields share a dot, which tells of the one with the fewest stars.
-    """
-    dots = min(len(stars), MOST_DOTS)
-    group = _groups(len(stars), dots)
-    # The first of a group after sorting by group, then by stars, is the poorest field of it.
-    order = np.lexsort((stars, group))
-    _, first, size = np.unique(group[order], return_index=True, return_counts=True)
-    shown = order[first]
-    bins = bins_of(stars)
-    radius = 0.98 * SCALE * HALF_WIDTH * np.sqrt(2.0 / dots)
-    x, y = project(ra_deg[shown], dec_deg[shown])
-    drawn: list[list[str]] = [[] for _ in bins]
-    columns = (
-        bin_numbers(bins, stars[shown]),
-        WIDTH / 2 + SCALE * x,
-        8 + SCALE * (HALF_HEIGHT - y),
-        ra_deg[shown],
-        dec_deg[shown],
-        stars[shown],
-        size,
-    )
-    for k, cx, cy, ra, dec, count, of in zip(*(one.tolist() for one in columns), strict=True):
-        more = f", fewest of {of}" if of > 1 else ""
-        drawn[k].append(
-            f'<circle cx="{cx:.0f}" cy="{cy:.0f}" r="{radius:.1f}">'
-            f"<title>RA {ra:.1f} Dec {dec:+.1f}: {count}{more}</title></circle>"
-        )
-    # Where dots overlap, poor fields lie on top.
-    groups = [
-        f'<g fill="#{one.colour}">{"".join(circles)}</g>'
-        for one, circles in zip(bins, drawn, strict=True)
-    ]
-    return "".join((*_head(title, guide_stars, stars), *reversed(groups), *_legend(bins)))
-
-
-def _head(title: str, guide_stars: int, stars: Counts) -> list[str]:
-    name = escape(title)
-    middle = int(np.quantile(stars, 0.5, method="inverted_cdf"))
-    told = (
-        f"{guide_stars:,} guide stars; {len(stars):,} fields have {stars.min()} to "
-        f"{stars.max()}, {middle} in the middle. Mollweide's projection, ICRS; right "
-        "ascension 0 is in the middle and grows to the left."
-    )
-    return [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
-        f'aria-label="{name}: {told}" font-family="sans-serif" font-size="12">',
-        f"<title>{name}: guide stars by field</title><desc>{told}</desc>",
-        f'<ellipse cx="{WIDTH / 2:.0f}" cy="{8 + SCALE * HALF_HEIGHT:.0f}" '
-        f'rx="{SCALE * HALF_WIDTH:.0f}" ry="{SCALE * HALF_HEIGHT:.0f}" fill="#8883"/>',
-    ]
-
-
-def _legend(bins: tuple[Bin, ...]) -> list[str]:
-    step, y = (WIDTH - 16) / len(bins), HEIGHT - 26
-    parts = ['<g fill="currentColor">']
-    for k, one in enumerate(bins):
-        parts.append(
-            f'<rect x="{8 + k * step:.0f}" y="{y}" width="{step - 4:.0f}" height="8" '
-            f'fill="#{one.colour}"/><text x="{8 + k * step:.0f}" y="{y + 21}">{one.text}</text>'
-        )
-    return [*parts, "</g></svg>\n"]
-
-
-@lru_cache(maxsize=8)
-def _groups(fields: int, dots: int) -> Counts:
-    """Return the dot that each field of a tiling belongs to."""
-    if fields == dots:
-        return np.arange(fields)
-    _, nearest = scipy.spatial.cKDTree(saff_kuijlaars(dots)).query(saff_kuijlaars(fields))
-    return np.asarray(nearest, dtype=np.int64)

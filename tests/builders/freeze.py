@@ -500,7 +500,6 @@ validate-400 POST /api/v1/specs/validate json {{"preset"
 validate-413 POST /api/v1/specs/validate toml *2000000
 estimate POST /api/v1/specs/estimate json {json.dumps(PRESET)}
 coverage POST /api/v1/specs/coverage json {json.dumps(PRESET)}
-coverage-svg POST /api/v1/specs/coverage.svg json {json.dumps(PRESET)}
 starter POST /api/v1/specs/starter json {json.dumps(CAMERA)}
 starter-422 POST /api/v1/specs/starter json {{"name": "cam"}}
 jobs-401 POST /api/v1/jobs json {{"kind": "build", "preset": "gaia-12deg"}}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import threading
 import time
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -204,36 +202,6 @@ def test_a_catalog_that_is_not_here_is_told(client):
     wrong = refused(client.post(f"{API}/specs/estimate", json={"preset": "tycho2-12deg"}), 404)
     assert wrong["detail"].startswith("tycho2 (The Tycho-2 Catalogue): no file found")
     assert wrong["code"] == 3
-
-
-# --- The map
-
-
-def test_the_map_says_what_each_field_has(client, small_spec):
-    answer = client.post(f"{API}/specs/coverage.svg", content=small_spec, headers=TOML)
-    assert answer.headers["content-type"] == "image/svg+xml"
-    root = ET.fromstring(answer.text)
-    space = "{http://www.w3.org/2000/svg}"
-    titles = [one.findtext(f"{space}title") for one in root.iter(f"{space}circle")]
-    assert len(titles) == 200
-    fields = client.post(f"{API}/specs/coverage", content=small_spec, headers=TOML).json()
-    assert (fields["fields"], fields["step"]) == (200, 1)
-    told = sorted(int(re.search(r": (\d+)$", title)[1]) for title in titles)
-    assert told == sorted(fields["stars"])
-    assert not {"script", "style"} & {one.tag.removeprefix(space) for one in root.iter()}
-
-
-def test_the_map_of_many_fields_is_small_and_shows_the_poorest(client, small_spec):
-    body = {"toml": small_spec, "changes": {"boresights.count": "9000", "camera.fov_x_deg": "12"}}
-    svg = client.post(f"{API}/specs/coverage.svg", json=body).text
-    assert len(svg) < 300_000
-    fields = client.post(f"{API}/specs/coverage", json=body).json()
-    told = [
-        int(found) for found in re.findall(r": (\d+)(?:, fewest of \d+)?</title></circle>", svg)
-    ]
-    assert min(told) == min(fields["stars"])
-    groups = [int(found) for found in re.findall(r"fewest of (\d+)", svg)]
-    assert sum(groups) + len(told) - len(groups) == 9000
 
 
 # --- First specs, catalogs

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request, Response
+from fastapi import APIRouter, Depends, Path, Request
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starcat.errors import ConfigError
 from starcat.failures import validation_message
-from starcat.geometry.sphere import radec_from_directions
-from starcat.report.coverage_map import coverage_svg
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import (
     MOST_CHARACTERS,
@@ -156,9 +154,6 @@ SPEC_BODY: dict[str, Any] = {
 
 KIND = refusals({415: "Neither TOML nor JSON."})
 BUSY = refusals({503: "A catalog is being read; ``Retry-After`` says when to ask again."})
-SVG: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"image/svg+xml": {"schema": {"type": "string"}}}, "description": "The map."}
-}
 
 
 @router.get("/schema", summary="Keys of a spec")
@@ -207,25 +202,6 @@ def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> Estima
 def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> CoverageMap:
     """Return the guide stars in each field that a spec will give."""
     return coverage_answer(service.catalogs.estimate(spec))
-
-
-@router.post(
-    "/coverage.svg",
-    summary="Map of the guide stars by field",
-    openapi_extra=SPEC_BODY,
-    response_class=Response,
-    responses={**KIND, **BUSY, **SVG},
-)
-def coverage_picture(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
-    """Return a map of the whole sky; a pointer on a field says where it is and what it has."""
-    found = service.catalogs.estimate(spec)
-    picture = coverage_svg(
-        f"{spec.name}-{spec.version}",
-        found.cost.stars,
-        *radec_from_directions(found.fields.boresights),
-        found.fields.count,
-    )
-    return Response(picture, media_type="image/svg+xml")
 
 
 @router.post("/starter", summary="A first spec for a camera", responses=BUSY)
