@@ -39,6 +39,7 @@ LIGHT = {
     "starcat.errors",
     "starcat.storage.hdf5",
     "starcat.storage.product_table",
+    "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }

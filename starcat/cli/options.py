@@ -147,8 +147,7 @@ WcsFile = Annotated[
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
     """Return the spec of a file or of a preset."""
-    from starcat.specs.reading import preset as named_preset
-    from starcat.specs.reading import preset_names, read_spec
+    from starcat.specs.reading import local_preset, preset_names, read_spec
 
     if path is not None and name is not None:
         raise ConfigError("give either a spec file or --preset, not both")
@@ -158,7 +157,7 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
         raise ConfigError(
             "say what to build: a spec (TOML), or --preset with one of " + ", ".join(preset_names())
         )
-    return named_preset(name, changed_keys(changes))
+    return local_preset(name, changed_keys(changes))
 
 
 def changed_keys(given: list[str] | None) -> dict[str, str]:

@@ -39,7 +39,8 @@ NOVA = (
 """Whose clients send no header: a session is in their JSON, a number in their addresses."""
 
 OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
-"""What everybody may see, also where a token is needed for all else."""
+"""Paths that everybody may see, also if a token is needed for all others. A path that ends with a
+slash stands for all paths below it."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")
 """Paths whose programs send a name and a password only when they are asked for them."""
@@ -163,7 +164,7 @@ class Authentication:
                     headers=later(wait_s),
                 )
         principal = self._anonymous if found is None else Principal(found.name, found.role)
-        if principal.role == Role.NONE and not path.startswith(OPEN_PATHS):
+        if principal.role == Role.NONE and not is_open(path):
             raise self._unknown(scope)
         scope.setdefault("state", {})["principal"] = principal
 
@@ -195,6 +196,18 @@ class Authentication:
             "this needs a token; send it as 'Authorization: Bearer TOKEN', or sign in on the page",
             headers={"WWW-Authenticate": BASIC if path.startswith(CHALLENGED) else BEARER},
         )
+
+
+def is_open(path: str) -> bool:
+    """Return whether everybody may see a path.
+
+    Examples
+    --------
+    >>> is_open("/sign-in"), is_open("/sign-inx"), is_open("/static/page.css")
+    (True, False, True)
+    """
+    below = tuple(one for one in OPEN_PATHS if one.endswith("/"))
+    return path in OPEN_PATHS or path.startswith(below)
 
 
 def token_in(authorization: str) -> str | None:

@@ -102,7 +102,11 @@ class Library:
     def databases(self) -> list[Database]:
         """Return all databases that can be read, by name, version and id."""
         found = []
-        for path in self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"):
+        paths = set(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
+        for path in list(self._known):
+            if path not in paths:  # somebody has removed the database
+                self._known.pop(path, None)
+        for path in paths:
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:

@@ -92,7 +92,10 @@ class Settings(BaseModel):
     )
     session_hours: float = Field(12.0, gt=0, description="Hours that a sign-in lasts.")
     shutdown_s: float = Field(
-        20.0, ge=0, description="Seconds that jobs have to end when the service stops."
+        8.0,
+        ge=0,
+        description="Seconds that requests and jobs have to end when the service stops. The "
+        "process ends after 10 s, or 2 s after a longer shutdown_s, whatever still runs.",
     )
 
     @property

@@ -10,10 +10,11 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
+from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.camera_response import with_files_read
+from starcat.storage.regular_files import read_regular_file
 
 
 class _Shown(reprlib.Repr):
@@ -32,6 +33,9 @@ _SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
 MOST_CHARACTERS, MOST_POINTS = 100_000, 200
 """Of the text of a spec, and of full stops in a line of it."""
+
+MOST_BYTES = 4 * MOST_CHARACTERS
+"""Of the file of a spec or of a camera."""
 
 Changes = Mapping[str, str]
 """Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
@@ -65,14 +69,15 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
 
 
 def text_of_toml(path: Path, missing: str) -> str:
-    """Read a TOML file; ``missing`` is what to say where there is none."""
+    """Read a TOML file; ``missing`` is what the error says if the file does not exist."""
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        return read_regular_file(path, MOST_BYTES).decode("utf-8")
+    except FileMissing:
         raise FileMissing(f"{path}: {missing}") from None
-    except (OSError, ValueError) as error:
-        why = reason(error) if isinstance(error, OSError) else error
-        raise ConfigError(f"{path}: not a readable TOML file: {why}") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
 
 
 def content_of_toml(text: str, origin: str) -> dict[str, Any]:
@@ -200,7 +205,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset.
+    """Return a preset. Files that the changes name are refused, not read.
 
     Parameters
     ----------
@@ -217,13 +222,28 @@ def preset(name: str, changes: Changes | None = None) -> BuildSpec:
     Raises
     ------
     ConfigError
-        If there is no such preset, or a change is no value of its key.
+        If there is no such preset, or a change is no value of its key, or names a file.
     """
+    return spec_from_dict(changed(_preset_content(name), changes or {}), f"{name}.toml")
+
+
+def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
+    """Return a preset as `preset` does, with the files read that the changes name.
+
+    Relative names are taken from the current folder. It is for the user of this machine only: the
+    service must never call it.
+    """
+    content = with_files_read(changed(_preset_content(name), changes or {}), Path())
+    return spec_from_dict(content, f"{name}.toml")
+
+
+def _preset_content(name: str) -> dict[str, Any]:
     if name not in preset_names():
         hint = suggest(name, preset_names())
         raise ConfigError(
-            f"unknown preset {name!r}; {hint}known presets: {', '.join(preset_names())}",
+            f"unknown preset {quoted(name)}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",
             value=name,
         )
-    return read_spec(resource_folder("specs/presets") / f"{name}.toml", changes)
+    path = resource_folder("specs/presets") / f"{name}.toml"
+    return content_of_toml(text_of_toml(path, "no such preset"), path.name)

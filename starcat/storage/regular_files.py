@@ -13,6 +13,18 @@ from pathlib import Path
 from starcat.errors import FileMissing, SourceError, reason
 
 
+def check_regular_file(path: Path) -> None:
+    """Raise a `SourceError` if a path exists and is not a regular file; links are followed.
+
+    It is for readers of files of any size, before they open one: opening a pipe can wait for ever.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return  # the reader itself says why it cannot open the file
+    _check_mode(mode, path)
+
+
 def read_regular_file(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file.
 
@@ -43,11 +55,11 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         why = reason(error) if isinstance(error, OSError) else str(error)
         raise SourceError(f"{path}: cannot be read ({why})", path=path) from error
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
+    try:
+        _check_mode(os.fstat(descriptor).st_mode, path)
+    except SourceError:
         os.close(descriptor)
-        what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise SourceError(f"{path}: is {what}; give a file", path=path)
+        raise
     with os.fdopen(descriptor, "rb") as file:
         # The size that the system states can be wrong, as in /proc: what arrives is counted.
         content = file.read(max_bytes + 1)
@@ -56,3 +68,9 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
             f"{path}: has more than {max_bytes:,} bytes; a file of this kind is smaller", path=path
         )
     return content
+
+
+def _check_mode(mode: int, path: Path) -> None:
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
+        raise SourceError(f"{path}: is {what}; give a file", path=path)

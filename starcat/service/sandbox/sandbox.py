@@ -62,6 +62,10 @@ class Sandbox:
                 raise Problem(
                     413, "it takes more memory than a request may; send less, or a smaller picture"
                 )
+            if answer.get("kind") == "RecursionError":
+                raise Problem(
+                    422, "the file is nested too deep to be read; send it with fewer levels"
+                )
         if "kind" not in answer:
             return answer["found"]
         if answer["errno"] is not None:

@@ -19,7 +19,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import Message, Receive, Scope
 
 from starcat.service.problems import Problem
-from starcat.service.settings import Settings
+from starcat.service.settings import Role, Settings
 
 MOST_HEADERS, MOST_HEADER_BYTES, MOST_TARGET_BYTES = 100, 32_768, 16_384
 
@@ -32,6 +32,10 @@ TEXT_MIB = 1.0
 
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
+
+CHECKED = ("/api/upload",)
+"""Paths that take files of somebody without a token in a header: the body has a session, and the
+handler checks it before it reads the file. Elsewhere such a body is at most `TEXT_MIB`."""
 
 LEAST_FREE_GIB = 0.01
 """Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
@@ -153,6 +157,9 @@ class BodyLimits:
         headers = Headers(scope=scope)
         kind = headers.get("content-type", "").strip().lower()
         most_mib = self.settings.upload_mib
+        principal = scope.get("state", {}).get("principal")
+        if getattr(principal, "role", None) == Role.NONE and scope["path"] not in CHECKED:
+            most_mib = min(TEXT_MIB, most_mib)
         most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
         length = headers.get("content-length")
         if length is not None and not (length.isascii() and length.isdigit()):
