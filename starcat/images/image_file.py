@@ -28,9 +28,10 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, reason
+from starcat.errors import ConfigError, FileMissing, SourceError
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
+from starcat.storage.regular_files import read_regular_file
 from starcat.version import install_command
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ WRITTEN_KINDS = {
 }  # fmt: skip
 # Files that may say when they were taken.
 KNOWS_TIME = (".fits", ".fit", ".fts", ".jpg", ".jpeg", ".tif", ".tiff", ".png")
+MAX_FILE_BYTES = 4 << 30
 _LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
@@ -105,11 +107,11 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
 
 def _unpacked(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
+        data = read_regular_file(path, MAX_FILE_BYTES)
+    except FileMissing as error:
         raise FileMissing(f"{path}: no such file; give an image") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected an image") from error
     if not data.startswith(b"\x1f\x8b"):
         return data
     try:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import reprlib
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, OutputError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
+from starcat.storage.regular_files import read_regular_file
 
 BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
 """Names of a column of brightness; the first that a file has is used."""

@@ -35,6 +35,7 @@ from starcat.storage.product_table import (
     SMALLEST,
     Numbers,
 )
+from starcat.storage.regular_files import check_regular_file
 
 Made = TypeVar("Made")
 
@@ -107,6 +108,7 @@ def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     `SchemaVersionError` if its layout or a product's schema is of another major version.
     """
     path = _database_file(artifact)
+    check_regular_file(path)
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
         return _read(file, mapped, path, tuple(products))

@@ -10,10 +10,12 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError, SourceError, suggest
 from starcat.failures import validation_message
+from starcat.storage.regular_files import read_regular_file
 
 FILE_NAME = "service.toml"
+MAX_FILE_BYTES = 1 << 20
 
 RoleName = Literal["none", "reader", "builder", "publisher"]
 
@@ -130,8 +132,8 @@ def read_settings(root: Path, **options: object) -> Settings:
     content: dict[str, object] = {}
     if path.exists():
         try:
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            content = tomllib.loads(read_regular_file(path, MAX_FILE_BYTES).decode("utf-8"))
+        except (SourceError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     content |= {name: value for name, value in options.items() if value is not None}
     if "queue_url" in content:
