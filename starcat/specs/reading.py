@@ -98,10 +98,30 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
                 f"{MOST_POINTS} are read, and a key of a spec has two"
             )
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
+    _check_integers(content, origin)
+    return content
+
+
+def _check_integers(content: dict[str, Any], origin: str) -> None:
+    """Refuse integers that TOML does not have: Python cannot write one of 4,300 digits as text."""
+    left: list[tuple[str, Any]] = list(content.items())
+    while left:
+        key, value = left.pop()
+        if isinstance(value, dict):
+            left += [(f"{key}.{name}", one) for name, one in value.items()]
+        elif isinstance(value, list):
+            left += [(key, one) for one in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            shown = _shown_key(key)
+            raise ConfigError(
+                f"{origin}: {shown}: found {_SHOWN.repr(value)}; an integer of TOML is from -2^63 "
+                "to 2^63 - 1",
+                key=shown,
+            )
 
 
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from starcat.errors import FileMissing, SourceError, reason
 
+CHUNK_BYTES = 1 << 20
+
 
 def check_regular_file(path: Path) -> None:
     """Raise a `SourceError` if a path exists and is not a regular file; links are followed.
@@ -61,13 +63,18 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
         os.close(descriptor)
         raise
     with os.fdopen(descriptor, "rb") as file:
+        # Not `read(max_bytes)`: Python would allocate as much before it reads.
+        parts = [file.read(min(os.fstat(descriptor).st_size, max_bytes) + 1)]
+        size = len(parts[0])
         # The size that the system states can be wrong, as in /proc: what arrives is counted.
-        content = file.read(max_bytes + 1)
-    if len(content) > max_bytes:
+        while size <= max_bytes and (part := file.read(CHUNK_BYTES)):
+            parts.append(part)
+            size += len(part)
+    if size > max_bytes:
         raise SourceError(
             f"{path}: has more than {max_bytes:,} bytes; a file of this kind is smaller", path=path
         )
-    return content
+    return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def _check_mode(mode: int, path: Path) -> None:

@@ -40,7 +40,7 @@ router = APIRouter(include_in_schema=False)
 _MOST, _KEPT_S = 2_000, 3_600.0
 _ANONYMOUS = "anonymous"
 _HEAD_BYTES = 1 << 16
-_SESSION = re.compile(rb'"session"\s*:\s*"([A-Za-z0-9._-]{1,200})"')
+_SESSION = re.compile(rb'"session"[\s+]*:[\s+]*"([A-Za-z0-9._-]{1,200})"')
 _URLENCODED = "application/x-www-form-urlencoded"
 _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
 """Units of a scale that are of the width of a picture, degrees."""
