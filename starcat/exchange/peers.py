@@ -27,6 +27,7 @@ from starcat.catalog.verdict import Quality
 from starcat.errors import ConfigError, SourceError, SourceMissing, reason
 from starcat.exchange.export import NamedTables, in_memory
 from starcat.geometry.sphere import directions_from_radec
+from starcat.storage.regular_files import check_regular_file
 
 _COLUMNS = 6
 _DIRECTION_TOLERANCE = 1e-6
@@ -99,6 +100,7 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
         raise SourceMissing(
             f"{path}: no such file; give a database of cedar-solve or tetra3", path=path
         )
+    check_regular_file(path)
     wanted = ("star_table", "star_catalog_IDs", "props_packed")
     try:
         # Opened here, as numpy leaves a damaged file open.
