@@ -52,7 +52,7 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
     try:
         # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise FileMissing(f"{path}: no such file") from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         why = reason(error) if isinstance(error, OSError) else str(error)
