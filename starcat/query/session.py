@@ -18,7 +18,7 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.engine import Allowance, Engine, WorkerEnded
+from starcat.query.engine import MESSAGE_BYTES, Allowance, Engine, WorkerEnded
 from starcat.query.gallery import macros
 from starcat.query.messages import Statement
 from starcat.query.names import quoted, short_names
@@ -45,6 +45,8 @@ class Limits:
     time_s: float = 60.0  # seconds until it is stopped
     memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
     disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
+    message_bytes: int = MESSAGE_BYTES  # size of a row, and of what is sent at once
+    rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,15 @@ class Session:
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""
         [found] = self._engine.ask("statements", text)
-        return list(found)
+        return list(map(str, found))
 
     def check(self, text: str, allowance: Allowance | None = None) -> Statement:
         """Check that a text is a query that may run."""
         known = self._checked.pop(text, None)
         if known is None:
             given = allowance or self._allowance()
-            [known] = self._engine.ask("check", text, allowance=given)
+            [found] = self._engine.ask("check", text, allowance=given)
+            known = Statement.from_json(found)
         self._checked[text] = known
         if len(self._checked) > MAX_CHECKED:
             del self._checked[next(iter(self._checked))]
@@ -100,7 +103,10 @@ class Session:
         if statement.is_description:
             runs = self._described(statement, used, allowance)
             used = None
-        yield RunningQuery(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
+        known = facts_by_name(self.views)
+        yield RunningQuery(
+            self._engine, runs, used, known, allowance, progress, self.limits.rows_bytes
+        )
 
     def _allowance(self) -> Allowance:
         return self.allowance or Allowance(self.limits.time_s)
@@ -133,7 +139,7 @@ def open_session(
     allowed = limits or Limits()
     scratch = Path(tempfile.mkdtemp(prefix="starcat-sql-"))
     try:
-        engine = Engine(scratch, allowed.memory_gb, allowed.disk_gb)
+        engine = Engine(scratch, allowed.memory_gb, allowed.disk_gb, allowed.message_bytes)
         try:
             targets = open_targets(given, scratch, engine, progress)
             _make_views(engine, targets)
