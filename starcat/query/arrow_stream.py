@@ -70,7 +70,7 @@ def streams_of(batch: pa.RecordBatch, max_bytes: int) -> Iterator[bytes]:
             yield from streams_of(part.slice(half), max_bytes)
 
 
-def schema_of(content: bytes) -> pa.Schema:
+def schema_of(content: bytes | bytearray) -> pa.Schema:
     """Return the schema of a stream; MalformedMessage if it is not one."""
     try:
         schema: pa.Schema = pa.ipc.open_stream(content).schema
@@ -81,7 +81,7 @@ def schema_of(content: bytes) -> pa.Schema:
     return schema
 
 
-def batches_of(content: bytes, schema: pa.Schema) -> list[pa.RecordBatch]:
+def batches_of(content: bytes | bytearray, schema: pa.Schema) -> list[pa.RecordBatch]:
     """Return the batches of a stream with a known schema; MalformedMessage if it has others."""
     try:
         _check_messages(content)
@@ -179,7 +179,7 @@ def _has_wide_values(kind: pa.DataType) -> bool:
     return is_wide or any(map(_has_wide_values, parts))
 
 
-def _check_messages(content: bytes) -> None:
+def _check_messages(content: bytes | bytearray) -> None:
     """Refuse compressed rows: a few bytes could become gigabytes."""
     for message in pa.ipc.MessageReader.open_stream(content):
         table = message.metadata.to_pybytes()

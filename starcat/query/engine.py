@@ -23,12 +23,13 @@ from typing import IO, Any
 from starcat.errors import QueryError, QueryLimitError
 from starcat.progress import Progress, no_progress
 from starcat.query.frames import (
+    READ_BYTES,
     MalformedMessage,
+    Receiver,
     decoded_rows,
     encoded,
     from_json,
     json_content,
-    receive_message,
     send_message,
     write_message,
 )
@@ -271,13 +272,16 @@ class Engine:
         told = "DuckDB failed: " if kind == BROKEN else ""
         raise QueryError(f"{told}{parts[-1]}")
 
-    def _replies(self, max_bytes: int | None) -> Iterator[tuple[str, bytes]]:
+    def _replies(self, max_bytes: int | None) -> Iterator[tuple[str, bytes | bytearray]]:
         """Give what the process sends until it is at an end."""
         stream, kind, size = self._process.stdout, "", 0
         if stream is None:
             raise EOFError
+        receiver = Receiver(stream, self._opening.message_bytes, self._is_gone)
         while kind not in ENDINGS:
-            kind, content = receive_message(stream, self._opening.message_bytes, self._is_gone)
+            if kind and self._is_gone():
+                raise EOFError
+            kind, content = receiver.receive()
             if kind not in ENDINGS | {PART, PROGRESS}:
                 raise MalformedMessage("the process of the query sent a message of no known kind")
             size += len(content) if kind == PART else 0
@@ -352,10 +356,15 @@ class Engine:
     def _used_s(self) -> float:
         """Return the time of processors that it has taken, where that can be read, or any time."""
         try:
-            text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii")
+            # Twice for each question, so without what `Path` and decoding take.
+            descriptor = os.open(f"/proc/{self._process.pid}/stat", os.O_RDONLY)
         except OSError:
             return time.monotonic()
-        user, system = text.rpartition(")")[2].split()[11:13]
+        try:
+            text = os.read(descriptor, READ_BYTES)
+        finally:
+            os.close(descriptor)
+        user, system = text.rpartition(b")")[2].split()[11:13]
         return (int(user) + int(system)) / TICKS
 
     def _ended(self, allowance: Allowance) -> QueryError:
@@ -395,7 +404,7 @@ def _too_large(max_bytes: int) -> AnswerTooLarge:
     )
 
 
-def _percent(content: bytes) -> int:
+def _percent(content: bytes | bytearray) -> int:
     found = from_json(content)
     if not isinstance(found, int):
         raise MalformedMessage("the process of the query sent a progress that is not a number")

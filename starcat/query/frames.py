@@ -15,11 +15,10 @@ import json
 import os
 import select
 import struct
-import sys
 import uuid
-from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
+from itertools import chain
 from typing import IO, Any
 
 from starcat.errors import QueryError
@@ -27,24 +26,31 @@ from starcat.errors import QueryError
 HEAD = struct.Struct(">cQ")
 """Kind and length of a message."""
 
-READ_BYTES = 1 << 20
+READ_BYTES = 1 << 16
 LOOK_S = 0.5
 """Seconds after which a reader that waits looks whether the writer is still running."""
 
 _PLAIN = {bool, int, float, str, type(None)}
-_PACKED = {"d": float, "q": int}
-"""Types of columns that are sent as packed numbers, by the letter of `array.array`."""
+_BETWEEN = "\n"
+"""Between the texts of a column that have none in them. It is short in JSON and rare in columns."""
+_INTEGERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "UTINYINT", "USMALLINT", "UINTEGER")
+_CODES = {"DOUBLE": "d", "FLOAT": "d", "BOOLEAN": "?", **dict.fromkeys(_INTEGERS, "q")}
+"""How `struct` packs the values of a column, by DuckDB's type."""
+
+_JSON = json.JSONEncoder(separators=(",", ":"))
+_SIZES = {"d": 8, "q": 8, "?": 1}
 
 
 class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact
     """A process sent bytes that are not a message, or a message that is too long."""
 
 
-def write_message(stream: IO[bytes], kind: str, content: bytes) -> None:
-    """Write a message."""
+def write_message(stream: IO[bytes], kind: str, content: bytes, *, more: bool = False) -> None:
+    """Write a message; if more follow, it may wait for them."""
     stream.write(HEAD.pack(kind.encode(), len(content)))
     stream.write(content)
-    stream.flush()
+    if not more:
+        stream.flush()
 
 
 def read_message(stream: IO[bytes]) -> tuple[str, bytes]:
@@ -60,35 +66,44 @@ def _exactly(stream: IO[bytes], size: int) -> bytes:
     return found
 
 
-def receive_message(
-    stream: IO[bytes], max_bytes: int, is_over: Callable[[], bool]
-) -> tuple[str, bytes]:
-    """Read a message of a process that is not trusted.
+class Receiver:
+    """Messages of a process that is not trusted.
 
-    Memory is taken only for bytes that arrived. EOFError if the process ended, or if ``is_over``
-    becomes true: a process that it started may keep the pipe open.
+    Memory is taken only for bytes that arrived. ``is_over`` says that nothing of the process is on
+    its way any more: another process that it started may keep the pipe open.
     """
-    kind, size = HEAD.unpack(_arrived(stream, HEAD.size, is_over))
-    if size > max_bytes:
-        raise MalformedMessage(
-            f"the process of the query sent a message of {size:,} bytes; at most {max_bytes:,} "
-            "are read"
-        )
-    return kind.decode("latin-1"), _arrived(stream, size, is_over)
 
+    def __init__(self, stream: IO[bytes], max_bytes: int, is_over: Callable[[], bool]) -> None:
+        self._descriptor = stream.fileno()
+        self._max_bytes = max_bytes
+        self._is_over = is_over
+        self._arrived = bytearray()
 
-def _arrived(stream: IO[bytes], size: int, is_over: Callable[[], bool]) -> bytes:
-    found = bytearray()
-    while len(found) < size:
-        if is_over():
-            raise EOFError
-        if os.name == "posix" and not select.select([stream], [], [], LOOK_S)[0]:
-            continue
-        part = os.read(stream.fileno(), min(READ_BYTES, size - len(found)))
-        if not part:
-            raise EOFError
-        found += part
-    return bytes(found)
+    def receive(self) -> tuple[str, bytes | bytearray]:
+        """Return kind and content of the next message; EOFError if there is none."""
+        self._read(self._arrived, HEAD.size, READ_BYTES)
+        kind, size = HEAD.unpack_from(self._arrived)
+        if size > self._max_bytes:
+            raise MalformedMessage(
+                f"the process of the query sent a message of {size:,} bytes, and at most "
+                f"{self._max_bytes:,} are read; it was ended. Ask again"
+            )
+        content = self._arrived[HEAD.size : HEAD.size + size]
+        del self._arrived[: HEAD.size + len(content)]
+        self._read(content, size, size)
+        return kind.decode("latin-1"), content
+
+    def _read(self, found: bytearray, least: int, most: int) -> None:
+        """Read until there are enough bytes, and not more than the most."""
+        while len(found) < least:
+            # On Windows pipes cannot be waited for in this way.
+            if os.name != "posix" or select.select([self._descriptor], [], [], LOOK_S)[0]:
+                part = os.read(self._descriptor, min(READ_BYTES, most - len(found)))
+                if not part:
+                    raise EOFError
+                found += part
+            if len(found) < least and self._is_over():
+                raise EOFError
 
 
 def send_message(stream: IO[bytes], kind: str, content: bytes, is_over: Callable[[], bool]) -> None:
@@ -99,21 +114,23 @@ def send_message(stream: IO[bytes], kind: str, content: bytes, is_over: Callable
     left = memoryview(HEAD.pack(kind.encode(), len(content)) + content)
     os.set_blocking(stream.fileno(), False)
     while left:
-        if is_over():
-            raise BrokenPipeError
-        if select.select([], [stream], [], LOOK_S)[1]:
+        try:
             left = left[os.write(stream.fileno(), left) :]
+        except BlockingIOError:
+            select.select([], [stream], [], LOOK_S)
+            if is_over():
+                raise BrokenPipeError from None
 
 
 def json_content(found: Any) -> bytes:
     """Return plain values as the content of a message."""
-    return json.dumps(found, separators=(",", ":")).encode()
+    return _JSON.encode(found).encode()
 
 
-def from_json(content: bytes) -> Any:
+def from_json(content: bytes | bytearray) -> Any:
     """Return the plain values of a message; MalformedMessage if it is not JSON."""
     try:
-        return json.loads(content)
+        return json.loads(str(content, "utf-8"))
     except (ValueError, RecursionError) as error:
         raise _malformed(error) from error
 
@@ -148,63 +165,75 @@ def decoded(value: Any) -> Any:
         raise _malformed(error) from error
 
 
-def encoded_rows(rows: Sequence[Sequence[Any]]) -> bytes:
-    """Return rows as the content of a message, for `decoded_rows`."""
-    columns = list(zip(*rows, strict=True))
-    return json_content([len(rows), [_encoded_column(column) for column in columns]])
+def encoded_rows(rows: Sequence[Sequence[Any]], types: Sequence[str]) -> bytes:
+    """Return rows as the content of a message, for `decoded_rows`.
+
+    Numbers of 64 bits and texts are packed behind the JSON, which is much faster. ``types`` are
+    DuckDB's types of the columns.
+    """
+    packed: list[bytes] = []
+    values = list(chain.from_iterable(rows))
+    columns = [
+        _encoded_column(values[k :: len(types)], kind, packed) for k, kind in enumerate(types)
+    ]
+    return b"\n".join((json_content([len(rows), columns, list(map(len, packed))]), *packed))
 
 
-def decoded_rows(content: bytes) -> list[tuple[Any, ...]]:
+def decoded_rows(content: bytes | bytearray) -> list[tuple[Any, ...]]:
     """Return the rows of a message; MalformedMessage if there are none in it."""
-    found = from_json(content)
+    end = content.find(b"\n") % (len(content) + 1)
+    found = from_json(content[:end])
     try:
-        count, columns = found
-        values = [_decoded_column(column) for column in columns]
+        count, columns, sizes = found
+        packed, view = [], memoryview(content)
+        for size in sizes:
+            if not 0 <= size < len(content) - end:
+                raise ValueError("a packed column is cut off")
+            packed.append(view[end + 1 : end + 1 + size])
+            end += 1 + size
+        parts = iter(packed)
+        values = [_decoded_column(column, parts) for column in columns]
         if {len(column) for column in values} != {count}:
             raise ValueError("the columns have different lengths")
         return list(zip(*values, strict=True))
-    except (TypeError, ValueError, KeyError, RecursionError) as error:
+    except MalformedMessage:
+        raise
+    except Exception as error:  # whatever wrong parts lead to
         raise _malformed(error) from error
 
 
-def _encoded_column(column: Sequence[Any]) -> list[Any]:
-    kinds = set(map(type, column))
-    has_nulls = type(None) in kinds
-    kinds.discard(type(None))
-    for code, kind in _PACKED.items():
-        if kinds == {kind}:
-            nulls = [k for k, value in enumerate(column) if value is None] if has_nulls else []
-            values = [kind() if value is None else value for value in column] if nulls else column
-            try:
-                packed = array(code, values)
-            except OverflowError:  # larger than 64 bits
-                break
-            if sys.byteorder == "big":
-                packed.byteswap()
-            return [code, base64.b64encode(packed.tobytes()).decode("ascii"), nulls]
-    if kinds <= _PLAIN:
-        return ["plain", column]
+def _encoded_column(column: Sequence[Any], kind: str, packed: list[bytes]) -> list[Any]:
+    code = _CODES.get(kind)
+    if code is not None:
+        nulls = [k for k, value in enumerate(column) if value is None] if None in column else []
+        try:
+            given = [0 if value is None else value for value in column] if nulls else column
+            packed.append(struct.pack(f"<{len(column)}{code}", *given))
+            return [code, nulls]
+        except struct.error:  # larger than 64 bits
+            pass
+    if kind == "VARCHAR" and None not in column:
+        joined = _BETWEEN.join(column)
+        if joined.count(_BETWEEN) == len(column) - 1:
+            packed.append(joined.encode())
+            return ["text"]
     return ["any", [encoded(value) for value in column]]
 
 
-def _decoded_column(column: Any) -> list[Any]:
-    code, content, *rest = column
-    if code == "plain":
-        if any(type(value) not in _PLAIN for value in content):
-            raise ValueError("a plain column has other values")
-        return list(content)
+def _decoded_column(column: Any, packed: Iterator[memoryview]) -> Sequence[Any]:
+    code, *rest = column
+    if code == "text":
+        return str(next(packed), "utf-8").split(_BETWEEN)
     if code == "any":
-        return [decoded(value) for value in content]
-    if code not in _PACKED:
+        return [decoded(value) for value in rest[0]]
+    if code not in _SIZES:
         raise ValueError("an unknown form of a column")
-    packed = array(code)
-    packed.frombytes(base64.b64decode(content, validate=True))
-    if sys.byteorder == "big":
-        packed.byteswap()
-    values: list[Any] = packed.tolist()
-    [nulls] = rest
-    for k in nulls:
-        values[k] = None
+    part = next(packed)
+    values: Sequence[Any] = struct.unpack(f"<{len(part) // _SIZES[code]}{code}", part)
+    if rest[0]:
+        values = list(values)
+        for k in rest[0]:
+            values[k] = None
     return values
 
 

@@ -186,9 +186,9 @@ class Worker:
         zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
         if zoned:
             running = self._connection.execute(_without_zones(text, columns), values)
-        size = 0
+        size, types = 0, [kind for _, kind in columns]
         for part in _parts(running, count):
-            for content in self._contents(_in_utc(part, zoned) if zoned else part):
+            for content in self._contents(_in_utc(part, zoned) if zoned else part, types):
                 size += len(content)
                 if max_bytes is not None and size > max_bytes:
                     raise _TooLarge
@@ -197,19 +197,19 @@ class Worker:
         self._connection.abort()
         return columns
 
-    def _contents(self, rows: list[tuple[Any, ...]]) -> Iterator[bytes]:
+    def _contents(self, rows: list[tuple[Any, ...]], types: list[str]) -> Iterator[bytes]:
         """Give rows as contents of messages."""
         if not rows:
             return
-        content = encoded_rows(rows)
+        content = encoded_rows(rows, types)
         if len(content) <= self._opening.message_bytes:
             yield content
         elif len(rows) == 1:
             raise _TooLarge
         else:
             half = len(rows) // 2
-            yield from self._contents(rows[:half])
-            yield from self._contents(rows[half:])
+            yield from self._contents(rows[:half], types)
+            yield from self._contents(rows[half:], types)
 
     def batches(self, text: str, values: dict[str, Any] | None) -> bytes:
         """Begin to read all rows as Arrow batches; return their schema as an Arrow stream."""
@@ -244,7 +244,7 @@ class Worker:
         self._connection.abort()
 
     def _send(self, kind: str, content: bytes) -> None:
-        write_message(self._replies, kind, content)
+        write_message(self._replies, kind, content, more=kind == PART)
 
     def _hear(self) -> None:
         """Interrupt what runs when that is wanted."""
