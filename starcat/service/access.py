@@ -55,6 +55,9 @@ GUESSES_PER_MINUTE = 10
 """Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
 not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
 
+ANONYMOUS = "anonymous"
+"""Name of whoever has no token."""
+
 
 @dataclass(frozen=True)
 class Principal:
@@ -143,7 +146,7 @@ class Authentication:
     def __init__(self, settings: Settings, identities: Identities) -> None:
         self._settings = settings
         self._identities = identities
-        self._anonymous = Principal("anonymous", settings.anonymous_role)
+        self._anonymous = Principal(ANONYMOUS, settings.anonymous_role)
         self._asked = Buckets(settings.requests_per_minute)
 
     def check(self, scope: Scope) -> None:
