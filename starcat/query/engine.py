@@ -269,8 +269,7 @@ class Engine:
             )
         if self._is_late:
             raise _late(allowance)
-        told = "DuckDB failed: " if kind == BROKEN else ""
-        raise QueryError(f"{told}{parts[-1]}")
+        raise _refusal(parts[-1], kind)
 
     def _replies(self, max_bytes: int | None) -> Iterator[tuple[str, bytes | bytearray]]:
         """Give what the process sends until it is at an end."""
@@ -402,6 +401,16 @@ def _too_large(max_bytes: int) -> AnswerTooLarge:
     return AnswerTooLarge(
         f"the answer has more than {max_bytes / 1e6:,.0f} MB; ask for fewer rows or columns"
     )
+
+
+def _refusal(found: Any, kind: str) -> QueryError:
+    """Return the error that a process has sent; MalformedMessage if it is none."""
+    try:
+        words, fields = found
+        failed = "DuckDB failed: " if kind == BROKEN else ""
+        return QueryError(f"{failed}{words}", fields=tuple(map(str, fields)))
+    except (TypeError, ValueError):
+        return MalformedMessage("the process of the query sent no error that can be read")
 
 
 def _percent(content: bytes | bytearray) -> int:

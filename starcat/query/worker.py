@@ -120,7 +120,7 @@ class Worker:
                 content = json_content(found)
         except Exception as error:
             kind, words = _failure(error)
-            content = json_content(words)
+            content = json_content([words, list(getattr(error, "fields", ()))])
         with self._sending:
             self._is_running = False
             self._send(kind, content)

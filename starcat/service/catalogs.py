@@ -40,7 +40,7 @@ WAIT_S = 25.0
 RETRY_S = 5
 """Seconds after which to ask again."""
 
-READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 768 << 20, 128 << 20, 64 << 20
+READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 640 << 20, 128 << 20, 64 << 20
 """Memory for catalogs that were read, for guide stars, and for estimates."""
 
 MOST_INPUT_BYTES = 2 << 30

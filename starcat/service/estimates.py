@@ -8,11 +8,13 @@ ends, its requests are refused and the next one starts another process.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -49,7 +51,7 @@ class ChildCatalogs(Catalogs):
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         super().__init__(max_memory_bytes, wait_s)
         self._child: Child | None = None
-        self._pending: dict[int, Future[Any]] = {}
+        self._pending: dict[int, Future[Any]] = {}  # requests of this process, by their numbers
         self._read_ones: tuple[CatalogRead, ...] = ()  # catalogs that the process has read
         self._number = 0
         self._sending = threading.Lock()
@@ -117,7 +119,8 @@ class ChildCatalogs(Catalogs):
         with self._sending:
             child, self._child = self._child, None
         if child is not None:
-            child.close()
+            child.kill()
+            self._hearing.join()
 
     def _ask(self, task: str, **arguments: Any) -> Any:
         answer: Future[Any] = Future()
@@ -144,26 +147,30 @@ class ChildCatalogs(Catalogs):
         memory = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
         child = Child("starcat.service.estimates:serve", environment=memory)
         child.send({"max_memory_bytes": self._max_memory_bytes, "wait_s": self._wait_s})
-        threading.Thread(target=self._hear, args=(child,), daemon=True).start()
+        self._pending = {}
+        given = child, self._pending
+        self._hearing = threading.Thread(target=self._hear, args=given, daemon=True)
+        self._hearing.start()
         return child
 
-    def _hear(self, child: Child) -> None:
+    def _hear(self, child: Child, pending: dict[int, Future[Any]]) -> None:
         """Give each answer of a process to whom it is for, until the process ends."""
         try:
             for line in child.lines(TICK_S):
                 if line is not None:
                     content = json.loads(line)
                     self._read_ones = tuple(CatalogRead(**one) for one in content["read"])
-                    waiting = self._pending.pop(content["number"], None)
+                    waiting = pending.pop(content["number"], None)
                     if waiting is not None:
                         waiting.set_result(content)
         except (OSError, ValueError):  # the pipe was closed
             pass
         finally:
-            child.kill()
+            child.close()
             with self._sending:
-                lost, self._pending = self._pending, {}
-            for waiting in lost.values():
+                lost = list(pending.values())
+                pending.clear()
+            for waiting in lost:
                 waiting.set_exception(_ended())
 
 
@@ -189,8 +196,11 @@ def serve() -> None:
     writing = threading.Lock()
 
     def answer(request: Mapping[str, Any]) -> None:
+        before = catalogs.known()
         content = {"number": request["number"], **_answer(catalogs, request)}
         content["read"] = [asdict(one) for one in catalogs.known()]
+        if catalogs.known() != before:
+            _return_memory()
         line = json.dumps(content, default=_plain).encode() + b"\n"
         with writing:
             output.write(line)
@@ -247,6 +257,13 @@ _TASKS: dict[str, Callable[..., Any]] = {
     "starter": _starter,
     "enough_limit": _enough_limit,
 }
+
+
+def _return_memory() -> None:
+    """Return the memory that reading a catalog took and that is free now to the system."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # of another C library than that of GNU
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _plain(value: Any) -> Any:

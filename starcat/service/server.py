@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import signal
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -113,6 +115,8 @@ def run_server(settings: Settings, announce: Announce) -> None:
         raise _without_token(settings)  # before anything is made
     with _only_server(paths):
         shutil.rmtree(paths.scratch, ignore_errors=True)
+        # For uploads that are larger than a megabyte, and for what child processes write.
+        os.environ["TMPDIR"] = tempfile.tempdir = str(paths.scratch)
         _serve(settings, announce)
 
 

@@ -73,7 +73,9 @@ class Sandbox:
             return answer["found"]
         if answer["errno"] is not None:
             raise OSError(answer["errno"], answer["message"])
-        error = error_of_kind(answer["kind"], answer["message"], key=answer["key"])
+        error = error_of_kind(
+            answer["kind"], answer["message"], key=answer["key"], fields=answer["fields"]
+        )
         raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
 
     def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:

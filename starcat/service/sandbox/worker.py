@@ -152,6 +152,7 @@ def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, An
             "kind": kind,
             "message": str(error)[:4000],
             "key": None if key is None else str(key),
+            "fields": list(getattr(error, "fields", ())),
             "errno": _system_error(error),
         }
 
