@@ -27,8 +27,10 @@ from starcat.service.api.nova import Solution, Solutions
 from starcat.service.catalogs import Catalogs
 from starcat.service.estimates import ChildCatalogs
 from starcat.service.problems import Problem
+from starcat.service.removal import remove_old
 from starcat.service.sandbox import child as child_module
 from starcat.service.sandbox.child import Child
+from starcat.service.security.tokens import DAY_S
 from starcat.specs.reading import preset
 
 WIDE = "SELECT repeat('x', 1000) AS v, range AS n FROM range({})"
@@ -131,6 +133,8 @@ def test_temporary_files_of_queries_are_in_the_root(client):
     with service.query_pool.session([service.library.target(DATABASE)]) as session:
         spill = session._engine._opening.spill
         assert spill.is_relative_to(service.paths.scratch)
+        remove_old(service, time.time() + 10 * DAY_S)
+        assert spill.is_dir(), "the folder of a session that lives is not old"
 
 
 def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifact, tmp_path):
