@@ -16,6 +16,8 @@ from fastapi.testclient import TestClient
 from pictures import png_of
 from services import DATABASE, client_of
 
+from starcat.query.session import SCRATCH_PREFIX
+
 SETTINGS = {"query_time_s": 20.0, "max_rows": 500, "query_memory_gib": 0.75}
 SQL = "/api/v1/sql"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
@@ -164,8 +166,7 @@ def test_nothing_is_left_in_scratch(client, root):
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    from starcat.query.session import SCRATCH_PREFIX
-from starcat.images.render import write_simulated
+    from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
 
