@@ -180,9 +180,10 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
             copy_to_part(source, blob, arriving)
             make_folder(final.parent)
             arriving.replace(final)
-        except OSError:
-            # A full disk is not kept full. What a process that was killed leaves is gone on with.
-            arriving.unlink(missing_ok=True)
+        except OSError as error:
+            # A part is gone on with later, but not at the price of a disk that stays full.
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                arriving.unlink(missing_ok=True)
             raise
         # Not before: a part has to be writable for who goes on with it.
         final.chmod(final.stat().st_mode & 0o555)
