@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import io
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,7 @@ from starcat.service.problems import Problem
 from starcat.service.removal import remove_old
 from starcat.service.sandbox import child as child_module
 from starcat.service.sandbox.child import Child
+from starcat.service.security.request_limits import Buckets
 from starcat.service.security.tokens import DAY_S
 from starcat.specs.reading import preset
 
@@ -226,24 +228,63 @@ def test_a_query_job_without_a_token_is_seen_by_its_client_only(client):
 # What is kept in memory.
 
 
-def test_results_are_kept_for_many_threads():
-    """Without a lock, a cache that forgets while others read and write raises KeyError."""
-    kept, errors = Solutions(TTLCache(100, 0.001)), []
-    solution = Solution("a.fits", "", {})
+class SlowText(str):
+    """A key at which another thread is let in."""
 
-    def work() -> None:
+    __slots__ = ()
+
+    def __hash__(self) -> int:
+        time.sleep(0)
+        return str.__hash__(self)
+
+
+class SlowNumber(int):
+    """A key at which another thread is let in."""
+
+    def __hash__(self) -> int:
+        time.sleep(0)
+        return int.__hash__(self)
+
+
+def in_threads(work: Callable[[], None]) -> list[Exception]:
+    """Run a function in eight threads at the same time; return what they raised."""
+    errors: list[Exception] = []
+
+    def run() -> None:
         try:
-            for _ in range(2000):
-                kept.get(kept.add(solution))
+            work()
         except Exception as error:
             errors.append(error)
 
-    threads = [threading.Thread(target=work) for _ in range(8)]
+    threads = [threading.Thread(target=run) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert errors == []
+    return errors
+
+
+def test_results_are_kept_for_many_threads(monkeypatch):
+    """Without a lock, a cache that forgets while other threads read and write raises KeyError."""
+    kept, numbers = Solutions(TTLCache(20, 0.002)), itertools.count()
+    monkeypatch.setattr("secrets.randbits", lambda _: SlowNumber(next(numbers)))
+    solution = Solution("a.fits", "", {})
+
+    def work() -> None:
+        for _ in range(300):
+            kept.get(kept.add(solution))
+
+    assert in_threads(work) == []
+
+
+def test_buckets_count_what_many_threads_take():
+    buckets, waits = Buckets(6000.0, clock=lambda: 0.0), []
+
+    def work() -> None:
+        waits.extend(buckets.take(SlowText("a")) for _ in range(1000))
+
+    assert in_threads(work) == []
+    assert waits.count(0.0) == 6000
 
 
 def test_estimates_of_the_child_process_are_the_same():

@@ -102,7 +102,10 @@ class Library:
     def databases(self) -> list[Database]:
         """Return all databases that can be read, by name, version and id."""
         found = []
-        for path in self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"):
+        paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
+        for gone in set(self._known) - set(paths):
+            self._known.pop(gone, None)
+        for path in paths:
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:
