@@ -27,6 +27,7 @@ from starcat.query.session import open_session
 from starcat.service.app import make_app
 from starcat.service.jobs.job import QUERY, begin_next
 from starcat.service.jobs.slots import ENDED_WITH_SERVER
+from starcat.service.sandbox.places import asker
 from starcat.service.service import Service
 from starcat.service.settings import Settings
 from starcat.service.vo.tap import ClientGone, Spool
@@ -553,7 +554,9 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     settings = Settings(root=root)
     service = Service(settings)
     jobs = service.query_jobs
+    client_of_jobs = asker.set("testclient")  # without a token, jobs belong to their client
     made = [jobs.create("anonymous").job_id for _ in range(3)]
+    asker.reset(client_of_jobs)
     for job_id in made:
         jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
     for job_id in made[:2]:

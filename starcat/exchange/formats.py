@@ -90,6 +90,9 @@ FORMATS = {
 """All formats by name."""
 
 FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
+WHOLE_FORMATS = ("fits", "ecsv", "npz")
+"""Formats that are written from a table that is in memory as a whole."""
+
 PAGE_FORMATS: tuple[PageFormat, ...] = get_args(PageFormat)
 TEXT_FORMATS = tuple(name for name in FILE_FORMATS if FORMATS[name].is_text)
 EXPORT_FORMATS = (*FILE_FORMATS, "hats")

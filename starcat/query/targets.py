@@ -200,7 +200,8 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [(found, columns)] = engine.ask("footer", str(path.resolve()))
+        [(schema_name, names)] = engine.ask("footer", str(path.resolve()))
+        found, columns = str(schema_name), tuple(map(str, names))
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(

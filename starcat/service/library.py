@@ -102,10 +102,9 @@ class Library:
     def databases(self) -> list[Database]:
         """Return all databases that can be read, by name, version and id."""
         found = []
-        paths = set(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
-        for path in list(self._known):
-            if path not in paths:  # somebody has removed the database
-                self._known.pop(path, None)
+        paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
+        for gone in set(self._known) - set(paths):
+            self._known.pop(gone, None)
         for path in paths:
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue

@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -130,6 +131,8 @@ def run_server(settings: Settings, announce: Announce) -> None:
         raise _without_token(settings)  # before anything is made
     with _only_server(paths):
         shutil.rmtree(paths.scratch, ignore_errors=True)
+        # For uploads that are larger than a megabyte, and for what child processes write.
+        os.environ["TMPDIR"] = tempfile.tempdir = str(paths.scratch)
         _serve(settings, announce)
 
 

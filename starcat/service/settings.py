@@ -72,6 +72,11 @@ class Settings(BaseModel):
         2, ge=1, le=64, description="Queries that take long and run at the same time."
     )
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
+    rows_mib: float = Field(
+        16.0,
+        gt=0,
+        description="Size of an answer in rows (JSON) at most, MiB; larger answers are files.",
+    )
     upload_mib: float = Field(64.0, gt=0, description="Size of an upload at most, MiB.")
     upload_time_s: float = Field(60.0, gt=0, description="Seconds that an upload may take.")
     requests_per_minute: int = Field(

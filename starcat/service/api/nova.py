@@ -12,6 +12,7 @@ import json
 import math
 import re
 import secrets
+import threading
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import unquote_to_bytes
@@ -65,18 +66,25 @@ class Solutions:
     """What was found in the last hour."""
 
     known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, solution: Solution) -> int:
         """Keep a solution and return its number."""
         number = secrets.randbits(52)  # JSON's numbers are exact so far
-        self.known[number] = solution
+        with self.lock:
+            self.known[number] = solution
         return number
+
+    def get(self, number: int) -> Solution | None:
+        """Return the solution of a number, if it is still known."""
+        with self.lock:
+            return self.known.get(number)
 
 
 def solution_of(request: Request, number: int) -> Solution:
     """Return what was found under a number."""
     solutions: Solutions = request.app.state.solutions
-    found = solutions.known.get(number)
+    found = solutions.get(number)
     if found is None:
         raise Problem(404, f"no job {number}: results are kept for an hour, until a restart")
     return found

@@ -6,6 +6,7 @@ import asyncio
 import math
 import re
 import shutil
+import threading
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -61,17 +62,19 @@ class Buckets:
         self._size = per_minute
         self._clock = clock
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._lock = threading.Lock()
 
     def take(self, key: str) -> float:
         """Take one out of the bucket of a key."""
-        now_s = self._clock()
-        left, then_s = self._left.pop(key, (self._size, now_s))
-        left = min(self._size, left + (now_s - then_s) * self._per_s)
-        wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
-        self._left[key] = (left if wait_s else left - 1.0), now_s
-        if len(self._left) > MOST_BUCKETS:
-            self._left.popitem(last=False)
-        return wait_s
+        with self._lock:  # some handlers are threads
+            now_s = self._clock()
+            left, then_s = self._left.pop(key, (self._size, now_s))
+            left = min(self._size, left + (now_s - then_s) * self._per_s)
+            wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
+            self._left[key] = (left if wait_s else left - 1.0), now_s
+            if len(self._left) > MOST_BUCKETS:
+                self._left.popitem(last=False)
+            return wait_s
 
 
 class Shares:

@@ -29,7 +29,7 @@ from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
 from starcat.query.engine import CLOCK_TIMES
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
-from starcat.service.sandbox.places import SHORT_S, Lease, Overdue, lease
+from starcat.service.sandbox.places import SHORT_S, Lease, Overdue, asker, lease
 from starcat.service.service import Service, TheService, service_of
 from starcat.service.transfers import body_type, scratch_folder
 from starcat.vo.documents import (
@@ -316,7 +316,7 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
 
     with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
         files = given.keep(folder) if folder else {}
-        files |= service.query_jobs.answers(asked.uploads, owner)
+        files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")
