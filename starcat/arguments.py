@@ -12,7 +12,7 @@ import operator
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -26,6 +26,14 @@ UNITS = {
     "_km_s": "km / s", "_km": "km", "_arcsec": "arcsec", "_mas": "mas", "_deg": "deg",
     "_rad": "rad", "_px": "pix", "_mag": "mag", "magnitudes": "mag", "mag": "mag", "_s": "s",
 }  # fmt: skip
+
+
+class HasFolder(Protocol):
+    """What `starcat.open`, `starcat.build` and `starcat.pull` return: it has the folder."""
+
+    @property
+    def folder(self) -> Path:
+        """Return where the database is."""
 
 
 def unit_of(name: str) -> str:

@@ -28,8 +28,15 @@ ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
     "ground": [
-        "arguments", "arrays", "errors", "failures", "progress", "resources", "threads", "version",
-    ],  # fmt: skip
+        "arguments",
+        "arrays",
+        "errors",
+        "failures",
+        "progress",
+        "resources",
+        "threads",
+        "version",
+    ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
 }
@@ -42,6 +49,7 @@ LIGHT = {
     "starcat.errors",
     "starcat.storage.hdf5",
     "starcat.storage.product_table",
+    "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }

@@ -94,9 +94,7 @@ def brightest_of(frame: Frame) -> Brightest:
 def brightest_of_frames(frames: Frames) -> tuple[Frames, dict[int, Brightest]]:
     """Return frames with the centroids that are searched, and those frames that had more."""
     counts = np.diff(frames.starts)
-    crowded = {
-        int(n): brightest_of(frames[int(n)]) for n in np.flatnonzero(counts > MAX_CENTROIDS)
-    }
+    crowded = {int(n): brightest_of(frames[int(n)]) for n in np.flatnonzero(counts > MAX_CENTROIDS)}
     if not crowded:
         return frames, {}
     is_kept = np.ones(len(frames.centroids_px), dtype=bool)

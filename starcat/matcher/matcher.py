@@ -18,7 +18,7 @@ from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
-from starcat.arguments import database_path, path_of, whole_number
+from starcat.arguments import HasFolder, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
@@ -26,7 +26,7 @@ from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.database import Database, open_database, open_image, products_in
+from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_arrays, as_frame, as_frames
@@ -88,7 +88,7 @@ class Matcher(Settings, _WithDatabase):
     @classmethod
     def open(
         cls,
-        artifact: str | os.PathLike[str],
+        artifact: HasFolder | str | os.PathLike[str],
         method: str | None = "triangle",
         *,
         tolerance_px: float | None = None,
@@ -100,18 +100,26 @@ class Matcher(Settings, _WithDatabase):
         min_share: float = MIN_SHARE,
         max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
+        verify: bool = True,
     ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
         Parameters
         ----------
-        artifact : str or path-like
-            The artifact's folder, or an image as `starcat export --to onboard` writes it.
+        artifact : Artifact, str or path-like
+            What ``starcat.open`` returns, the folder of a database, or an image as
+            `starcat export --to onboard` writes it.
         method : str, default "triangle"
             A key of `METHODS`; None for the best that the products allow. An image has its own.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
         min_share, max_steps, time_limit_s
             As the fields of `Settings`.
+        verify : bool, default True
+            Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
+            any change since the build: about 2 ms for each MB of the file. The manifest itself
+            is believed, and a ``database.h5`` without one is not compared; `starcat.verify`
+            checks everything. With False only types, lengths, ranges and references are checked.
+            An onboard image has checksums of its own, which are always checked.
 
         Raises
         ------
@@ -120,7 +128,7 @@ class Matcher(Settings, _WithDatabase):
         ProductError, SchemaVersionError
             If the artifact cannot be read, or lacks a product that the method needs.
         """
-        path = Path(artifact)
+        path = database_path("artifact", artifact)
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
@@ -131,6 +139,8 @@ class Matcher(Settings, _WithDatabase):
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable))
+            if verify:  # last, as what is missing or of another version has an error of its own
+                check_digest(path)
         return cls(
             database,
             chosen,
