@@ -69,7 +69,9 @@ def test_masked_entries_are_not_used(matcher, frame):
     assert np.isnan(numbers_of("magnitudes", [3.0, None], "(N,)")[1])
 
 
-@pytest.mark.parametrize("wrong", [[["1", "2"]], np.ones((4, 2), bool), [[True, None]], [[1j, 2.0]]])
+@pytest.mark.parametrize(
+    "wrong", [[["1", "2"]], np.ones((4, 2), bool), [[True, None]], [[1j, 2.0]]]
+)
 def test_texts_and_bools_are_no_numbers(matcher, wrong):
     for ask in (matcher.identify, lambda px: matcher.identify_many([np.ones((5, 2)), px])):
         with pytest.raises(ConfigError, match="centroids_px is no array of real numbers"):
@@ -112,7 +114,7 @@ def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
     assert starcat.export(opened, "csv", tmp_path / "csv", products=["stars"])
     assert starcat.publish(opened, tmp_path / "registry")
     with starcat.connect(opened) as connection:
-        assert connection.sql("SELECT count(*) AS n FROM stars")["n"].tolist() == [
+        assert connection.sql("SELECT count(*) AS n FROM stars").to_table()["n"].tolist() == [
             len(matcher.database.mag)
         ]
     [frame] = starcat.simulate(opened, seed=7)

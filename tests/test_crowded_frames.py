@@ -99,7 +99,9 @@ def test_one_odd_frame_leaves_the_others_to_the_c_library(sky, monkeypatch):
     sigma = [np.full(len(mag), 0.3) for mag in mags]
     sigma[4][0] = 1e7  # beyond the limits of the library
     asked = []
-    monkeypatch.setattr(matcher, "solve", lambda *args, **more: asked.append(1) or run(*args, **more))
+    monkeypatch.setattr(
+        matcher, "solve", lambda *args, **more: asked.append(1) or run(*args, **more)
+    )
     one = Matcher(sky, engine="c")
     found = one.identify_many(px, magnitudes=mags, sigma_px=sigma)
     assert len(asked) == 1
@@ -144,5 +146,6 @@ def test_an_answer_is_true_if_it_identifies(sky):
     [frame] = frames_of(sky, 1)
     answers = Matcher(sky).identify_many([frame.centroids_px, frame.centroids_px[:3]])
     assert [bool(answer) for answer in answers] == [True, False]
-    assert bool(answers) and not all(answers)
+    assert bool(answers)
+    assert not all(answers)
     assert not Matcher(sky).identify_many([])

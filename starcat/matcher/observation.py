@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, overload
@@ -176,11 +177,9 @@ def as_frames(
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
     """Return an argument that has to have an entry for each frame; an iterator is run through."""
-    is_one_frame = isinstance(values, str | bytes) or columns_of(values) is not None
-    try:
-        return values if hasattr(values, "__len__") and not is_one_frame else list(values)
-    except TypeError:
-        pass
+    if not isinstance(values, str | bytes) and columns_of(values) is None:
+        with suppress(TypeError):
+            return values if hasattr(values, "__len__") else list(values)
     raise ArgumentTypeError(
         f"{name} is of type {type(values).__name__}; expected a sequence with one array per frame",
         key=name,

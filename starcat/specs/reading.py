@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from starcat.arguments import path_of
 from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
@@ -58,7 +59,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     ConfigError
         If the file is missing or not TOML, or a key is unknown, missing or out of range.
     """
-    path = Path(path)
+    path = path_of("path", path, "the path of a spec")
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     content = changed(content_of_toml(text, str(path)), changes or {})
     return spec_from_dict(with_files_read(content, path.parent), path.name)
@@ -220,7 +221,7 @@ def preset(name: str, changes: Changes | None = None) -> BuildSpec:
         If there is no such preset, or a change is no value of its key.
     """
     if name not in preset_names():
-        hint = suggest(name, preset_names())
+        hint = suggest(str(name), preset_names())
         raise ConfigError(
             f"unknown preset {name!r}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",
