@@ -149,3 +149,13 @@ def test_an_answer_is_true_if_it_identifies(sky):
     assert bool(answers)
     assert not all(answers)
     assert not Matcher(sky).identify_many([])
+
+
+def test_the_command_line_says_what_was_not_searched(starcat, small_artifact, tmp_path):
+    sky = Matcher.open(small_artifact).database
+    px, mag, _ = crowded(sky, 3000)
+    rows = "".join(f"{x},{y},{m}\n" for (x, y), m in zip(px, mag, strict=True))
+    (tmp_path / "frame.csv").write_text("x_px,y_px,mag\n" + rows)
+    printed = " ".join(starcat(["identify", small_artifact, tmp_path / "frame.csv"]).out.split())
+    assert "512 of 3000 centroids were searched" in printed
+    assert len(printed) < 10_000
