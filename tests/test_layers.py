@@ -27,7 +27,16 @@ def rooms_of_the_house() -> list[str]:
 ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
-    "ground": ["arrays", "errors", "failures", "progress", "resources", "threads", "version"],
+    "ground": [
+        "arguments",
+        "arrays",
+        "errors",
+        "failures",
+        "progress",
+        "resources",
+        "threads",
+        "version",
+    ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
 }
@@ -35,6 +44,7 @@ SINGLE_MODULES = {
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 ONBOARD = ("grid", "image", "layout", "reading")
 LIGHT = {
+    "starcat.arguments",
     "starcat.arrays",
     "starcat.errors",
     "starcat.storage.hdf5",

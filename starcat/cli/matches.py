@@ -16,6 +16,7 @@ from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame
 
@@ -182,6 +183,8 @@ def as_options(text: str) -> str:
 
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
     heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+    if len(stars) > MAX_CENTROIDS:  # a terminal takes minutes to lay out tens of thousands
+        stars = [star for star in stars if star["star"]]
     lines = [
         (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
          f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix
-from starcat.errors import NotIdentifiedError
+from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
@@ -69,6 +69,13 @@ class MatchResult:
         Why there is no answer; None for an answer.
     time_s : float
         Time that the answer took; NaN where nobody measured. It is no part of the answer.
+    n_not_searched : int
+        Usable centroids that the search left out, because the frame has more than the 512
+        brightest; their stars are not known. 0 in nearly all frames.
+
+    Notes
+    -----
+    ``bool(result)`` is `ok`: false without an identification.
     """
 
     status: Status
@@ -81,6 +88,7 @@ class MatchResult:
     focal_length_error_px: float | None = None
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
+    n_not_searched: int = 0
     # The frame as it was given, the stars, and the noise of a centroid where it was stated: what
     # the properties are made of when they are asked for.
     frame: Frame | None = field(default=None, repr=False, compare=False)
@@ -117,10 +125,18 @@ class MatchResult:
                 raise AttributeError(f"'MatchResult' object has no attribute {name!r}")
             return content[name]
 
+    def facts(self) -> dict[str, Any]:
+        """Return the fields, and what is kept for `q_body_from_icrs`; without what is derived."""
+        names = {"_quaternion", *(one.name for one in fields(self))}
+        return {name: value for name, value in self._complete().items() if name in names}
+
     @property
     def ok(self) -> bool:
         """Whether the frame was identified."""
         return self.status == "identified"
+
+    def __bool__(self) -> bool:
+        return self.ok
 
     @property
     def n_matched(self) -> int:
@@ -167,7 +183,7 @@ class MatchResult:
         if not self.ok:
             return NO_STARS
         if self.frame is None or self.database is None or self.camera is None:
-            raise ValueError("this MatchResult does not hold the frame that was asked about")
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
         return matched_stars(
             self.star_index, self.matrix, self.camera, self.frame, self.database, self.noise_px
         )
@@ -202,6 +218,13 @@ class MatchResult:
     def remarks(self) -> tuple[str, ...]:
         """What a reader of the answer should know beside it, in sentences."""
         told, count = [], len(self.star_index)
+        if self.n_not_searched:
+            searched = count - len(self.dropped) - self.n_not_searched
+            told.append(
+                f"{searched} of {count} centroids were searched: the brightest, or without "
+                f"magnitudes a selection that disregards positions. The other "
+                f"{self.n_not_searched} have no star; give fewer centroids"
+            )
         outside = sum(why == "out_of_frame" for _, why in self.dropped)
         if outside >= NOTABLE_OUTSIDE * count > 0:
             told.append(
@@ -224,7 +247,7 @@ class MatchResult:
         """
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:
-            raise ValueError("this MatchResult does not hold the frame that was asked about")
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
         px = np.column_stack([stars.x_px, stars.y_px])
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
@@ -296,7 +319,7 @@ class MatchResult:
         """
         self._expect_ok("WCS")
         if self.camera is None:
-            raise ValueError("this MatchResult does not hold the camera that it was found with")
+            raise ConfigError("this MatchResult does not hold the camera that it was found with")
         return sky_objects.wcs(self.camera, self.matrix, bottom_up)
 
     def _expect_ok(self, what: str) -> None:

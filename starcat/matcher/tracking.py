@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.errors import ConfigError
+from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -72,6 +72,14 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        matcher: object = self.matcher
+        if not isinstance(matcher, Matcher):
+            raise ArgumentTypeError(
+                f"matcher is of type {type(matcher).__name__}; expected a starcat.Matcher",
+                key="matcher",
+                value=matcher,
+                fields=("matcher",),
+            )
         turn_deg: object = self.max_turn_deg
         if (
             not isinstance(turn_deg, int | float | np.floating)

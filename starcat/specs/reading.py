@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from starcat.arguments import path_of
 from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
@@ -62,7 +63,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     ConfigError
         If the file is missing or not TOML, or a key is unknown, missing or out of range.
     """
-    path = Path(path)
+    path = path_of("path", path, "the path of a spec")
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     content = changed(content_of_toml(text, str(path)), changes or {})
     return spec_from_dict(with_files_read(content, path.parent), path.name)
@@ -259,7 +260,7 @@ def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
 
 def _preset_content(name: str) -> dict[str, Any]:
     if name not in preset_names():
-        hint = suggest(name, preset_names())
+        hint = suggest(str(name), preset_names())
         raise ConfigError(
             f"unknown preset {quoted(name)}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",
