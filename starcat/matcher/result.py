@@ -138,7 +138,10 @@ class MatchResult:
 
     @cached_property
     def q_body_from_icrs(self) -> NDArray[np.float64]:
-        """Scalar-last attitude, shape (4,); NaN unless identified."""
+        """Attitude [x, y, z, w], shape (4,); NaN unless identified.
+
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        """
         own = self._complete().get("_quaternion")
         return quaternion_from_matrix(self.matrix) if own is None else own
 
