@@ -30,6 +30,7 @@ from starcat.matcher.stars import (
     matched_stars,
     reduced_chi_square,
 )
+from starcat.onboard.flight_limits import centroids_in_flight
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -211,6 +212,8 @@ class MatchResult:
                 f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
                 "count from the outer corner of the top-left pixel, not from the centre"
             )
+        if self.database is not None and self.database.image is not None:
+            told += centroids_in_flight(count)
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(
