@@ -72,6 +72,16 @@ def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
         assert not done.value.code, command
 
 
+def test_the_two_kinds_of_steps_are_told_apart():
+    """The numpy matcher and the C library count other things, a thousand times apart in time."""
+    for path in ("docs/cli.md", "onboard/README.md"):
+        text = " ".join((ROOT / path).read_text().split())
+        assert re.search(r"[Cc]andidates that the numpy matcher .{0,14}, 2 to 20 micro", text), path
+    text = " ".join((ROOT / "docs" / "algorithms.md").read_text().split())
+    assert "A step takes 2 to 20 µs" in text
+    assert "1 to 5 ns each (`options.max_steps`)" in text
+
+
 def test_links_between_pages_lead_somewhere():
     for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text()):

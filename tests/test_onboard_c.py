@@ -126,7 +126,7 @@ DRIVER = r"""
 
 static uint64_t words[1 << 17];
 
-/* Counts the frames that the example identifies if each has more centroids than a frame may have. */
+/* Counts the frames that the example identifies if each has more centroids than it may have. */
 int main(int argc, char **argv) {
   FILE *file = fopen(argv[1], "rb");
   const size_t size = argc == 3 ? fread(words, 1, sizeof words, file) : 0;
