@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import duckdb
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -80,6 +81,15 @@ def test_the_two_kinds_of_steps_are_told_apart():
     text = " ".join((ROOT / "docs" / "algorithms.md").read_text().split())
     assert "A step takes 2 to 20 µs" in text
     assert "1 to 5 ns each (`options.max_steps`)" in text
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/scale.md", "docs/cli.md"])
+def test_files_of_examples_have_names_that_sql_takes_as_they_are(name):
+    """A file is a table of its name, but BOTH, for instance, is a word of SQL."""
+    names = re.findall(r"-o (\w+)\.parquet", (ROOT / name).read_text())
+    assert names
+    for table in names:
+        duckdb.sql(f"SELECT * FROM (SELECT 1) AS {table}")
 
 
 def test_links_between_pages_lead_somewhere():
