@@ -20,8 +20,9 @@
  * same attitude by the conjugate [-x, -y, -z, w]. In scipy v_camera is
  * Rotation.from_quat(q).inv().apply(v_icrs), or Rotation.from_quat([-x, -y, -z, w]).apply(v_icrs).
  *
- * Numbers to test a conversion: Sirius at right ascension 101.287155, declination -16.716116 degrees, in a
- * camera of 1280 x 960 px with focal_length_px 3200, x0_px 640, y0_px 480, without distortion:
+ * Numbers to test a conversion: Sirius at right ascension 101.287155, declination -16.716116, in a
+ * camera of 1280 x 960 px with focal_length_px 3200, x0_px 640, y0_px 480, without distortion,
+ * whose boresight is at right ascension 100, declination -15, with a roll of 30 (all in degrees):
  *
  *     q_body_from_icrs   -0.781300520   0.137764362   0.208208671   0.572048623
  *     v_icrs             -0.187455223   0.939217529  -0.287629922
@@ -228,8 +229,9 @@ starcat_status starcat_identify(const starcat_image *image, const starcat_camera
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result);
 
-/* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad` and
- * has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is STARCAT_E_CAPACITY: state the prior more narrowly. */
+/* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
+ * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is
+ * STARCAT_E_CAPACITY: state the prior more narrowly. */
 starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,

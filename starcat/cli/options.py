@@ -312,7 +312,9 @@ def observer_of_options(
 PriorAttitude = Annotated[
     str | None,
     typer.Option(
-        "--prior-q", metavar="X,Y,Z,W", help="Expected attitude: only stars near it are compared."
+        "--prior-q",
+        metavar="X,Y,Z,W",
+        help="Expected attitude as q_body_from_icrs: only stars near it are compared.",
     ),
 ]
 PriorErrorDeg = Annotated[
