@@ -42,7 +42,7 @@ SINGLE_MODULES = {
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
-ONBOARD = ("grid", "image", "layout", "reading")
+ONBOARD = ("flight_limits", "grid", "image", "layout", "reading")
 LIGHT = {
     "starcat.arguments",
     "starcat.arrays",

@@ -86,7 +86,7 @@ module Starcat {
     matched: U16 @< centroids that are stars of the image
     usable: U16 @< centroids that could be used
     steps: U32 @< steps that were taken
-    quaternion: Quaternion @< camera from ICRS, scalar last
+    quaternion: Quaternion @< x, y, z, w: camera = A icrs, A and an example in starcat.h
     covariance_rad2: Covariance @< of turns about the camera's axes: xx, xy, xz, yy, yz, zz
     logChance: F64 @< natural logarithm of the bound on chance
     residual_rad: F64 @< root mean square of the matched centroids

@@ -184,7 +184,7 @@ def crossmatch(
     Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
     Catalog stores are matched partition by partition, whatever their size.
 
-    Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
+    Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
     from starcat.pipeline.counterparts import match_files
     from starcat.pipeline.match_stores import match_on_cluster

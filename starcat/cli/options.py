@@ -108,7 +108,12 @@ MinShare = Annotated[
     typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
 ]
 MaxSteps = Annotated[
-    int | None, typer.Option(min=1, help="Steps of a search, each some microseconds.")
+    int | None,
+    typer.Option(
+        min=1,
+        help="Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "
+        "100,000. Not for an onboard image, whose steps are others.",
+    ),
 ]
 TimeLimit = Annotated[
     float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a frame may take.")
@@ -306,7 +311,9 @@ def observer_of_options(
 PriorAttitude = Annotated[
     str | None,
     typer.Option(
-        "--prior-q", metavar="X,Y,Z,W", help="Expected attitude: only stars near it are compared."
+        "--prior-q",
+        metavar="X,Y,Z,W",
+        help="Expected attitude as q_body_from_icrs: only stars near it are compared.",
     ),
 ]
 PriorErrorDeg = Annotated[

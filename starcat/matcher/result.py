@@ -30,6 +30,7 @@ from starcat.matcher.stars import (
     matched_stars,
     reduced_chi_square,
 )
+from starcat.onboard.flight_limits import centroids_in_flight
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -154,7 +155,10 @@ class MatchResult:
 
     @cached_property
     def q_body_from_icrs(self) -> NDArray[np.float64]:
-        """Scalar-last attitude, shape (4,); NaN unless identified."""
+        """Attitude [x, y, z, w], shape (4,); NaN unless identified.
+
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        """
         own = self._complete().get("_quaternion")
         return quaternion_from_matrix(self.matrix) if own is None else own
 
@@ -231,6 +235,8 @@ class MatchResult:
                 f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
                 "count from the outer corner of the top-left pixel, not from the centre"
             )
+        if self.database is not None and self.database.image is not None:
+            told += centroids_in_flight(count)
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(

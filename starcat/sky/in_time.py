@@ -71,7 +71,8 @@ class SkyInTime:
     time : str
         UTC, ISO 8601.
     q_body_from_icrs : ndarray of float64, shape (4,)
-        Attitude with light deflection and aberration taken into account, scalar last.
+        Attitude with light deflection and aberration taken into account, in the convention of
+        `MatchResult`.
     boresight_ra_deg, boresight_dec_deg, roll_deg : float
         The same as angles.
     correction_arcsec : float
