@@ -136,6 +136,8 @@ def identify_files(
         workers = min(multiprocessing.cpu_count(), _MOST_WORKERS) if len(paths) > _FEW else 0
     for path, measured in zip(paths, _measured_files(paths, chosen, own, workers), strict=True):
         if isinstance(measured, ConfigError):
+            if tracker is not None:  # time passes in a frame that cannot be read, too
+                tracker.record(None)
             yield BatchItem(path, error=measured)
             continue
         try:
