@@ -395,7 +395,10 @@ def test_an_image_is_searched_identified_and_drawn(starcat, small_artifact, tmp_
     assert picture.read_bytes().startswith(b"\x89PNG")
     upside_down = starcat(["identify", small_artifact, image, "--flip"])
     assert "no_match" in upside_down.out
-    assert "--no-flip" in upside_down.err
+    printed = " ".join(upside_down.out.split())
+    assert "it was turned over, and was upright before" in printed
+    assert "leave this option out (--flip)" in printed
+    assert "try" not in upside_down.err
 
 
 def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
@@ -544,7 +547,7 @@ def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifa
         "evaluate nope", "simulate nope -o x.csv", "sql nope", "export nope --to csv -o x",
         "identify nope nope.csv", "identify {small} nope.csv", "identify {small} nope.png",
         "identify {small} nope.csv --camera nope.toml", "calibrate {small} nope.csv -o x.toml",
-        "build nope.toml", "estimate nope.toml", "ingest sao --input nope.dat -o x",
+        "build nope.toml", "estimate nope.toml", "ingest sao --input nope.dat -o x.parquet",
         "crossmatch nope.parquet nope.parquet -o x",
     ],
 )  # fmt: skip

@@ -124,7 +124,8 @@ def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
     for case in CASES:
         (tmp_path / case.name).mkdir()
         draft = draft_map(case.make(sky, tmp_path / case.name))
-        assert mapped(tomllib.loads(draft.as_toml())).table is not None
+        content = tomllib.loads(draft.as_toml())
+        assert mapped({"epoch": 2000.0, **content}).table is not None
         hits = sum(draft.used.get(column) == key for column, key in case.meant.items())
         assert hits >= 0.8 * len(case.meant), case.name
         right, total = right + hits, total + len(case.meant)
@@ -417,3 +418,16 @@ def test_null_values_of_fits_are_compared_as_they_are_stored(tmp_path: Path):
         read = read_catalog(name, [tmp_path / f"{form}.fits"], neighbours=False)
         assert read.stars["mag"].to_pylist() == [5.0, None, 7.0]
         assert read.stars["second_mag"].to_pylist() == [5.0, None, 7.0]
+
+
+@pytest.mark.parametrize(
+    ("column", "band"),
+    [("mag", "V"), ("m", "V"), ("magnitude", "V"), ("V", "V"), ("Vmag", "V"), ("mag_B", "B")],
+)
+def test_a_draft_of_the_plainest_table_finds_the_magnitudes(tmp_path: Path, column: str, band: str):
+    (tmp_path / "plain.csv").write_text(f"id,ra,dec,{column}\n1,10.5,20.5,5.1\n2,100.5,-2.5,6.1\n")
+    draft = draft_map(tmp_path / "plain.csv")
+    content = tomllib.loads(draft.as_toml())
+    assert content["magnitudes"] == {band: column}
+    assert "epoch" not in content
+    assert "# epoch = 2000.0  # a guess" in draft.as_toml()

@@ -188,12 +188,13 @@ def calibrate(
         If too few frames can be identified; says which and why.
     """
     from starcat.calibration.files import calibrate_files
+    from starcat.images.batch import frame_files
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
     return calibrate_files(
         Matcher.open(artifact, method),
-        _paths(frames),
+        frame_files([str(path) for path in _paths(frames)]),
         camera=camera,
         size_px=size_px,
         fov_deg=fov_deg,
@@ -367,9 +368,10 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     ConfigError
         If the file is not there, or is neither.
     """
+    from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure
 
-    return list(measure(Path(file)).frames)
+    return [frame for path in frame_files([os.fspath(file)]) for frame in measure(path).frames]
 
 
 def export(

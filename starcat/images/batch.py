@@ -94,6 +94,11 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
     return list(found)
 
 
+def frame_files(inputs: Sequence[str]) -> list[Path]:
+    """Return the files that folders, patterns and names stand for, or stdin (``-``) alone."""
+    return files_of(inputs) if not inputs or is_batch(inputs) else [Path(inputs[0])]
+
+
 def _is_pattern(given: str) -> bool:
     return glob.has_magic(given) and not Path(given).exists()
 

@@ -211,8 +211,9 @@ class FileAnswers:
                 return deeper
             if self._is_lost_in_space and result.status == "no_match":
                 result = look_again(
-                    search, frame, self.camera, result, fov_error, is_scale_free=self._is_scale_free
-                )
+                    search, frame, self.camera, result, fov_error,
+                    is_scale_free=self._is_scale_free, flip=self.options.flip,
+                )  # fmt: skip
         return FrameAnswer(frame, result, observer, spots)
 
     def _deeper(self, search: Search, fov_error: float) -> FrameAnswer | None:
@@ -314,7 +315,9 @@ class FileAnswers:
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
                 "attitude are those of the middle of the exposure."
             )
-        if self.is_image and not is_any_identified:
+        refusal = None if first is None else first.result.refusal
+        is_said = refusal is not None and refusal.reason == "mirrored" and refusal.flip is not None
+        if self.is_image and not is_any_identified and not is_said:
             notes.append(f"An image that was read upside down is never identified: try {flip}.")
         return notes
 
