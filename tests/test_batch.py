@@ -183,6 +183,7 @@ def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
     starcat, small_artifact, tmp_path, monkeypatch
 ):
     database = open_database(small_artifact)
+    (tmp_path / "night").mkdir()
     frames = simulate_frames(
         database.directions, database.camera, 4, Noise(0.2), 1, mag=database.mag
     )

@@ -29,7 +29,7 @@ MOST_NAMED = 10  # frames that a message names at most
 SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibratedFrame:
     """What became of one frame.
 

@@ -48,12 +48,12 @@ _RULES = (
 """Key, UCD and name (in small letters and digits) of what a column may be, in this order."""
 
 _BANDS = (
+    r"m(ag(nitude)?)?|(?P<band>[ubvri])",
     r"phot_(?P<band>g|bp|rp)_mean_mag",
     r"(?P<band>(?!m?mag)[a-z]{1,2}[0-9]?)_?(t)?mag(nitude)?( .*)?",
     r"m(ag(nitude)?)?_?(?P<band>[a-z]{1,3})",
     r"(psf)?_?flux_?(?P<band>[a-z]{1,2})(_.*)?",
     r"(?P<band>[jhk])_m",
-    r"m(ag(nitude)?)?|(?P<band>[ubvri])",
 )
 _ERROR = re.compile(
     r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom)$", re.IGNORECASE

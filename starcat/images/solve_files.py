@@ -64,7 +64,7 @@ class LocalInputs:
     track: bool = False  # the frames are a sequence
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeasuredFile:
     """The centroids of a file, and the image (height, width) that they were found in, if any.
 

@@ -26,7 +26,7 @@ Dropped = tuple[tuple[int, str], ...]
 FLOAT64 = np.dtype(np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The centroids of a frame as they were given, and the camera that they were given with."""
 
@@ -40,7 +40,7 @@ class Frame:
         return len(self.centroids_px)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frames(Sequence[Frame]):
     """Frames of one camera, one after the other."""
 

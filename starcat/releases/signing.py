@@ -156,7 +156,14 @@ def roles_of(registry: str) -> tuple[RoleFacts, ...]:
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         copy = Path(folder)
         _copy_metadata(opened, copy / METADATA)
-        return _facts(load_tree(copy))
+        try:
+            return _facts(load_tree(copy))
+        except ProductError as error:
+            found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
+            raise ProductError(
+                f"{registry}: its signatures do not agree ({found}); do not trust it, and ask who "
+                "publishes it"
+            ) from error
 
 
 MAX_ROOTS = 1000
