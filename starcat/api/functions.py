@@ -205,12 +205,13 @@ def calibrate(
         If too few frames can be identified; says which and why.
     """
     from starcat.calibration.files import calibrate_files
+    from starcat.images.batch import frame_files
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
     return calibrate_files(
         Matcher.open(artifact, method),
-        paths_of("frames", frames),
+        frame_files([str(path) for path in paths_of("frames", frames)]),
         camera=camera,
         size_px=size_px,
         fov_deg=fov_deg,
@@ -410,9 +411,11 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     ConfigError
         If the file is not there, or is neither.
     """
+    from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure
 
-    return list(measure(path_of("file", file)).frames)
+    files = frame_files([str(path_of("file", file))])
+    return [frame for path in files for frame in measure(path).frames]
 
 
 def export(

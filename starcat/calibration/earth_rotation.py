@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration
+from starcat.calibration.files import names_of_files
 from starcat.calibration.fit import turn_derivatives
 from starcat.errors import CalibrationError, ConfigError, FileMissing, SourceError
 from starcat.geometry.attitude import solve_wahba_svd
@@ -83,7 +84,8 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     """Return the time of each frame by its name: of a table, or of the pictures themselves."""
     if table is not None:
         return _times_of_table(table)
-    times = {path.stem: time_in_file(path) for path in paths if path.suffix.lower() in KNOWS_TIME}
+    names = zip(names_of_files(paths), paths, strict=True)
+    times = {name: time_in_file(path) for name, path in names if path.suffix.lower() in KNOWS_TIME}
     found = {name: time for name, time in times.items() if time is not None}
     if not found:
         raise ConfigError(

@@ -111,6 +111,7 @@ def ingest(
     """
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
+    from starcat.exchange.formats import expect_parquet
     from starcat.store.plan import StoreOptions
     from starcat.store.reading import brought
 
@@ -121,6 +122,7 @@ def ingest(
     given = inputs_by_source(inputs, None if merge else source)
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
+        expect_parquet(output)
         read = _read_to_file([source, *(merge or [])], given, output, workers=workers, **how)
         print_ingested(read, output, as_json=json)
         return
@@ -186,11 +188,13 @@ def crossmatch(
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
+    from starcat.exchange.formats import expect_parquet
     from starcat.pipeline.counterparts import match_files
     from starcat.pipeline.match_stores import match_on_cluster
     from starcat.specs.product_sections import Crossmatch
     from starcat.store.layout import is_store
 
+    expect_parquet(output)
     wanted = Crossmatch(radius_arcsec=radius_arcsec)
     if is_store(a) or is_store(b):
         with progress_bars() as progress:

@@ -134,7 +134,8 @@ def print_result(found: ResultTable) -> None:
             facts = [(c.name, cell, c.unit) for c, cell in zip(found.columns, row, strict=True)]
             print_table(f"row {k + 1}", ["column", "value", "unit"], facts)
     if found.is_cut:
-        say(f"the first {len(cells)} rows; --rows N shows more, -o FILE writes all")
+        first = "the first row" if len(cells) == 1 else f"the first {len(cells)} rows"
+        say(f"{first}; --rows N shows more, -o FILE writes all")
 
 
 def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:

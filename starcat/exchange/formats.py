@@ -118,6 +118,17 @@ def format_of(path: str | Path) -> FileFormat:
     )
 
 
+def expect_parquet(path: Path) -> None:
+    """Refuse the name of a file that is written as Parquet and ends otherwise."""
+    if path.suffix.lower() not in FORMATS["parquet"].suffixes:
+        raise ConfigError(
+            f"{path}: this file is written as Parquet; end its name with .parquet, and turn it "
+            "into another format with 'starcat sql' or 'starcat export'",
+            key="output",
+            value=str(path),
+        )
+
+
 def response_format(text: str | None) -> Format:
     """Return the format that RESPONSEFORMAT of TAP asks for, by name or media type."""
     wanted = "".join((text or "votable").lower().split()).replace('"', "")

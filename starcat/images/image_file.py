@@ -242,6 +242,8 @@ def time_in_file(path: Path) -> datetime | None:
     data = _unpacked(path)
     try:
         found = _time_of_fits(data) if data.startswith(b"SIMPLE  =") else _time_of_exif(data)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         _log.info("%s: no time can be read (%s)", path, error)
         return None
@@ -255,8 +257,26 @@ def _time_of_fits(data: bytes) -> datetime | None:
         headers = [part.header for part in parts if "DATE-OBS" in part.header]
         if not headers:
             return None
-        start = datetime.fromisoformat(str(headers[0]["DATE-OBS"]))
-        return _middle(start, headers[0].get("EXPTIME", 0.0))
+        return _middle(_start_of_fits(headers[0]), headers[0].get("EXPTIME", 0.0))
+
+
+_CLOCK_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTC", "UTSTART")  # beside a DATE-OBS without hours
+
+
+def _start_of_fits(header: Any) -> datetime:
+    """Return the start of an exposure: DATE-OBS, with the time of day of another key if need be."""
+    date = str(header["DATE-OBS"]).strip()
+    if "T" not in date and " " not in date:
+        clocks = (str(header.get(key, "")).strip() for key in _CLOCK_KEYS)
+        clock = next((text for text in clocks if ":" in text), None)
+        if clock is None:
+            raise ConfigError(
+                f"DATE-OBS is {date!r}, a date without a time of day, and the header has none of "
+                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00; state the time of each frame (times)",
+                fields=("times",),
+            )
+        date = f"{date}T{clock}"
+    return datetime.fromisoformat(date)
 
 
 def _time_of_exif(data: bytes) -> datetime | None:

@@ -31,7 +31,7 @@ _LIGHT = ("flux", "sum")
 SIGMA = "sigma_px"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeasuredFrame:
     """The centroids of one frame, as a file has them."""
 

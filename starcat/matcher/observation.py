@@ -30,7 +30,7 @@ LARGEST_MAG = 100.0
 magnitudes, of light in any unit, lie far within. ``onboard/python/many.c`` has the same limit."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The centroids of a frame as they were given, and the camera that they were given with."""
 
@@ -44,7 +44,7 @@ class Frame:
         return len(self.centroids_px)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frames(Sequence[Frame]):
     """Frames of one camera, one after the other."""
 

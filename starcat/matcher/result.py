@@ -42,7 +42,7 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 Origin = Literal["lost_in_space", "tracking"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchResult:
     """The answer to one frame of centroids.
 

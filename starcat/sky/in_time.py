@@ -62,7 +62,7 @@ class BodyInFrame:
     row: int | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SkyInTime:
     """What a time adds to the answer to a frame.
 
