@@ -24,7 +24,8 @@ from starcat.catalog.verdict import Quality
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.images.centroiding import find_spots
-from starcat.images.render import Optics, render_image
+from starcat.images.background import load_sep
+from starcat.images.render import Optics, render_image, star_electrons
 from starcat.pipeline.build import build
 from starcat.pipeline.catalog_snapshot import read_snapshot
 from starcat.pipeline.estimate import choose_stars
@@ -154,6 +155,50 @@ def test_a_fainter_star_is_found_where_it_is_not_lost(psf_sigma_px):
     assert np.mean(is_found != other.is_lost) >= 0.93
     moved = (place + offset + other.offset - spots[of_star])[other.is_lost & ~is_found]
     assert np.median(np.hypot(*moved.T)) < 0.03
+
+
+def centre_of_mass(image: Values, place: Values, box_px: int) -> Values:
+    """Return the centre of mass around the brightest pixel near a place, by sums over pixels."""
+    half, (column, row) = box_px // 2, np.floor(place).astype(int)
+    near = image[row - 2 : row + 3, column - 2 : column + 3]
+    down, right = np.unravel_index(np.argmax(near), near.shape)
+    row, column = row - 2 + int(down), column - 2 + int(right)
+    box = image[row - half : row + half + 1, column - half : column + half + 1]
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    return np.array([column, row]) + 0.5 + [(box * axis).sum() / box.sum() for axis in (x, y)]
+
+
+@pytest.mark.parametrize("box_px", [3, 5, 7, None])
+def test_a_pair_is_where_its_centroid_is_measured(box_px):
+    """Two equal stars 4.2 px apart: rendered without noise at all places in a pixel."""
+    psf_sigma_px, apart = 1.0, np.array([4.2, 0.0])
+    phases = np.linspace(-0.45, 0.45, 10)
+    optics, found = Optics(psf_sigma_px), []
+    widths = widths_px(psf_sigma_px, None, box_px)
+    for x, y in np.stack(np.meshgrid(phases, phases), axis=-1).reshape(-1, 2):
+        place = np.array([20.5 + x, 20.5 + y])
+        image = star_electrons(np.stack([place, place + apart]), np.full(2, 5.0), (41, 41), optics)
+        if box_px is None:
+            light = image.astype(np.float32)
+            column, row, _ = load_sep().winpos(
+                light, *(place[:, None] - 0.5), widths.window, subpix=0
+            )
+            measured_px = np.array([column[0], row[0]]) + 0.5
+        else:
+            measured_px = centre_of_mass(image, place, box_px)
+        found.append(measured_px - place)
+    no = np.zeros(1, dtype=bool)
+    predicted = blends(1, np.zeros(1, dtype=np.int64), apart[None], np.ones(1), no, widths)
+    assert predicted.offset[0] == pytest.approx(np.mean(found, axis=0), abs=0.01)
+
+
+def test_a_box_measures_one_star_where_it_is():
+    nobody = np.zeros(0, dtype=np.int64)
+    widths = widths_px(1.0, None, 5).times(3.0)
+    found = blends(1, nobody, np.zeros((0, 2)), np.zeros(0), nobody > 0, widths)
+    assert np.abs(found.offset).max() < 1e-9
+    assert found.brightening == pytest.approx([1.0])
+    assert found.contamination == pytest.approx([0.0])
 
 
 # --- Properties
@@ -384,6 +429,18 @@ def judged_wide(stars: pa.Table) -> Selected:
     ("changes", "words"),
     [
         ({"neighbours.max_offset_px": "0.2"}, "psf_sigma_px is missing: without the width of a"),
+        (
+            {"neighbours.psf_sigma_px": "1.0", "neighbours.centroid": "box"},
+            'state both centroid = "box" and the size of the box',
+        ),
+        (
+            {
+                "neighbours.psf_sigma_px": "1.0",
+                "neighbours.centroid": "box",
+                "neighbours.box_px": "4",
+            },
+            "a box has an odd number of pixels on a side",
+        ),
         ({"neighbours.psf_sigma_px": "0.0"}, "psf_sigma_px: found 0.0; Input should be greater"),
         ({"neighbours.psf_sigma_px": "1.0", "neighbours.action": "mend"}, "action: found 'mend'"),
         (
@@ -407,6 +464,7 @@ def test_a_spec_without_the_section_is_recorded_as_it_always_was():
     spec = preset("sao-12deg", {"selection.neighbours.psf_sigma_px": "1.0"})
     recorded = spec.recorded()
     assert recorded["selection"]["neighbours"]["psf_sigma_px"] == 1.0
+    assert {"centroid", "box_px"}.isdisjoint(recorded["selection"]["neighbours"])
     assert spec_from_dict(recorded, "manifest") == spec
 
 
