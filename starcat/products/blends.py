@@ -8,7 +8,7 @@ own centroiding (`starcat.images.centroiding`), which takes them from here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -62,8 +62,10 @@ class Widths:
 
     def times(self, scale: float) -> Widths:
         """Return the same widths in another unit."""
-        lengths = (self.spot, self.window, self.smoothed, self.pixel)
-        return Widths(*(length * scale for length in lengths), self.box_px)
+        return replace(
+            self, spot=self.spot * scale, window=self.window * scale,
+            smoothed=self.smoothed * scale, pixel=self.pixel * scale,
+        )  # fmt: skip
 
 
 def widths_px(
@@ -107,8 +109,8 @@ def blends(
     by ``f exp(...)``. The aperture's share of a spot is that of the noncentral chi-squared
     distribution.
 
-    With a box, `Widths.box_px`, the centroid is the centre of mass of the pixels in a box around the
-    brightest pixel, where the star's own maximum of light is or the maximum of the brightest
+    With a box, `Widths.box_px`, the centroid is the centre of mass of the pixels in a box around
+    the brightest pixel, where the star's own maximum of light is or the maximum of the brightest
     neighbour that it is not told apart from. Where that maximum is in its pixel is not known: all
     places in the pixel are averaged.
 
@@ -170,8 +172,8 @@ def _boxed(
 def _in_pixels(away: Array, widths: Widths) -> tuple[Array, Array]:
     """Return parts of light in a box and their first moments about the peak, shape (2, P, M).
 
-    The axes are that of the pixels, the place of the peak in its pixel, and the star, whose distance
-    from the peak is in pixels.
+    The axes are x and y, the place of the peak in its pixel, and the star, whose distance from the
+    peak is in pixels.
     """
     box_px = widths.box_px or 1
     spot_px = widths.spot / widths.pixel

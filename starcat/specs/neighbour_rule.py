@@ -35,9 +35,9 @@ class NeighbourRule(Section):
     )
     centroid: Literal["window", "box"] = Field(
         "window",
-        description="how the sensor measures a star: in a Gaussian window that is moved until it is "
-        "centred on the light, or as the centre of mass of the pixels in a box around the brightest "
-        "pixel",
+        description="how the sensor measures a star: in a Gaussian window that is moved until it "
+        "is centred on the light, or as the centre of mass of the pixels in a box around the "
+        "brightest pixel",
     )
     box_px: int | None = Field(
         None,
@@ -85,8 +85,8 @@ class NeighbourRule(Section):
             )
         if self.box_px is not None and (self.box_px % 2 == 0 or self.window_px is not None):
             raise ValueError(
-                f"box_px is {self.box_px} and window_px is {self.window_px}; a box has an odd number "
-                "of pixels on a side, around the brightest one, and no window"
+                f"box_px is {self.box_px} and window_px is {self.window_px}; a box has an odd "
+                "number of pixels on a side, around the brightest one, and no window"
             )
         return self
 
