@@ -155,7 +155,7 @@ def print_views(session: Session, *, as_json: bool) -> None:
     if as_json:
         print_json([_view_facts(target, view) for target, view in views])
         return
-    names = [f"{target.name}.{view.name}" for target, view in views]
+    names = [f"{target.short_name}.{view.name}" for target, view in views]
     rows = [
         (name, _row_count(session, name), view.schema.summary if view.schema else "")
         for name, (_, view) in zip(names, views, strict=True)
@@ -166,7 +166,7 @@ def print_views(session: Session, *, as_json: bool) -> None:
 def _view_facts(target: Target, view: View) -> dict[str, Any]:
     columns = view.schema.columns if view.schema else ()
     return {
-        "schema": target.name,
+        "schema": target.short_name,
         "view": view.name,
         "description": view.schema.description if view.schema else "",
         "columns": [
@@ -299,7 +299,7 @@ def words(session: Session) -> list[str]:
     known |= {f"{macro.name}(" for macro in macros() if not macro.name.startswith("_")}
     for target in session.targets:
         for view in target.views:
-            known |= {view.name, f"{target.name}.{view.name}"}
+            known |= {view.name, f"{target.short_name}.{view.name}"}
             known |= {column.name for column in (view.schema.columns if view.schema else ())}
     return sorted(known)
 

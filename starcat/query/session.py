@@ -195,10 +195,10 @@ def _remove_abandoned(parent: Path) -> None:
 def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
     """Return targets by their schemas.
 
-    A target alone is ``main`` and its own name; several are ``a``, ``b`` ... and their names.
+    A target alone is ``main`` and its own names; several are ``a``, ``b`` ... and their names.
     """
     short = ["main"] if len(targets) == 1 else short_names(len(targets))
-    named = {target.name: target for target in targets}
+    named = {name: target for target in targets for name in (target.name, target.alias) if name}
     return {**dict(zip(short, targets, strict=True)), **named}
 
 

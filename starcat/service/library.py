@@ -46,6 +46,11 @@ class Database:
         return f"{self.name}-{self.version}"
 
     @property
+    def built_ns(self) -> int:
+        """When its manifest was written, nanoseconds since 1970."""
+        return (self.folder / MANIFEST_NAME).stat().st_mtime_ns
+
+    @property
     def spec(self) -> dict[str, Any]:
         """The spec, with all defaults."""
         return dict(self.manifest["spec"])

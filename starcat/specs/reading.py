@@ -262,7 +262,7 @@ def _preset_content(name: str) -> dict[str, Any]:
     if name not in preset_names():
         hint = suggest(str(name), preset_names())
         raise ConfigError(
-            f"unknown preset {quoted(name)}; {hint}known presets: {', '.join(preset_names())}",
+            f"unknown preset {quoted(str(name))}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",
             value=name,
         )

@@ -273,7 +273,7 @@ def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
     with service.query_pool.session([service.library.target(name) for name in targets]) as session:
         return [
             ViewFacts(
-                target=target.name,
+                target=target.short_name,
                 view=view.name,
                 description=view.schema.description if view.schema else "",
                 columns=_columns(view),

@@ -93,9 +93,11 @@ class Tap:
 
     def _found(self) -> dict[Path, str]:
         """Return what there is on disk, and what each is."""
+        # Of two databases with one name and version, the older one keeps its schema.
+        databases = sorted(self._library.databases(), key=lambda one: one.built_ns)
         found = {
             database.folder: f"Guide-star database {database.name}, version {database.version}"
-            for database in self._library.databases()
+            for database in databases
         }
         for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and not path.stem.endswith("rejected")
