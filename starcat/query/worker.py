@@ -263,7 +263,10 @@ class Worker:
             with self._sending:
                 percent = self._connection.query_progress() if self._is_running else -1.0
                 if percent >= 0.0:
-                    self._send(PROGRESS, json_content(int(percent)))
+                    try:
+                        self._send(PROGRESS, json_content(int(percent)))
+                    except OSError:  # the one that asks has gone since it was looked for
+                        os._exit(1)
 
 
 def _settings(opening: Opening) -> dict[str, Any]:
