@@ -11,7 +11,10 @@ rooms behind them are described in ``docs/house.md`` and may change.
 
 from __future__ import annotations
 
-from starcat.version import __version__
+from starcat.version import __version__, mixed_with
+
+if _mixed := mixed_with():
+    raise ImportError(_mixed)
 
 TYPE_CHECKING = False  # as a type checker knows it, without importing typing for it
 if TYPE_CHECKING:

@@ -10,11 +10,15 @@ import os
 import sys
 from contextlib import suppress
 
+from starcat.version import damaged_by_others
+
 INTERRUPTED_CODES = (130, 143)
 
 
 def main() -> None:
     """Run the command line, or what there is of it."""
+    if damaged := damaged_by_others():
+        sys.exit(f"starcat: error: {damaged}")
     try:
         from starcat.cli.main import main as run
     except ModuleNotFoundError as lacking:

@@ -109,6 +109,10 @@ class ConfigError(StarcatError, ValueError):
     value: object = None
 
 
+class ArgumentTypeError(ConfigError, TypeError):
+    """An argument of another type than the parameter takes."""
+
+
 class FileMissing(ConfigError):  # noqa: N818 - the name reads as the fact
     """A spec, a camera file or a frame that is not there."""
 

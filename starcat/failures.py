@@ -127,7 +127,12 @@ def shown(text: str, most: int) -> str:
         half = (most - 1) // 2
         text = f"{text[:half]}…{text[-half:]}"
     return "".join(
-        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+        c
+        if c.isprintable() or c == "\n"
+        else " "
+        if c == "\t"
+        else c.encode("unicode_escape").decode()
+        for c in text
     )
 
 

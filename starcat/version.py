@@ -1,4 +1,9 @@
-"""The version of starcat, and the name that pip installs it by."""
+"""The version of starcat, the name that pip installs it by, and whether it is installed alone."""
+
+from __future__ import annotations
+
+import os  # not pathlib, which takes long to import
+import sys
 
 __version__ = "0.2.0"
 
@@ -8,16 +13,45 @@ DISTRIBUTION = "starcat-guide-stars"
 MATCHER = "starcat-matcher"
 """The same import name with what identifies stars alone: numpy, h5py and cffi."""
 
+OTHER_PROJECTS = {"starcatalog.py": "rms-starcat", "bonus.py": "starcat"}
+"""Other projects on PyPI that install a package ``starcat``, by a file that only they have."""
 
-def install_command(extra: str) -> str:
-    """Return what to type to have the libraries of an optional part.
+_FOLDER = os.path.dirname(os.path.abspath(__file__))
+
+
+def install_command(extra: str = "") -> str:
+    """Return the command that installs starcat, or the libraries of an optional part of it.
+
+    It names what starcat was installed from: a clone, or another file or address, else PyPI.
 
     Examples
     --------
-    >>> install_command("images")
-    "pip install 'starcat-guide-stars[images]'"
+    >>> install_command("images")  # in a clone
+    "pip install -e '...[images]'"
     """
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
+    import shlex
+    from pathlib import Path
+
+    extras = f"[{extra}]" if extra else ""
+    clone = Path(_FOLDER).parent
+    if (clone / "pyproject.toml").is_file() and (clone / "onboard").is_dir():
+        return f"pip install -e {shlex.quote(f'{clone}{extras}')}"
+    source = _installed_from()
+    return f"pip install {shlex.quote(f'{DISTRIBUTION}{extras}' + (source and f' @ {source}'))}"
+
+
+def _installed_from() -> str:
+    """Return the address that pip installed starcat from (PEP 610), or an empty text for PyPI."""
+    import json
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    try:
+        origin = json.loads(distribution(DISTRIBUTION).read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:
+        return ""
+    if "vcs_info" in origin:
+        return f"{origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"
+    return str(origin.get("url", ""))
 
 
 def lacking(what: str, error: ModuleNotFoundError) -> str:
@@ -26,14 +60,48 @@ def lacking(what: str, error: ModuleNotFoundError) -> str:
     Examples
     --------
     >>> print(lacking("build", ModuleNotFoundError(name="typer")))
-    build needs the library 'typer', which is not installed; pip install starcat-guide-stars
+    build needs the library 'typer', which is not installed; pip install ...
     """
     name = (error.name or "").partition(".")[0]
     if name != "starcat":
-        return (
-            f"{what} needs the library {name!r}, which is not installed; pip install {DISTRIBUTION}"
-        )
+        return f"{what} needs the library {name!r}, which is not installed; {install_command()}"
     return (
         f"{what} is not in {MATCHER}, which only identifies stars; pip uninstall {MATCHER}, then "
-        f"pip install {DISTRIBUTION}"
+        f"{install_command()}"
+    )
+
+
+def mixed_with() -> str:
+    """Return the sentence for a package whose folder has files of another project; else nothing.
+
+    Two files are looked for, which takes some microseconds: every import of starcat does it.
+    """
+    others = [
+        project
+        for name, project in OTHER_PROJECTS.items()
+        if os.path.exists(os.path.join(_FOLDER, name))
+    ]
+    if not others:
+        return ""
+    names = " and ".join(others)
+    return (
+        f"{_FOLDER} has files of the project {names} and of {DISTRIBUTION}. Both are imported as "
+        f"'starcat', so that they cannot be in one environment. Uninstall both (pip uninstall "
+        f"{' '.join(others)} {DISTRIBUTION} {MATCHER}), then install one of them again"
+    )
+
+
+def damaged_by_others() -> str:
+    """Return the sentence for a package that another project has changed; else nothing.
+
+    The command asks this. Unlike `mixed_with` it also finds that ``starcat/__init__.py`` is that of
+    another project, or was removed with it.
+    """
+    text = mixed_with()
+    if text or "Matcher" in getattr(sys.modules["starcat"], "__all__", ()):
+        return text
+    return (
+        f"{_FOLDER}/__init__.py is missing or of another project: pip replaced or removed it with "
+        f"another project that is imported as 'starcat'. Install {DISTRIBUTION} again: pip "
+        f"uninstall {DISTRIBUTION} {MATCHER}, then {install_command()}"
     )

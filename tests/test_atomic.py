@@ -177,3 +177,23 @@ def test_the_files_of_a_built_artifact_can_only_be_read(small_artifact):
     modes = {mode_of(path) for path in small_artifact.rglob("*") if path.is_file()}
     assert modes == {0o444}
     assert mode_of(small_artifact) & 0o200
+
+
+def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_is_kept(tmp_path):
+    final = tmp_path / "dist" / "cube-1.0.0"
+    abandoned = final.parent / ".cube-1.0.0.dead.partial"
+    aside = final.parent / ".cube-1.0.0.dead.partial.old.partial"
+    other = final.parent / ".cube-1.0.0-b.dead.partial"
+    for path in (abandoned, aside, other):
+        path.mkdir(parents=True)
+    with whole_folder(final) as first, whole_folder(final) as second:
+        assert first.is_dir()
+        assert second.is_dir()
+        assert not abandoned.exists()
+    assert sorted(final.parent.iterdir()) == sorted([aside, other])
+
+
+def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path):
+    with pytest.raises(ValueError, match="stop"), whole_folder(tmp_path / "new" / "a"):
+        raise ValueError("stop")
+    assert not (tmp_path / "new").exists()

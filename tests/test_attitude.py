@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from starcat.geometry.attitude import (
     solve_wahba_svd,
     turn_between,
 )
+from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
 
 # Components are rounded to 1.1e-16, and a handful of products add up.
@@ -278,3 +281,50 @@ def test_a_turn_is_what_leads_from_one_attitude_to_another(angle_rad):
         # A turn about the boresight leaves the boresight where it is.
         rolled = matrix_from_quaternion(np.array(after_turn(q, (0.0, 0.0, 0.3))))
         np.testing.assert_allclose(rolled[2], matrix[2], atol=1e-15)
+
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = {"q_body_from_icrs": 4, "v_icrs": 3, "v_camera": 3, "pixel": 2}
+"""Lines of the worked example, and how many numbers stand in each."""
+
+
+def worked_example(path: str) -> dict[str, list[str]]:
+    """Return the numbers of the worked example of a document, as they are printed."""
+    text = (ROOT / path).read_text(encoding="utf-8")
+    lines = {}
+    for name, count in EXAMPLE.items():
+        [found] = re.findall(rf"^[ *]*{name}((?: +-?\d+\.\d+){{{count}}})$", text, re.MULTILINE)
+        lines[name] = found.split()
+    return lines
+
+
+def test_the_worked_example_is_the_same_everywhere():
+    """And its numbers are those of this library, of its C library, and of scipy."""
+    example = worked_example("onboard/include/starcat.h")
+    for path in ("onboard/MANUAL.md", "docs/tutorial.md", "docs/python.md"):
+        assert worked_example(path) == example, path
+        text = (ROOT / path).read_text(encoding="utf-8")
+        assert "A = (w^2 - v.v) I + 2 v v^T - 2 w [v x]" in text
+        assert "Rotation.from_quat(q).inv().apply(v_icrs)" in text
+    test_in_c = (ROOT / "onboard" / "tests" / "test_geometry.c").read_text(encoding="utf-8")
+    for numbers in example.values():  # what the C library makes of them is tested there
+        assert re.search(r",\s+".join(map(re.escape, numbers)), test_in_c), numbers
+
+    q, v_icrs, v_camera, pixel = (np.array(row, dtype=float) for row in example.values())
+    printed = {"rtol": 0.0, "atol": 2e-9}
+    expected = quaternion_from_matrix(matrix_from_radec_roll(100.0, -15.0, 30.0))
+    np.testing.assert_allclose(q, expected, **printed)
+    [sirius] = directions_from_radec(np.array([101.287155]), np.array([-16.716116]))
+    np.testing.assert_allclose(v_icrs, sirius, **printed)
+    x, y, z, w = q
+    np.testing.assert_allclose(matrix_from_quaternion(q) @ v_icrs, v_camera, **printed)
+    np.testing.assert_allclose(Rotation.from_quat(q).inv().apply(v_icrs), v_camera, **printed)
+    conjugate = Rotation.from_quat([-x, -y, -z, w])
+    np.testing.assert_allclose(conjugate.apply(v_icrs), v_camera, **printed)
+    np.testing.assert_allclose(Rotation.from_quat(q).apply(v_camera), v_icrs, **printed)
+    v = q[:3]
+    cross = np.cross(v, np.eye(3)).T  # cross @ u is v x u
+    formula = (w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) - 2.0 * w * cross
+    np.testing.assert_allclose(formula, matrix_from_quaternion(q), **printed)
+    seen = Camera(1280, 960, 3200.0).pixels_from_directions(v_camera[None])
+    np.testing.assert_allclose(seen, [pixel], rtol=0.0, atol=2e-5)

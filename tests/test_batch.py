@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from starcat.api.functions import calibrate, read_frames
 from starcat.errors import ConfigError
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
 from starcat.images.contact_sheet import write_contact_sheet
 from starcat.images.render import write_simulated
+from starcat.images.solve_files import LocalInputs
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.matcher.tracking import Tracker
+from starcat.simulation.simulate import Noise, Sky, simulate_frame, simulate_frames
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +148,53 @@ def test_a_small_picture_keeps_every_star(shape):
     small = small_picture(image)
     assert max(small.shape) <= 256
     assert small.max() == 255
+
+
+def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_path, monkeypatch):
+    """A frame that is searched for again, in other ways, moves the time of the tracker once."""
+    database, generator = open_database(small_artifact), np.random.default_rng(3)
+    sky = Sky(database.directions, database.mag, np.arange(len(database.mag), dtype=np.int32))
+    q, paths, predictions = (0.0, 0.0, 0.0, 1.0), [], []
+    for number in range(8):
+        q = after_turn(q, (np.radians(1.5), 0.0, 0.0))
+        matrix = matrix_from_quaternion(np.array(q))
+        frame = simulate_frame(sky, database.camera, matrix, Noise(0.2), generator)
+        paths.append(tmp_path / f"{number}.png")
+        write_simulated(paths[-1], frame, database.camera, number)
+    dark = generator.normal(100.0, 5.0, (512, 512))
+    Image.fromarray(np.rint(dark).astype(np.uint16)).save(paths[3])
+    predicted = Tracker._predicted
+
+    def noted(self, now, camera):
+        found = predicted(self, now, camera)
+        predictions.append((now, found[1]))
+        return found
+
+    monkeypatch.setattr(Tracker, "_predicted", noted)
+    matcher = Matcher.open(small_artifact)
+    items = list(identify_files(paths, matcher, local=LocalInputs(track=True), workers=0))
+    origins = [item.answers[0].result.origin for item in items if item.answers[0].result.ok]
+    assert origins == ["lost_in_space", *["tracking"] * 6]
+    assert {now for now, _ in predictions} == set(map(float, range(8)))
+    assert dict(predictions)[5.0] < 1.0  # degrees
+
+
+def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
+    starcat, small_artifact, tmp_path, monkeypatch
+):
+    database = open_database(small_artifact)
+    (tmp_path / "night").mkdir()
+    frames = simulate_frames(
+        database.directions, database.camera, 4, Noise(0.2), 1, mag=database.mag
+    )
+    for number, frame in enumerate(frames):
+        write_simulated(tmp_path / "night" / f"{number}.csv", frame, database.camera, number)
+    assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
+    for given in ("night", "night/*.csv"):
+        monkeypatch.chdir(tmp_path)
+        run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml"])
+        assert run.code == 0, run.err
+    two = starcat(["calibrate", small_artifact, "night/[01].csv", "-o", "camera.toml"])
+    assert "2 of 2 frames are identified" in two.err
+    assert "a calibration needs 3. Give more frames" in " ".join(two.err.split())
+    assert calibrate(small_artifact, "night").n_identified == 4

@@ -11,11 +11,11 @@ FOLDER = Path(__file__).parent / "benchmarks"
 LACKING = 77
 
 BENCHMARKS = [
-    "campaign", "crossmatch_sql", "deep_fields", "engines", "false_matches", "fields",
+    "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines", "false_matches", "fields",
     "hostile", "ingest", "instructions", "interrupts",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
-    "matcher --of ruststartracker", "pictures", "products", "scale", "service", "sql", "tracking",
-    "votable",
+    "matcher --of ruststartracker", "pictures", "products", "scale", "service", "service_load",
+    "sql", "tracking", "votable",
 ]  # fmt: skip
 
 

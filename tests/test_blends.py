@@ -23,8 +23,8 @@ from starcat.catalog.stars import directions_of, floats_of, table_from_columns
 from starcat.catalog.verdict import Quality
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
-from starcat.images.centroiding import find_spots
-from starcat.images.render import Optics, render_image
+from starcat.images.centroiding import centres_of_mass, find_spots
+from starcat.images.render import Optics, render_image, star_electrons
 from starcat.pipeline.build import build
 from starcat.pipeline.catalog_snapshot import read_snapshot
 from starcat.pipeline.estimate import choose_stars
@@ -154,6 +154,53 @@ def test_a_fainter_star_is_found_where_it_is_not_lost(psf_sigma_px):
     assert np.mean(is_found != other.is_lost) >= 0.93
     moved = (place + offset + other.offset - spots[of_star])[other.is_lost & ~is_found]
     assert np.median(np.hypot(*moved.T)) < 0.03
+
+
+def settled_in_a_window(image: Values, place: Values, window_px: float) -> Values:
+    """Return where a Gaussian window on the light of an image comes to rest."""
+    row, column = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    for _ in range(500):
+        apart2 = (column - place[0]) ** 2 + (row - place[1]) ** 2
+        seen = image * np.exp(-0.5 * apart2 / window_px**2)
+        mean = np.array([(seen * column).sum(), (seen * row).sum()]) / seen.sum()
+        place, step = mean, np.abs(mean - place).max()
+        if step < 1e-6:
+            break
+    return place
+
+
+@pytest.mark.parametrize(
+    ("psf_sigma_px", "box_px", "offset_px"),
+    [(1.0, 3, 0.01), (1.0, 5, 0.10), (1.0, 7, 0.56), (1.0, None, 0.08), (1.443, 5, 0.26),
+     (1.443, None, 1.62)],
+)  # fmt: skip
+def test_a_pair_is_where_its_centroid_is_measured(psf_sigma_px, box_px, offset_px):
+    """Two equal stars 4.2 px apart: rendered without noise at all places in a pixel."""
+    apart = np.array([4.2, 0.0])
+    columns = (np.arange(40) + 0.5) / 40 - 0.5
+    phases = np.stack(np.meshgrid(columns, columns[4::8]), axis=-1).reshape(-1, 2)
+    optics, found = Optics(psf_sigma_px), []
+    widths = widths_px(psf_sigma_px, None, box_px)
+    for place in 20.5 + (phases if box_px else phases[2::19]):
+        image = star_electrons(np.stack([place, place + apart]), np.full(2, 5.0), (41, 41), optics)
+        if box_px is None:
+            settled = settled_in_a_window(image, place, widths.window)
+        else:
+            settled = centres_of_mass(image, place[None], box_px)[0]
+        found.append(settled - place)
+    no = np.zeros(1, dtype=bool)
+    predicted = blends(1, np.zeros(1, dtype=np.int64), apart[None], np.ones(1), no, widths)
+    assert predicted.offset[0] == pytest.approx(np.mean(found, axis=0), abs=0.01)
+    assert predicted.offset[0] == pytest.approx([offset_px, 0.0], abs=0.01)
+
+
+def test_a_box_measures_one_star_where_it_is():
+    nobody = np.zeros(0, dtype=np.int64)
+    widths = widths_px(1.0, None, 5).times(3.0)
+    found = blends(1, nobody, np.zeros((0, 2)), np.zeros(0), nobody > 0, widths)
+    assert np.abs(found.offset).max() < 1e-9
+    assert found.brightening == pytest.approx([1.0])
+    assert found.contamination == pytest.approx([0.0])
 
 
 # --- Properties
@@ -384,6 +431,18 @@ def judged_wide(stars: pa.Table) -> Selected:
     ("changes", "words"),
     [
         ({"neighbours.max_offset_px": "0.2"}, "psf_sigma_px is missing: without the width of a"),
+        (
+            {"neighbours.psf_sigma_px": "1.0", "neighbours.centroid": "box"},
+            'state both centroid = "box" and the size of the box',
+        ),
+        (
+            {
+                "neighbours.psf_sigma_px": "1.0",
+                "neighbours.centroid": "box",
+                "neighbours.box_px": "4",
+            },
+            "a box has an odd number of pixels on a side",
+        ),
         ({"neighbours.psf_sigma_px": "0.0"}, "psf_sigma_px: found 0.0; Input should be greater"),
         ({"neighbours.psf_sigma_px": "1.0", "neighbours.action": "mend"}, "action: found 'mend'"),
         (
@@ -407,6 +466,7 @@ def test_a_spec_without_the_section_is_recorded_as_it_always_was():
     spec = preset("sao-12deg", {"selection.neighbours.psf_sigma_px": "1.0"})
     recorded = spec.recorded()
     assert recorded["selection"]["neighbours"]["psf_sigma_px"] == 1.0
+    assert {"centroid", "box_px"}.isdisjoint(recorded["selection"]["neighbours"])
     assert spec_from_dict(recorded, "manifest") == spec
 
 

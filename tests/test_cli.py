@@ -23,6 +23,7 @@ from starcat.catalog.source import source_names
 from starcat.cli.main import app
 from starcat.cli.panels import OPTIONS, PANELS
 from starcat.matcher.c_engine import library_version
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.specs.reading import preset_names
 from starcat.storage.schema import product_schema
@@ -395,7 +396,10 @@ def test_an_image_is_searched_identified_and_drawn(starcat, small_artifact, tmp_
     assert picture.read_bytes().startswith(b"\x89PNG")
     upside_down = starcat(["identify", small_artifact, image, "--flip"])
     assert "no_match" in upside_down.out
-    assert "--no-flip" in upside_down.err
+    printed = " ".join(upside_down.out.split())
+    assert "it was turned over, and was upright before" in printed
+    assert "leave this option out (--flip)" in printed
+    assert "try" not in upside_down.err
 
 
 def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
@@ -544,11 +548,28 @@ def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifa
         "evaluate nope", "simulate nope -o x.csv", "sql nope", "export nope --to csv -o x",
         "identify nope nope.csv", "identify {small} nope.csv", "identify {small} nope.png",
         "identify {small} nope.csv --camera nope.toml", "calibrate {small} nope.csv -o x.toml",
-        "build nope.toml", "estimate nope.toml", "ingest sao --input nope.dat -o x",
-        "crossmatch nope.parquet nope.parquet -o x",
+        "build nope.toml", "estimate nope.toml", "ingest sao --input nope.dat -o x.parquet",
+        "crossmatch nope.parquet nope.parquet -o x.parquet",
     ],
 )  # fmt: skip
 def test_what_is_not_there_has_one_wording_and_one_exit_code(starcat, small_artifact, command):
     run = starcat(command.format(small=small_artifact).split())
     assert run.code == 3, run.err
     assert re.search(r"nope\S*: no such [a-z, ]+; ", " ".join(run.err.split())), run.err
+
+
+@pytest.mark.parametrize("command", ["ingest sao --input {here}/s -o {here}/x.csv",
+                                     "crossmatch {here}/a {here}/b -o {here}/z.fits"])  # fmt: skip
+def test_a_file_that_is_written_as_parquet_ends_so(starcat, tmp_path, command):
+    run = starcat(command.format(here=tmp_path).split())
+    assert run.code == 2
+    assert "end its name with .parquet" in " ".join(run.err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_results_of_frames_are_compared_without_an_error(small_artifact):
+    result = Matcher.open(small_artifact).identify(np.zeros((0, 2)))
+    again = Matcher.open(small_artifact).identify(np.zeros((0, 2)))
+    assert result == result
+    assert result != again
+    assert len({result, again}) == 2

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import duckdb
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -70,6 +71,25 @@ def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
         with pytest.raises(SystemExit) as done:
             cli.main()
         assert not done.value.code, command
+
+
+def test_the_two_kinds_of_steps_are_told_apart():
+    """The numpy matcher and the C library count other things, a thousand times apart in time."""
+    for path in ("docs/cli.md", "onboard/README.md"):
+        text = " ".join((ROOT / path).read_text().split())
+        assert re.search(r"[Cc]andidates that the numpy matcher .{0,14}, 2 to 20 micro", text), path
+    text = " ".join((ROOT / "docs" / "algorithms.md").read_text().split())
+    assert "A step takes 2 to 20 µs" in text
+    assert "1 to 5 ns each (`options.max_steps`)" in text
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/scale.md", "docs/cli.md"])
+def test_files_of_examples_have_names_that_sql_takes_as_they_are(name):
+    """A file is a table of its name, but BOTH, for instance, is a word of SQL."""
+    names = re.findall(r"-o (\w+)\.parquet", (ROOT / name).read_text())
+    assert names
+    for table in names:
+        duckdb.sql(f"SELECT * FROM (SELECT 1) AS {table}")
 
 
 def test_links_between_pages_lead_somewhere():

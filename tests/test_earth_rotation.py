@@ -9,9 +9,11 @@ from datetime import UTC, datetime, timedelta
 import erfa
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from starcat.calibration.calibrate import calibrate_frames
 from starcat.calibration.earth_rotation import earth_rotation, times_of_frames
+from starcat.calibration.files import measured_frames, names_of_files
 from starcat.errors import CalibrationError, ConfigError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -113,3 +115,29 @@ def test_the_command_prints_the_errors_and_json_has_them(starcat, small_artifact
     assert "Against the turn of the Earth" in run.out
     said = json.loads(starcat([*asked, "--json"]).out)["earth_rotation"]
     assert len(said["frames"]) == 6
+
+
+def test_pictures_of_one_name_in_two_folders_keep_their_times(tmp_path):
+    paths = [tmp_path / night / "img_1.fits" for night in ("a", "b")]
+    heads = [{"DATE-OBS": "2026-03-01T20:00:00"}, {"DATE-OBS": "2026-03-01", "UT": "23:00:00.5"}]
+    for path, head in zip(paths, heads, strict=True):
+        path.parent.mkdir()
+        hdu = fits.PrimaryHDU(np.zeros((64, 64), np.uint16) + np.eye(64, dtype=np.uint16))
+        hdu.header.update(head)
+        hdu.writeto(path)
+    found = times_of_frames(paths, None)
+    assert [time.isoformat() for time in found.values()] == [
+        "2026-03-01T20:00:00+00:00", "2026-03-01T23:00:00.500000+00:00",
+    ]  # fmt: skip
+    assert list(found) == names_of_files(paths) == [str(path.with_suffix("")) for path in paths]
+    measured, _ = measured_frames(paths)
+    assert [frame.name for frame in measured] == list(found)
+    assert names_of_files([paths[0], tmp_path / "img_2.csv"]) == ["img_1", "img_2"]
+
+
+def test_a_date_without_a_time_of_day_is_refused(tmp_path):
+    hdu = fits.PrimaryHDU(np.zeros((8, 8), np.uint16))
+    hdu.header["DATE-OBS"] = "2026-03-01"
+    hdu.writeto(tmp_path / "day.fits")
+    with pytest.raises(ConfigError, match=r"day\.fits: DATE-OBS is '2026-03-01', a date without"):
+        times_of_frames([tmp_path / "day.fits"], None)

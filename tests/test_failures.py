@@ -17,6 +17,7 @@ from starcat.cli.console import progress_bars
 from starcat.errors import ConfigError, SourceMissing
 from starcat.failures import DEFECT, MAX_MESSAGE, failure_of, hint_in
 from starcat.pipeline import build as pipeline
+from starcat.version import install_command
 
 Run = Callable[[list[Any]], Any]
 
@@ -138,8 +139,8 @@ def test_a_library_that_is_missing_is_named(starcat, breaking):
     run = starcat(["sources"])
     assert (run.code, run.err) == (
         2,
-        "starcat: error: starcat sources needs the library 'rich', which is not installed; pip "
-        "install starcat-guide-stars\n",
+        "starcat: error: starcat sources needs the library 'rich', which is not installed; "
+        f"{install_command()}\n",
     )
 
 

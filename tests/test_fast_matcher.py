@@ -17,7 +17,7 @@ from starcat.exchange.onboard import export_image
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import c_engine
-from starcat.matcher.c_engine import BatchResult
+from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
@@ -298,12 +298,14 @@ def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
             )
 
 
-def test_an_image_has_nothing_for_frames_that_are_too_large(small_artifact, tmp_path):
+def test_an_image_has_nothing_for_a_camera_that_is_too_wide(small_artifact, tmp_path):
     path = tmp_path / "db.img"
     export_image(small_artifact, "onboard", path)
-    frame = np.random.default_rng(3).random((600, 2)) * 500.0
-    with pytest.raises(ConfigError, match="600 centroids and this camera are beyond the C library"):
-        Matcher.open(path).identify(frame)
+    frame, wide = np.random.default_rng(3).random((600, 2)) * 500.0, Camera(1024, 1024, 1e-3)
+    matcher = Matcher.open(path)
+    assert matcher.identify(frame).n_not_searched == 600 - 512
+    with pytest.raises(ConfigError, match="512 centroids and this camera are beyond the C library"):
+        matcher.identify(frame, wide)
 
 
 def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):

@@ -32,18 +32,29 @@ def rooms_of_the_house() -> list[str]:
 ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
-    "ground": ["arrays", "errors", "failures", "progress", "resources", "threads", "version"],
+    "ground": [
+        "arguments",
+        "arrays",
+        "errors",
+        "failures",
+        "progress",
+        "resources",
+        "threads",
+        "version",
+    ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
-ONBOARD = ("grid", "image", "layout", "reading")
+ONBOARD = ("flight_limits", "grid", "image", "layout", "reading")
 LIGHT = {
+    "starcat.arguments",
     "starcat.arrays",
     "starcat.errors",
     "starcat.storage.hdf5",
     "starcat.storage.product_table",
+    "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }

@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starcat.api.functions import simulate
 from starcat.artifact.reader import open_artifact
-from starcat.cli import exchange as onboard
+from starcat.cli import exchange
 from starcat.exchange.onboard import contents_of
 from starcat.matcher.database import open_database
+from starcat.onboard import flight_limits
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import DIRECTION_SCALE
 from starcat.onboard.reading import read_image
@@ -174,18 +177,49 @@ def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, 
         subprocess.run(built, check=True)
 
 
+def test_the_limits_in_flight_are_those_of_the_header():
+    header = (Path(__file__).parents[1] / "onboard" / "include" / "starcat.h").read_text()
+    for name, limit in (("STARS", FLIGHT_STARS), ("CENTROIDS", FLIGHT_CENTROIDS)):
+        assert re.findall(rf"#define STARCAT_MAX_{name} (\d+)", header) == [str(limit)]
+
+
 def test_a_field_that_the_library_has_no_room_for_is_told_of(
     small_artifact, tmp_path, starcat, monkeypatch
 ):
-    header = Path(__file__).parents[1] / "onboard" / "include" / "starcat.h"
-    found = re.search(r"define STARCAT_MAX_STARS (\d+)", header.read_text())
-    assert found is not None
-    assert int(found[1]) == onboard.LIBRARY_STARS
     command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
     assert starcat(command).err == ""
     near = read_image(tmp_path / "db.img").header["most_near"]
-    monkeypatch.setattr(onboard, "LIBRARY_STARS", near - 1)
+    monkeypatch.setattr(flight_limits, "FLIGHT_STARS", near - 1)
     assert f"-DSTARCAT_MAX_STARS={near}" in starcat(command).err
+    monkeypatch.setattr(exchange, "FLIGHT_CENTROIDS", near - 1)
+    ran = starcat(command)
+    assert f"-DSTARCAT_MAX_CENTROIDS={near}" in ran.err
+    assert f"at most {near - 1} centroids: give the brightest" in ran.out
+
+
+def test_a_frame_that_flight_refuses_is_told_of(small_artifact, path, tmp_path, starcat):
+    """The ground identifies it; the library in flight, of other limits, says status -10."""
+    # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.
+    [frame] = simulate(small_artifact, seed=7)
+    generator = np.random.default_rng(3)
+    crowd = generator.uniform((0.0, 0.0), (1024.0, 1024.0), (80, 2))
+    count = FLIGHT_CENTROIDS + 1
+    crowded = np.concatenate([frame.centroids_px, crowd])[:count].tolist()
+    advice = f"-DSTARCAT_MAX_CENTROIDS={count}"
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    one.write_text(json.dumps({"frames": [{"centroids_px": crowded}]}))
+    calm = {"centroids_px": crowded[:FLIGHT_CENTROIDS]}
+    two.write_text(json.dumps({"frames": [calm, {"centroids_px": crowded}]}))
+    ran = starcat(["identify", path, one])
+    assert re.search(rf"remark.*{count} centroids", ran.out)
+    [answer] = json.loads(starcat(["identify", path, one, "--json"]).out)
+    assert advice in " ".join(answer["remarks"])
+    ran = starcat(["identify", path, two])
+    assert f"1 of 2 frames have more than {FLIGHT_CENTROIDS} centroids" in ran.err
+    assert advice in ran.err
+    # A database's folder is no matter of flight.
+    ran = starcat(["identify", small_artifact, one])
+    assert "STARCAT_MAX_CENTROIDS" not in ran.out + ran.err
 
 
 def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import tomllib
 from pathlib import Path
 
 import jsonschema
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from astropy.io import fits
+from astropy.table import Table
 from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 
 from starcat.catalog.archives.mapped import identity
@@ -120,7 +124,8 @@ def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
     for case in CASES:
         (tmp_path / case.name).mkdir()
         draft = draft_map(case.make(sky, tmp_path / case.name))
-        assert mapped(tomllib.loads(draft.as_toml())).table is not None
+        content = tomllib.loads(draft.as_toml())
+        assert mapped({"epoch": 2000.0, **content}).table is not None
         hits = sum(draft.used.get(column) == key for column, key in case.meant.items())
         assert hits >= 0.8 * len(case.meant), case.name
         right, total = right + hits, total + len(case.meant)
@@ -354,3 +359,75 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(
     assert again.manifest["products"] == built.manifest["products"]
     rebuilt = rebuild(built.folder, {"bright": [Path("bright.parquet")]})
     assert rebuilt.is_identical
+
+
+IDS = (5, 4260750323735821843, 9000000000000000001, 2**63, 2**64 - 1)
+LARGER = {text: int(hashlib.sha256(text.encode()).hexdigest()[:16], 16) >> 2
+          for text in map(str, IDS[3:])}  # fmt: skip
+
+
+def identified(folder: Path, form: str, ids: tuple[int, ...]) -> Path:
+    """Write stars with identifiers in a format of tables."""
+    dtype = np.uint64 if max(ids) >= 2**63 else np.int64
+    columns = {"id": np.array(ids, dtype), "ra": np.arange(1.0, len(ids) + 1), "dec": 1.0, "v": 5.0}
+    path = folder / f"t.{form}"
+    table = Table({name: np.broadcast_to(one, len(ids)) for name, one in columns.items()})
+    if form == "parquet":
+        pq.write_table(pa.table({name: np.array(table[name]) for name in columns}), path)
+    else:
+        table.write(path, format={"csv": "ascii.csv", "vot": "votable"}.get(form, form))
+    return path
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "fits", "vot"])
+@pytest.mark.parametrize("count", [3, 5])
+def test_a_number_of_64_bits_is_the_same_star_in_every_format(
+    tmp_path: Path, form: str, count: int
+):
+    if (form, count) == ("vot", 5):
+        pytest.skip("VOTable has no unsigned numbers of 64 bits")
+    short = MAP.split("pm_ra_cosdec")[0] + '[magnitudes]\nV = "v"\n'
+    (tmp_path / "mine.toml").write_text(short)
+    name = give_map(tmp_path / "mine.toml").name
+    read = read_catalog(name, [identified(tmp_path, form, IDS[:count])], neighbours=False)
+    expected = [LARGER.get(str(one), one) for one in IDS[:count]]
+    stars = dict(
+        zip(read.stars["star_id"].to_pylist(), read.stars["designation"].to_pylist(), strict=True)
+    )
+    assert stars == {one: f"mine {n}" for one, n in zip(expected, IDS[:count], strict=True)}
+
+
+def test_null_values_of_fits_are_compared_as_they_are_stored(tmp_path: Path):
+    ids, ra, v = [1, 2, 3], [10.0, 20.0, 30.0], [5000, -32768, 7000]
+    columns = [
+        fits.Column("id", "K", array=ids), fits.Column("ra", "D", array=ra),
+        fits.Column("dec", "D", array=ra), fits.Column("v", "I", array=v),
+        fits.Column("w", "I", array=np.array([5, 65535, 7], np.uint16), bzero=32768, null=32767),
+    ]  # fmt: skip
+    binary = fits.BinTableHDU.from_columns(columns)
+    binary.header.update({"TSCAL4": 0.001, "TNULL4": -32768})
+    binary.writeto(tmp_path / "binary.fits")
+    columns[3:] = [fits.Column(c, "F7.3", array=[5, -9, 7], null="-9.000") for c in "vw"]
+    columns[0] = fits.Column("id", "I5", array=ids)
+    columns[1:3] = [fits.Column(c, "F7.3", array=ra) for c in ("ra", "dec")]
+    fits.TableHDU.from_columns(columns).writeto(tmp_path / "text.fits")
+    short = MAP.split("pm_ra_cosdec")[0] + '[magnitudes]\nV = "v"\nW = "w"\n'
+    (tmp_path / "mine.toml").write_text(short)
+    name = give_map(tmp_path / "mine.toml").name
+    for form in ("binary", "text"):
+        read = read_catalog(name, [tmp_path / f"{form}.fits"], neighbours=False)
+        assert read.stars["mag"].to_pylist() == [5.0, None, 7.0]
+        assert read.stars["second_mag"].to_pylist() == [5.0, None, 7.0]
+
+
+@pytest.mark.parametrize(
+    ("column", "band"),
+    [("mag", "V"), ("m", "V"), ("magnitude", "V"), ("V", "V"), ("Vmag", "V"), ("mag_B", "B")],
+)
+def test_a_draft_of_the_plainest_table_finds_the_magnitudes(tmp_path: Path, column: str, band: str):
+    (tmp_path / "plain.csv").write_text(f"id,ra,dec,{column}\n1,10.5,20.5,5.1\n2,100.5,-2.5,6.1\n")
+    draft = draft_map(tmp_path / "plain.csv")
+    content = tomllib.loads(draft.as_toml())
+    assert content["magnitudes"] == {band: column}
+    assert "epoch" not in content
+    assert "# epoch = 2000.0  # a guess" in draft.as_toml()

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from starcat.errors import FileMissing, SourceError
-from starcat.storage.regular_files import read_regular_file
+from starcat.artifact.manifest import read_manifest
+from starcat.bands.response import read_response
+from starcat.catalog.readers.blocks import open_input
+from starcat.catalog.source import read_source
+from starcat.errors import FileMissing, SourceError, StarcatError
+from starcat.images.image_file import read_image as read_picture
+from starcat.matcher.centroids import read_frames
+from starcat.onboard.reading import read_image
+from starcat.releases.lockfile import read_pins
+from starcat.specs.camera_file import read_camera
+from starcat.specs.reading import read_spec
+from starcat.storage.keys import is_public_key
+from starcat.storage.regular_files import check_regular_file, read_regular_file
 
 
 def test_a_regular_file_is_read_up_to_its_limit(tmp_path):
@@ -18,6 +30,7 @@ def test_a_regular_file_is_read_up_to_its_limit(tmp_path):
     assert read_regular_file(path, 5) == b"12345"
     with pytest.raises(SourceError, match="more than 4 bytes"):
         read_regular_file(path, 4)
+    assert read_regular_file(path, 1 << 60) == b"12345"  # takes no memory for the limit
 
 
 def test_a_link_to_a_regular_file_is_followed(tmp_path):
@@ -31,6 +44,33 @@ def test_a_pipe_that_nobody_writes_to_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SourceError, match="not a regular file"):
         read_regular_file(tmp_path / "pipe", 9)
+    with pytest.raises(SourceError, match="not a regular file"):
+        check_regular_file(tmp_path / "pipe")
+
+
+READERS: tuple[Callable[[Path], object], ...] = (
+    read_spec,
+    read_camera,
+    read_source,
+    read_frames,
+    read_image,
+    read_picture,
+    read_pins,
+    open_input,
+    is_public_key,
+    lambda path: read_response(path, "photon"),
+    lambda path: read_manifest(path.parent),
+)
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+@pytest.mark.parametrize("number", range(len(READERS)))
+def test_no_reader_waits_for_a_pipe_or_reads_a_device(tmp_path, number, make):
+    path = tmp_path / "manifest.json"
+    make(path)
+    with pytest.raises(StarcatError, match="not a regular file"):
+        READERS[number](path)
 
 
 def test_what_is_no_regular_file_is_refused(tmp_path):

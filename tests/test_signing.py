@@ -16,12 +16,12 @@ from cryptography.hazmat.primitives.asymmetric.x448 import X448PrivateKey
 from registry_files import edit_index, serving, write
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
-from starcat.errors import ConfigError, StarcatError
+from starcat.errors import ConfigError, ProductError, StarcatError
 from starcat.releases.lockfile import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import remembered
 from starcat.releases.signing import change_roles, renew, renew_if_old, roles_of
-from starcat.releases.tree import MAX_INDEX_BYTES
+from starcat.releases.tree import INDEX_NAME, MAX_INDEX_BYTES
 from starcat.storage.download import DownloadOptions
 from starcat.storage.keys import public_pem
 
@@ -448,6 +448,18 @@ def test_an_attack_behind_an_address_is_refused(name, registry, made):
         refused(ATTACKS[name], registry, made.earlier, Path("root.json"), server.url)
 
 
+def test_the_roles_of_a_registry_behind_an_address_are_those_of_its_folder(registry, tmp_path):
+    with serving(registry) as server:
+        assert roles_of(server.url) == roles_of(str(registry))
+        by_mallory("targets")(registry, registry)
+        with pytest.raises(ProductError, match="signatures do not agree"):
+            roles_of(server.url)
+    (tmp_path / "plain").mkdir()
+    (tmp_path / "plain" / INDEX_NAME).write_bytes((registry / INDEX_NAME).read_bytes())
+    with serving(tmp_path / "plain") as server, pytest.raises(ConfigError, match="nothing is sig"):
+        roles_of(server.url)
+
+
 def test_a_key_is_trusted_only_with_a_root_that_it_signed(registry, made):
     sentence = "metadata/1.root.json is not a root that the key"
     refused((all_by_mallory, sentence), registry, made.earlier, Path("chief.pub"), "registry")
@@ -593,4 +605,8 @@ def pem_of(kind: str, passphrase: bytes | None) -> bytes:
 def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):
     assert not renew_if_old(registry, signing("clock"))
     assert renew_if_old(registry, signing("clock", now=datetime.now(UTC) + timedelta(days=50)))
-    assert roles_of(registry)[-1].version == Forger(registry).read("timestamp").signed.version == 4
+    assert (
+        roles_of(str(registry))[-1].version
+        == Forger(registry).read("timestamp").signed.version
+        == 4
+    )

@@ -155,6 +155,29 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
     assert predicted == pytest.approx(max(east, north), rel=0.03)
 
 
+@pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.46])
+def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, correlation):
+    """Each axis is exact, whatever its correlation with the other one, which no column has."""
+    path = tmp_path / "hip_main.dat"
+    given = {"e_ra": 1.0, "e_de": 1.0, "e_pm_ra": 1.0, "e_pm_de": 1.0}
+    path.write_bytes(
+        record(
+            data_source("hipparcos").files[0],
+            {"catalog": "H", **FAST["Barnard's star"], **given, "pm_ra_ra": " 0.00",
+             "pm_de_de": " 0.00"},
+        )
+    )  # fmt: skip
+    stated_arcsec = position_errors(ingest("hipparcos", [path]).stars, 2027.0)[0]
+    rng = np.random.default_rng(25)
+    shared = [[1.0, correlation], [correlation, 1.0]]
+    place, motion = (rng.multivariate_normal([0.0, 0.0], shared, 10_000) for _ in range(2))
+    at_the_end = (place + (2027.0 - 1991.25) * motion) / 1000.0
+    assert stated_arcsec == pytest.approx(at_the_end.std(axis=0).max(), rel=0.03)
+    major = np.sqrt(np.linalg.eigvalsh(np.cov(at_the_end.T))[-1])
+    assert major == pytest.approx(stated_arcsec * np.sqrt(1.0 + abs(correlation)), rel=0.03)
+    assert major <= 1.01 * np.sqrt(2.0) * stated_arcsec
+
+
 @pytest.fixture
 def folder_of(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callable[..., Path]:
     """Build the small spec with some of its keys changed."""

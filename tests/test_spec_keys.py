@@ -239,3 +239,15 @@ def test_build_changes_a_key(starcat, tmp_path, sao_file, small_spec):
     manifest = json.loads((tmp_path / "small-2.0.0" / "manifest.json").read_text())
     assert manifest["spec"]["self_test"]["frames"] == 3
     assert starcat([*given, "--set", "version"]).code == 2
+
+
+def test_a_section_of_defaults_can_be_appended_to_a_written_spec():
+    spec = preset("gaia-12deg")
+    text = spec_toml(spec)
+    assert "\n# [selection.observed]\n" in text
+    patched = tomllib.loads(text + "\n[selection.observed]\nnoise_mag = 0.2\n")
+    assert patched["selection"]["observed"] == {"noise_mag": 0.2}
+    headers = [n for n, line in enumerate(text.splitlines()) if line.startswith("[")]
+    lines = text.splitlines()
+    for start, end in zip(headers, [*headers[1:], len(lines)], strict=True):
+        assert any(line and line[0] != "#" for line in lines[start + 1 : end]), lines[start]

@@ -40,6 +40,8 @@ package Starcat is
 
    type Real_Array is array (Natural range <>) of aliased Real
      with Convention => C;
+   --  X, Y, Z, W of an attitude: the head of starcat.h has its matrix and an
+   --  example.
    type Quaternion is array (0 .. 3) of Real with Convention => C;
    type Matrix is array (0 .. 8) of Real with Convention => C;
    type Rows is array (0 .. Max_Centroids - 1) of Integer_32

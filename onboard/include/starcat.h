@@ -2,8 +2,35 @@
  *
  * C99, freestanding: no heap, no files, no global state, no recursion. All memory is the caller's.
  * Directions are ICRS or camera unit vectors (camera frame: x right, y down, z along the
- * boresight). Pixels start at the outer corner of the top-left pixel. Quaternions are scalar-last,
- * turn ICRS into camera components, and have w >= 0.
+ * boresight). Pixels start at the outer corner of the top-left pixel.
+ *
+ * Every attitude is a matrix A or its quaternion q_body_from_icrs = [x, y, z, w]: scalar last, of
+ * length 1, w >= 0. Both convert the ICRS components of a direction into its components in the
+ * camera: v_camera = A v_icrs. With v = [x, y, z], the identity I, and [v x] the matrix of the
+ * cross product,
+ *
+ *     A = (w^2 - v.v) I + 2 v v^T - 2 w [v x]
+ *
+ *         | 1 - 2 (y y + z z)   2 (x y + z w)       2 (x z - y w)     |
+ *       = | 2 (x y - z w)       1 - 2 (x x + z z)   2 (y z + x w)     |
+ *         | 2 (x z + y w)       2 (y z - x w)       1 - 2 (x x + y y) |
+ *
+ * This is the attitude quaternion of Wertz (1978), Shuster (1993), Markley and Crassidis (2014).
+ * Libraries that rotate a vector by q v q* (Hamilton's convention: scipy, Eigen, ROS) describe the
+ * same attitude by the conjugate [-x, -y, -z, w]. In scipy v_camera is
+ * Rotation.from_quat(q).inv().apply(v_icrs), or Rotation.from_quat([-x, -y, -z, w]).apply(v_icrs).
+ *
+ * Numbers to test a conversion: Sirius at right ascension 101.287155, declination -16.716116, in a
+ * camera of 1280 x 960 px with focal_length_px 3200, x0_px 640, y0_px 480, without distortion,
+ * whose boresight is at right ascension 100, declination -15, with a roll of 30 (all in degrees):
+ *
+ *     q_body_from_icrs   -0.781300520   0.137764362   0.208208671   0.572048623
+ *     v_icrs             -0.187455223   0.939217529  -0.287629922
+ *     v_camera           -0.003626651   0.036746347   0.999318044
+ *     pixel                 628.38680     597.66855
+ *
+ * The pixel is at x0_px + focal_length_px v_camera[0] / v_camera[2] and
+ * y0_px + focal_length_px v_camera[1] / v_camera[2].
  *
  * SPDX-License-Identifier: MIT
  */
@@ -157,8 +184,8 @@ typedef struct {
 } starcat_frame;
 
 typedef struct {
-  starcat_real q_body_from_icrs[4];
-  starcat_real matrix[9];                /* the same attitude by rows, body = matrix * icrs */
+  starcat_real q_body_from_icrs[4];      /* x, y, z, w; see the head of this file */
+  starcat_real matrix[9];                /* the same attitude, A by rows: camera = A * icrs */
   starcat_real residual_rad;             /* root mean square of the matched centroids */
   starcat_real log_chance;               /* natural logarithm of the bound; 0 if not identified */
   uint32_t n_matched;
@@ -202,15 +229,16 @@ starcat_status starcat_identify(const starcat_image *image, const starcat_camera
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result);
 
-/* Identify the stars of a frame near a prior attitude, wrong by at most `uncertainty_rad`. If more
- * than STARCAT_MAX_STARS may be seen that is STARCAT_E_CAPACITY: state the prior more narrowly. */
+/* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
+ * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is
+ * STARCAT_E_CAPACITY: state the prior more narrowly. */
 starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,
                              starcat_workspace *work, starcat_result *result);
 
-/* Find the rotation that best turns `icrs` into `body`, pairs of unit vectors by rows. No number of
- * them may be beyond 2. */
+/* Find the attitude A that fits pairs of unit vectors (rows) best: body = A icrs. `body` has camera
+ * components. A component beyond 2 is an error. */
 starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
                                 uint32_t count, starcat_real q_body_from_icrs[4]);
 

@@ -87,7 +87,7 @@ struct frame {
   span<const real> x_px, y_px, magnitudes{}, sigma_px{};
 };
 
-// An attitude that is wrong by at most so much.
+// A prior attitude, x, y, z, w as starcat.h describes it, and its largest error as an angle.
 struct prior {
   real q_body_from_icrs[4];
   real uncertainty_rad;

@@ -3,6 +3,7 @@
  *
  * SPDX-License-Identifier: MIT
  */
+#include <math.h>
 #include <string.h>
 #include <time.h>
 
@@ -18,6 +19,9 @@ static double now_s(void) {
 #endif
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
+
+/* Magnitudes that are far from any star's are unknown ones, as in starcat/matcher/observation.py. */
+static const double LARGEST_MAG = 100.0;
 
 /* What the library found, as Python wants it. */
 static void tell(const starcat_result *result, starcat_answer *answer) {
@@ -41,7 +45,8 @@ static int identify(const starcat_search *search, uint32_t count, const double *
                     const double *magnitudes, const double *sigma_px, const double *q_prior,
                     double uncertainty_rad, starcat_answer *answer, int32_t *star,
                     starcat_memory *memory) {
-  const starcat_frame frame = {count, memory->x_px, memory->y_px, magnitudes, sigma_px};
+  const starcat_frame frame = {count, memory->x_px, memory->y_px,
+                               magnitudes == NULL ? NULL : memory->magnitudes, sigma_px};
   starcat_result *result = &memory->result;
   memset(answer, 0, sizeof *answer);
   if (count > STARCAT_MAX_CENTROIDS) {
@@ -51,6 +56,10 @@ static int identify(const starcat_search *search, uint32_t count, const double *
   for (size_t i = 0; i < count; i++) {
     memory->x_px[i] = pairs_px[2u * i];
     memory->y_px[i] = pairs_px[2u * i + 1u];
+  }
+  for (size_t i = 0; (magnitudes != NULL) && (i < count); i++) {
+    const int is_known = (magnitudes[i] >= -LARGEST_MAG) && (magnitudes[i] <= LARGEST_MAG);
+    memory->magnitudes[i] = is_known ? magnitudes[i] : (double)NAN;
   }
   const double begun_s = now_s();
   const starcat_status status =

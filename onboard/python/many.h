@@ -38,6 +38,7 @@ typedef struct {
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
   double x_px[STARCAT_MAX_CENTROIDS];
   double y_px[STARCAT_MAX_CENTROIDS];
+  double magnitudes[STARCAT_MAX_CENTROIDS];
   starcat_workspace work;
   starcat_result result;
 } starcat_memory;

@@ -51,6 +51,42 @@ static void check_known_rotations(void) {
   CHECK_NEAR(q[3], sqrt(0.5), tight);
 }
 
+/* The example at the head of starcat.h, which MANUAL.md and the pages of the ground have too. */
+static void check_worked_example(void) {
+  static const double q_body_from_icrs[4] = {-0.781300520, 0.137764362,
+                                             0.208208671, 0.572048623};
+  static const double v_icrs[3] = {-0.187455223, 0.939217529, -0.287629922};
+  static const double v_camera[3] = {-0.003626651, 0.036746347, 0.999318044};
+  static const double pixel[2] = {628.38680, 597.66855};
+  starcat_camera given = {0};
+  starcat_optics camera;
+  starcat_real q[4], m[9], back[4], v[3], seen[3], x = 0, y = 0;
+  for (int k = 0; k < 4; k++) {
+    q[k] = (starcat_real)q_body_from_icrs[k];
+  }
+  starcat_matrix(q, m);
+  starcat_quaternion(m, back);
+  for (int k = 0; k < 4; k++) {
+    CHECK_NEAR(back[k], q_body_from_icrs[k], IF_SINGLE(1e-6, 2e-9));
+  }
+  for (int k = 0; k < 3; k++) {
+    v[k] = (starcat_real)v_icrs[k];
+  }
+  for (int k = 0; k < 3; k++) {
+    seen[k] = starcat_dot(m + 3 * k, v);
+    CHECK_NEAR(seen[k], v_camera[k], IF_SINGLE(1e-6, 3e-9));
+  }
+  given.width_px = (starcat_real)1280.0;
+  given.height_px = (starcat_real)960.0;
+  given.focal_length_px = (starcat_real)3200.0;
+  given.x0_px = (starcat_real)640.0;
+  given.y0_px = (starcat_real)480.0;
+  CHECK_IS(starcat_prepare_camera(&given, &camera), STARCAT_IDENTIFIED);
+  CHECK(starcat_pixel(&camera, seen, &x, &y));
+  CHECK_NEAR(x, pixel[0], IF_SINGLE(5e-3, 2e-5));
+  CHECK_NEAR(y, pixel[1], IF_SINGLE(5e-3, 2e-5));
+}
+
 static starcat_status solve(starcat_real (*body)[3], starcat_real (*icrs)[3], uint32_t count,
                             starcat_real *q) {
   return starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, count, q);
@@ -60,6 +96,7 @@ void test_attitude(void) {
   starcat_real body[12][3], icrs[12][3], q[4];
   uint64_t state = 41;
   check_known_rotations();
+  check_worked_example();
   for (uint32_t n = 0; n < 200u; n++) {
     double m[9], truth[4], off = 0.0;
     const uint32_t count = 2u + n % 10u;

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcat.arguments import database_path
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
@@ -113,7 +112,7 @@ def open_artifact(folder: PathLike) -> Artifact:
     SchemaVersionError
         If another version of starcat wrote it.
     """
-    path = Path(folder)
+    path = database_path("folder", folder)
     return Artifact(path, read_manifest(path))
 
 
@@ -148,13 +147,13 @@ class Connection:
         return f"<Connection to {', '.join(self._targets)}>"
 
 
-def connect(*targets: PathLike, limits: Limits | None = None) -> Connection:
+def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Connection:
     """Open databases, star tables and catalogs for questions in SQL.
 
     Parameters
     ----------
-    *targets : str or path-like
-        Folders of databases, Parquet files, archive files, or names of sources.
+    *targets : Artifact, str or path-like
+        Databases or their folders, Parquet files, archive files, or names of sources.
     limits : Limits, optional
         Time, memory and disk of a query.
 
@@ -168,4 +167,9 @@ def connect(*targets: PathLike, limits: Limits | None = None) -> Connection:
     QueryError, ProductError, SourceError
         If a target cannot be read.
     """
-    return Connection([os.fspath(target) for target in targets], limits)
+    return Connection([_target(target) for target in targets], limits)
+
+
+def _target(target: Artifact | PathLike) -> str:
+    """Return a target as text; the name of a source and an address are no paths."""
+    return target if isinstance(target, str) else str(database_path("targets", target))

@@ -7,13 +7,18 @@ of the rooms that the command line calls too.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcat.arguments import database_path, path_of, paths_of, whole_number
+from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+    from starcat.api.artifact import Artifact
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
@@ -32,6 +37,13 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.releases.pulling import Pulled
     from starcat.simulation.simulate import Frame
     from starcat.specs.build_spec import BuildSpec
+
+
+OPTIONS_OF_EXPORT = (
+    "products", "max_partition_rows", "method", "endian", "max_bytes", "patch_from", "sign",
+    "replace",
+)  # fmt: skip
+"""Options of `export`; each format has some of them."""
 
 
 def build(
@@ -78,13 +90,13 @@ def build(
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
-    given = {source: _inputs(files) for source, files in (inputs or {}).items()}
+    given = {source: _inputs("inputs", files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
         given,
-        Path(output),
+        path_of("output", output),
         replace=replace,
-        workers=workers,
+        workers=whole_number("workers", workers, 1),
         progress=progress or no_progress,
     )
 
@@ -127,13 +139,17 @@ def ingest(
     """
     from starcat.catalog.source import source_given
     from starcat.catalog.source_files import locate
+    from starcat.geometry.distortion import checked_number
     from starcat.progress import no_progress
     from starcat.store.reading import read_catalog as read
 
-    name = source_given(source).name
+    name = source_given(_text_of("source", source)).name
+    for parameter, value in (("epoch_jyear", epoch_jyear), ("read_limit_mag", read_limit_mag)):
+        if value is not None:
+            checked_number(parameter, value)
     return read(
         name,
-        locate(name, {name: _inputs(inputs)} if inputs is not None else {}),
+        locate(name, {name: _inputs("inputs", inputs)} if inputs is not None else {}),
         band=band,
         epoch_jyear=epoch_jyear,
         read_limit_mag=read_limit_mag,
@@ -142,7 +158,7 @@ def ingest(
 
 
 def calibrate(
-    artifact: PathLike,
+    artifact: Artifact | PathLike,
     frames: PathLike | Sequence[PathLike],
     *,
     camera: Camera | None = None,
@@ -156,8 +172,9 @@ def calibrate(
 
     Parameters
     ----------
-    artifact : str or path-like
-        The folder ``<name>-<version>`` of a database for about this field.
+    artifact : Artifact, str or path-like
+        A database for about this field: what `open_artifact` (``starcat.open``) returns, or its
+        folder ``<name>-<version>``.
     frames : path or sequence of paths
         Images or files of centroids, of one camera.
     camera : Camera, optional
@@ -188,12 +205,13 @@ def calibrate(
         If too few frames can be identified; says which and why.
     """
     from starcat.calibration.files import calibrate_files
+    from starcat.images.batch import frame_files
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
     return calibrate_files(
         Matcher.open(artifact, method),
-        _paths(frames),
+        frame_files([str(path) for path in paths_of("frames", frames)]),
         camera=camera,
         size_px=size_px,
         fov_deg=fov_deg,
@@ -203,7 +221,7 @@ def calibrate(
 
 
 def learn(
-    artifact: PathLike,
+    artifact: Artifact | PathLike,
     results: PathLike | Sequence[PathLike],
     *,
     by_frame: bool = False,
@@ -213,8 +231,8 @@ def learn(
 
     Parameters
     ----------
-    artifact : str or path-like
-        The folder ``<name>-<version>`` of the database that they were identified with.
+    artifact : Artifact, str or path-like
+        The database that they were identified with, or its folder ``<name>-<version>``.
     results : path or sequence of paths
         What ``starcat identify --ndjson`` printed.
     by_frame : bool
@@ -237,16 +255,21 @@ def learn(
     """
     from starcat.calibration.lessons import learn_files
 
-    return learn_files(Path(artifact), _paths(results), by_frame=by_frame, min_frames=min_frames)
+    return learn_files(
+        database_path("artifact", artifact),
+        paths_of("results", results),
+        by_frame=by_frame,
+        min_frames=whole_number("min_frames", min_frames, 1),
+    )
 
 
-def verify(artifact: PathLike) -> Verification:
+def verify(artifact: Artifact | PathLike) -> Verification:
     """Check a database: digests, schemas, rows, orders, indices, references, counts.
 
     Parameters
     ----------
-    artifact : str or path-like
-        The folder ``<name>-<version>``.
+    artifact : Artifact, str or path-like
+        The database, or its folder ``<name>-<version>``.
 
     Returns
     -------
@@ -260,7 +283,7 @@ def verify(artifact: PathLike) -> Verification:
     """
     from starcat.artifact.verify import verify_artifact
 
-    return verify_artifact(Path(artifact))
+    return verify_artifact(database_path("artifact", artifact))
 
 
 def init(
@@ -296,20 +319,27 @@ def init(
     ConfigError, BuildError, OutputError
         As the command line says them.
     """
+    from starcat.geometry.camera import Camera
+    from starcat.geometry.distortion import checked_number
     from starcat.pipeline.starter import starter_spec, write_starter
     from starcat.specs.build_spec import CameraSpec
 
+    if not isinstance(camera, Camera):
+        text = f"camera is of type {type(camera).__name__}; expected a starcat.Camera"
+        raise ArgumentTypeError(text, key="camera", value=camera, fields=("camera",))
+    if faint_limit_mag is not None:
+        checked_number("faint_limit_mag", faint_limit_mag)
     wanted = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
     made = starter_spec(name, wanted, faint_limit_mag)
     if output is not None:
-        write_starter(made, Path(output), replace=replace)
+        write_starter(made, path_of("output", output), replace=replace)
     return made
 
 
 def simulate(
-    database: Database | PathLike,
+    database: Database | Artifact | PathLike,
     count: int = 1,
     *,
     noise_px: float = 0.5,
@@ -322,8 +352,8 @@ def simulate(
 
     Parameters
     ----------
-    database : Database, str or path-like
-        That of a matcher, or the folder of one.
+    database : Database, Artifact, str or path-like
+        The ``database`` of a matcher, what `open_artifact` (``starcat.open``) returns, or a folder.
     count : int, default 1
         Number of frames.
     noise_px, noise_mag : float
@@ -340,13 +370,27 @@ def simulate(
     list of Frame
         ``centroids_px`` of shape (N, 2) and ``mag`` of shape (N,) to identify; ``matrix`` (body
         from ICRS) and ``star_index`` are the truth.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a number is out of range, or the database cannot be read.
     """
-    from starcat.matcher.database import Database, open_database
+    from starcat.geometry.distortion import checked_number
+    from starcat.matcher.database import as_database
+    from starcat.matcher.settings import in_range
     from starcat.simulation.simulate import Noise, simulate_frames
 
-    sky = database if isinstance(database, Database) else open_database(Path(database))
-    noise = Noise(noise_px, drop_probability, false_stars, noise_mag=noise_mag)
-    return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, mag=sky.mag))
+    sky = as_database("database", database)
+    for name, value in (("noise_px", noise_px), ("noise_mag", noise_mag)):
+        if checked_number(name, value) < 0.0:
+            text = f"{name} is {value!r}; expected a finite number, 0 or larger"
+            raise ConfigError(text, key=name, value=value, fields=(name,))
+    in_range("drop_probability", drop_probability, 1.0, with_zero=True)
+    false = whole_number("false_stars", false_stars, 0)
+    noise = Noise(noise_px, drop_probability, false, noise_mag=noise_mag)
+    frames = whole_number("count", count, 0), noise, whole_number("seed", seed, 0)
+    return list(simulate_frames(sky.directions, sky.camera, *frames, mag=sky.mag))
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:
@@ -367,20 +411,22 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     ConfigError
         If the file is not there, or is neither.
     """
+    from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure
 
-    return list(measure(Path(file)).frames)
+    files = frame_files([str(path_of("file", file))])
+    return [frame for path in files for frame in measure(path).frames]
 
 
 def export(
-    database: PathLike, form: str, output: PathLike | None = None, **options: Any
+    database: Artifact | PathLike, form: str, output: PathLike | None = None, **options: Any
 ) -> Exported | ExportedImage | ExportedSolver:
     """Write tables of a database, its image for flight software, or another solver's database.
 
     Parameters
     ----------
-    database : str or path-like
-        The folder of a database.
+    database : Artifact, str or path-like
+        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
     form : str
         As ``--to`` of ``starcat export``: csv, fits, votable, ... onboard, c, or a solver.
     output : str or path-like, optional
@@ -405,24 +451,35 @@ def export(
     from starcat.exchange.onboard import export_image
     from starcat.exchange.solvers.write import export_solver
 
-    target = None if output is None else Path(output)
+    folder = database_path("database", database)
+    target = None if output is None else path_of("output", output)
+    run: Callable[..., Exported | ExportedImage | ExportedSolver]
     if form in ONBOARD_FORMATS:
-        return export_image(Path(database), form, target, **options)
-    if form in SOLVER_FORMATS:
-        return export_solver(Path(database), form, target, **options)
-    return export_tables(tables_of(Path(database)), form, target or Path("export"), **options)
+        run = partial(export_image, folder, form, target)
+    elif form in SOLVER_FORMATS:
+        run = partial(export_solver, folder, form, target)
+    else:
+        run = partial(export_tables, tables_of(folder), form, target or Path("export"))
+    unknown = sorted(set(options) - set(signature(run).parameters))
+    if unknown:
+        known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
+        text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
+        raise ArgumentTypeError(text, key=unknown[0], value=options[unknown[0]])
+    return run(**options)
 
 
-def diff(a: PathLike, b: PathLike) -> Difference:
-    """Return what differs between two databases, given by their folders."""
+def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
+    """Return what differs between two databases: what ``starcat.open`` returns, or folders."""
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
 
-    return diff_artifacts(open_artifact(Path(a)), open_artifact(Path(b)))
+    return diff_artifacts(
+        open_artifact(database_path("a", a)), open_artifact(database_path("b", b))
+    )
 
 
 def publish(
-    database: PathLike,
+    database: Artifact | PathLike,
     registry: PathLike,
     *,
     sign: PathLike | Sequence[PathLike] = (),
@@ -432,8 +489,8 @@ def publish(
 
     Parameters
     ----------
-    database : str or path-like
-        The folder of a database.
+    database : Artifact, str or path-like
+        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
     registry : str or path-like
         A folder; made if need be.
     sign : path or sequence of paths, default none
@@ -449,8 +506,9 @@ def publish(
     from starcat.releases.metadata import read_signing
     from starcat.releases.publishing import publish_artifact
 
-    signing = read_signing(_paths(sign), threshold)
-    return publish_artifact(Path(database), os.fspath(registry), signing=signing)
+    signing = read_signing(paths_of("sign", sign), threshold)
+    place = _text_of("registry", registry)
+    return publish_artifact(database_path("database", database), place, signing=signing)
 
 
 def pull(
@@ -482,18 +540,21 @@ def pull(
     """
     from starcat.releases.lockfile import pull_wanted
 
-    place, key = Path(output), None if trust is None else Path(trust)
-    return pull_wanted(wanted, os.fspath(registry), place, place / "starcat.lock", trust=key)
+    place = path_of("output", output)
+    key = None if trust is None else path_of("trust", trust)
+    chosen, source = _text_of("wanted", wanted), _text_of("registry", registry)
+    return pull_wanted(chosen, source, place, place / "starcat.lock", trust=key)
 
 
-def _inputs(given: PathLike | Sequence[PathLike]) -> list[Path]:
+def _inputs(name: str, given: PathLike | Sequence[PathLike]) -> list[Path]:
     """Return what a catalog is read from; a text may be the address of a HATS catalog."""
     from starcat.store.wire import input_path
 
-    one = isinstance(given, str | os.PathLike)
-    return [input_path(str(path)) for path in ([given] if one else given)]  # type: ignore[union-attr]
+    if isinstance(given, str | os.PathLike) or not isinstance(given, Iterable):
+        return [input_path(_text_of(name, given))]
+    return [input_path(_text_of(name, path)) for path in given]
 
 
-def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
-    one = isinstance(given, str | os.PathLike)
-    return [Path(given)] if one else [Path(path) for path in given]  # type: ignore[arg-type, union-attr]
+def _text_of(name: str, given: PathLike) -> str:
+    """Return a path or an address as text; an address is no path, in which // would be /."""
+    return given if isinstance(given, str) else str(path_of(name, given))

@@ -15,13 +15,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import ProductError, SchemaVersionError, no_database
+from starcat.errors import FileMissing, ProductError, SchemaVersionError, SourceError, no_database
+from starcat.storage.regular_files import read_regular_file
 from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.source_files import FileFacts
 
 MANIFEST_NAME = "manifest.json"
+MAX_MANIFEST_BYTES = 256 << 20
 MANIFEST_VERSION = "1.1.0"
 MOTIONS_VERSION = "1.2.0"
 PHOTOMETRY_VERSION = "1.3.0"
@@ -109,13 +111,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a database."""
     path = folder / MANIFEST_NAME
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        if isinstance(error, FileNotFoundError | NotADirectoryError):
-            raise no_database(folder) from error
-        raise ProductError(
-            f"{folder}: {MANIFEST_NAME} cannot be read ({error.strerror})", path=folder
-        ) from error
+        data = read_regular_file(path, MAX_MANIFEST_BYTES)
+    except FileMissing as error:
+        raise no_database(folder) from error
+    except SourceError as error:
+        raise ProductError(f"{error}; expected the manifest of a database", path=folder) from error
     return parse_manifest(data, str(path), "rebuild the database", path)
 
 

@@ -34,11 +34,14 @@ def colour_of(text: str) -> tuple[str, str] | None:
 
 
 def relations_of(bands: Sequence[str], colours: Sequence[str], target: Response) -> list[Relation]:
-    """Return the relations from bands and colours to a sensor's band, the most exact first."""
+    """Return the relations from bands and colours to a sensor's band, the most exact first.
+
+    The errors computed from the spectra decide: measured ones are known for few bands.
+    """
     known = [pair for pair in map(colour_of, colours) if pair]
     made = [relation(base, pair, target) for base in bands for pair in known]
-    least = min((one.typical_error_mag for one in made), default=0.0)
-    return sorted(made, key=lambda one: max(one.typical_error_mag, AS_EXACT * least))
+    least = min((one.typical_computed_mag for one in made), default=0.0)
+    return sorted(made, key=lambda one: max(one.typical_computed_mag, AS_EXACT * least))
 
 
 def best_relation(source: str, target: Response) -> Relation:

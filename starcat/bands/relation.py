@@ -4,6 +4,7 @@ A relation is a smooth line through the library's spectra: at each colour a stra
 to those of about that colour, common ones with more weight. Nothing is fitted to stars of the sky.
 The error of a relation has three parts: how the spectra scatter about the line, what errors of the
 library's own flux calibration do to it, and how well the zero points of published bands are known.
+Their sum is multiplied by a factor that was measured on stars (`measured.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from functools import cache
 import numpy as np
 
 from starcat.arrays import Array, Mask
+from starcat.bands.measured import error_factors
 from starcat.bands.response import Response, shipped
 from starcat.bands.spectra import library, parsed_type
 from starcat.bands.synthetic import magnitudes, row_weights
@@ -66,13 +68,20 @@ class Relation:
     scatter_mag: Array  # shape (G,): of the spectra about the offset
     calibration_mag: Array  # shape (G,): from errors of the library's fluxes
     band_mag: Array  # shape (G,): from errors of the passbands and their zero points
+    measured: Array  # shape (G,): measured errors over the sum of these three
     typical_offset_mag: float  # without a colour
     typical_scatter_mag: float
     typical_error_mag: float  # the error of the relation at common colours
+    typical_computed_mag: float  # the same without the measured factor
 
     @property
     def error_mag(self) -> Array:
         """The error of the relation at each colour of the grid, shape (G,)."""
+        return np.asarray(self.measured * self.computed_error_mag)
+
+    @property
+    def computed_error_mag(self) -> Array:
+        """The error that the library's spectra alone predict, shape (G,)."""
         squares = self.scatter_mag**2 + self.calibration_mag**2 + self.band_mag**2
         return np.asarray(np.sqrt(squares))
 
@@ -143,6 +152,7 @@ def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
     calibration = 1.0857 * np.sqrt(np.sum((excess * _zone_deviations()) ** 2, axis=2)).ravel()
     typical = float(np.sum(weight.ravel() * y))
     band = each @ _band_variance(shipped(base), target) / total
+    measured = error_factors(base, colour, target, grid)
     at_colour = scatter**2 + each @ calibration**2 / total + band
     return Relation(
         base=base,
@@ -154,10 +164,17 @@ def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
         scatter_mag=scatter,
         calibration_mag=np.sqrt(each @ calibration**2 / total),
         band_mag=np.sqrt(band),
+        measured=measured,
         typical_offset_mag=typical,
         typical_scatter_mag=float(np.sqrt(np.sum(weight.ravel() * (y - typical) ** 2))),
-        typical_error_mag=float(np.sqrt(weight.ravel() @ np.interp(x, grid, at_colour))),
+        typical_error_mag=_typical(x, grid, measured**2 * at_colour),
+        typical_computed_mag=_typical(x, grid, at_colour),
     )
+
+
+def _typical(x: Array, grid: Array, variance: Array) -> float:
+    """Return the error at the colours of the spectra, each as often as it is common."""
+    return float(np.sqrt(library().weight.ravel() @ np.interp(x, grid, variance)))
 
 
 def _band_variance(base: Response, target: Response) -> Array:

@@ -16,8 +16,9 @@ from typing import Literal, cast
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
+from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
 from starcat.resources import resource_folder
+from starcat.storage.regular_files import read_regular_file
 
 Counts = Literal["photon", "energy"]
 """What a response is relative to."""
@@ -26,6 +27,9 @@ LIMITS_NM = (300.0, 2500.0)
 """Wavelengths that the spectra cover."""
 
 MOST_ROWS = 20_000
+MOST_BYTES = 4_000_000
+"""Of the CSV file of a response."""
+
 WIDEST_GAP_NM = 100.0
 """Rows further apart than this leave a curve to guesswork."""
 
@@ -202,14 +206,15 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
 def read_response(path: Path, per: str | None) -> Response:
     """Return the response of a CSV file, which a spec says what it is relative to."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        text = read_regular_file(path, MOST_BYTES).decode("utf-8")
+    except FileMissing:
         raise FileMissing(
             f"{path}: no such response; 'starcat bands' lists those that ship with starcat"
         ) from None
-    except (OSError, ValueError) as error:
-        why = reason(error) if isinstance(error, OSError) else error
-        raise ConfigError(f"{path}: not a readable CSV file: {why}", key="response") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected a CSV file", key="response") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a readable CSV file: {error}", key="response") from error
     if per not in (None, "photon", "energy"):
         raise ConfigError(f"per {per!r}: choose photon or energy", key="per", value=per)
     return response_from_text(path.stem, text, cast("Counts | None", per))

@@ -39,7 +39,7 @@ class Library:
     vega: Array  # shape (N,): erg/s/cm2/A
 
 
-def _table(name: str) -> tuple[list[str], list[list[str]]]:
+def data_table(name: str) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of a table of the data folder."""
     content = (resource_folder("bands/data") / name).read_bytes()
     text = (gzip.decompress(content) if name.endswith(".gz") else content).decode()
@@ -50,11 +50,11 @@ def _table(name: str) -> tuple[list[str], list[list[str]]]:
 @cache
 def library() -> Library:
     """Return the library, read once."""
-    names, rows = _table("spectra.csv.gz")
+    names, rows = data_table("spectra.csv.gz")
     columns = np.array(rows, dtype=np.float64).T
-    _, reference = _table("reference.csv")
+    _, reference = data_table("reference.csv")
     _, vega, extinction = np.array(reference, dtype=np.float64).T
-    stars = np.array([float(row[1]) for row in _table("types.csv")[1]])
+    stars = np.array([float(row[1]) for row in data_table("types.csv")[1]])
     types = tuple(names[2:])
     parsed = np.array([parsed_type(name) for name in types])
     dimming = 10.0 ** (-0.4 * REDDENING_MAG[:, None] * extinction)

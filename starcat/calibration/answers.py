@@ -15,16 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
-from starcat.errors import ConfigError, FileMissing, reason
+from starcat.errors import ConfigError, FileMissing, SourceError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import Zones, zones_of
+from starcat.storage.regular_files import read_regular_file
 
 EDGE_PX = 5.0
 """A star that should be nearer to the edge of the frame is not expected to be seen."""
 
 MAKE_THEM = "make it with 'starcat identify DATABASE FRAMES --ndjson > answers.ndjson'"
+
+MAX_BYTES = 4 << 30
+"""Of a file of answers."""
 
 _ARCSEC = np.degrees(1.0) * 3600.0
 _SAME_MAG = 1e-6
@@ -100,12 +104,13 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
 def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Return each answer of a file, and where it stands."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
+        text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
+    except FileMissing:
         raise FileMissing(f"{path}: no such file; {MAKE_THEM}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        why = reason(error) if isinstance(error, OSError) else "not text"
-        raise ConfigError(f"{path}: cannot be read ({why}); {MAKE_THEM}") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; {MAKE_THEM}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: cannot be read (not text); {MAKE_THEM}") from error
     if not text.strip():
         raise ConfigError(f"{path}: the file is empty; {MAKE_THEM}")
     for where, answer in _values_of(text, path):

@@ -29,7 +29,7 @@ MOST_NAMED = 10  # frames that a message names at most
 SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibratedFrame:
     """What became of one frame.
 
@@ -116,10 +116,10 @@ def calibrate_frames(
     begun = first_answer(matcher, frames, camera, focal_px)
     if begun is None:
         asked = identify_part(matcher, frames, camera)
-        raise CalibrationError(_too_few(frames, asked, focal_px))
+        raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov", "flip"))
     identified, fit = settled(matcher, frames, *begun, progress)
     if fit is None or len(identified.found) < MIN_FRAMES:
-        raise CalibrationError(_too_few(frames, identified, focal_px))
+        raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov", "flip"))
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit)
 
@@ -182,11 +182,19 @@ def _too_few(
     ]
     more = len(failed) - MOST_NAMED
     named = ", ".join(failed[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
+    if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
+        return (
+            f"{count} of {len(frames)} frames are identified, but no camera with a field of "
+            f"{across} across the width fits them; give a range of fields that holds the true "
+            "one (fov)"
+        )
+    missing = f" Not identified: {named}." if failed else ""
     return (
-        f"{len(identified.found)} of {len(frames)} frames are identified with fields of "
-        f"{fields[0]:.4g} to {fields[1]:.4g} deg across the width; a calibration needs "
-        f"{MIN_FRAMES}. Not identified: {named}. Give more frames, a wider --fov, the other of "
-        "--flip and --no-flip, or a database that was built for about this field and these stars"
+        f"{count} of {len(frames)} frames are identified with fields of {across} across the "
+        f"width; a calibration needs {MIN_FRAMES}.{missing} Give more frames, a wider range of "
+        "fields (fov), the other value of flip, or a database that was built for about this field "
+        "and these stars"
     )
 
 

@@ -12,6 +12,7 @@ Where the camera was moved between frames, each place that it looked to is a set
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,13 +25,16 @@ from scipy.spatial.transform import Rotation
 
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration
+from starcat.calibration.files import names_of_files
 from starcat.calibration.fit import turn_derivatives
-from starcat.errors import CalibrationError, ConfigError, reason
+from starcat.errors import CalibrationError, ConfigError, FileMissing, SourceError
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.images.image_file import KNOWS_TIME, time_in_file
 from starcat.sky.observer import Observer
+from starcat.storage.regular_files import read_regular_file
 
 EARTH_RATE_ARCSEC_S = 15.041067  # turn of the Earth against the stars (IERS Conventions 2010)
+MAX_BYTES = 64 << 20  # of the table of times
 _MOVED_DEG = 0.5  # a camera that turned farther than that was moved
 _ARCSEC = np.degrees(1.0) * 3600.0
 # Two components are within this sum of squares as often as one is within three errors: 99.73 %.
@@ -80,7 +84,8 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     """Return the time of each frame by its name: of a table, or of the pictures themselves."""
     if table is not None:
         return _times_of_table(table)
-    times = {path.stem: time_in_file(path) for path in paths if path.suffix.lower() in KNOWS_TIME}
+    names = zip(names_of_files(paths), paths, strict=True)
+    times = {name: time_in_file(path) for name, path in names if path.suffix.lower() in KNOWS_TIME}
     found = {name: time for name, time in times.items() if time is not None}
     if not found:
         raise ConfigError(
@@ -92,11 +97,14 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
 
 def _times_of_table(path: Path) -> dict[str, datetime]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = reason(error) if isinstance(error, OSError) else str(error)
-        raise ConfigError(f"{path}: cannot be read ({why})") from error
+        text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
+    except FileMissing as error:
+        raise FileMissing(f"{error}; give a CSV file with frame and time") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected a CSV file with frame and time") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from error
     if not rows or not {"frame", "time"} <= rows[0].keys():
         raise ConfigError(f"{path}: expected a header with frame and time, and a line a frame")
     times = {}

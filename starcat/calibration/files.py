@@ -6,7 +6,9 @@ residuals over the detector and with the radius.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,9 +68,10 @@ def measured_frames(
     """Read the frames of files."""
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
-    for number, path in enumerate(paths, start=1):
+    for number, (path, name) in enumerate(zip(paths, names_of_files(paths), strict=True), start=1):
         measured = measure(path, IdentifyOptions(flip=flip))
-        frames += measured.frames
+        for frame in measured.frames:
+            frames.append(replace(frame, name=name) if frame.name == path.stem else frame)
         if measured.image is not None:
             height, width = measured.image.shape
             if size_px is not None and size_px != (width, height):
@@ -79,6 +82,17 @@ def measured_frames(
             size_px = width, height
         progress("measure", number, len(paths))
     return frames, size_px
+
+
+def names_of_files(paths: Sequence[Path]) -> list[str]:
+    """Return the name of each file's frame, which no other file has.
+
+    The name is the file's name without its suffix; if several files share it, the path without
+    the suffix; if they share that too, the path.
+    """
+    ways = [[path.stem, str(path.with_suffix("")), str(path)] for path in paths]
+    counts = Counter(name for names in ways for name in set(names))
+    return [next((name for name in names if counts[name] == 1), names[-1]) for names in ways]
 
 
 def starting_camera(

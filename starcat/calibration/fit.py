@@ -142,7 +142,7 @@ EXACT = 1e-8  # share of the sum of squares by which the last step of a fit lowe
 PASSES = 4  # most fits of one camera, until the noise is known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Seen:
     """The stars that were identified in some frames."""
 
@@ -166,7 +166,7 @@ class Seen:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A camera that was fitted to stars.
 

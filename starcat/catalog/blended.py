@@ -53,7 +53,8 @@ class _Sky:
 def judge_neighbours(stars: pa.Table, selection: Selection, pixel_arcsec: float) -> Judged:
     """Judge the stars of a table by their neighbours; with "merge", blend them."""
     rule = selection.neighbours
-    widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px).times(pixel_arcsec * ARCSEC)
+    widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px, rule.box_px)
+    widths = widths.times(pixel_arcsec * ARCSEC)
     mag, number = floats_of(stars, "mag"), stars["star_id"].to_numpy()
     sky = _Sky(directions_of(stars), mag, number, widths)
     with np.errstate(invalid="ignore"):

@@ -138,6 +138,8 @@ def _download(
         except SourceError as error:
             _logger.warning("%s: %s", url, error)
             failures.append((url, error))
+            if part_of(own).is_file() and not part_of(own).stat().st_size:
+                forget_part(own)  # nothing arrived that could be continued
     raise _none_delivered(expected, failures)
 
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.bands.catalogs import colour_of, relations_of
-from starcat.bands.photometry import band_error, variability_error
+from starcat.bands.measured import companion_error, variation_error
+from starcat.bands.photometry import band_error
 from starcat.bands.relation import Prediction, Relation, combined, predict_by_type
 from starcat.bands.response import Response, shipped_names
 from starcat.catalog.stars import floats_of, with_columns
@@ -49,6 +50,7 @@ class Other:
     prediction: Prediction
     code: NDArray[np.int32]  # how each magnitude was made: a place in ``told``
     told: tuple[str, ...]
+    doubt_mag: Array  # what companions and variability add to the errors
 
 
 def in_sensor_band(
@@ -62,11 +64,13 @@ def in_sensor_band(
     predicted, best = _predicted(stars, source, response)
     for other in others:
         predicted.mix(other)
-    variable = variability_error(floats_of(stars, "amplitude_mag"))
+    doubt = _doubt(stars)
+    for other in others:
+        doubt[other.rows] = np.fmax(doubt[other.rows], other.doubt_mag)
     columns = {
         "mag": predicted.mag,
         "band": response.name,
-        "mag_error": np.hypot(predicted.error, variable),
+        "mag_error": np.hypot(predicted.error, doubt),
         "mag_source": pa.array(predicted.told).take(
             pa.array(predicted.code, mask=np.isnan(predicted.mag))
         ),
@@ -86,7 +90,23 @@ def other_of(
 ) -> Other:
     """Return what the counterparts of stars, in the order of ``rows``, say of their magnitudes."""
     found, _ = _predicted(counterparts, source, response)
-    return Other(source, rows, found.prediction, found.code, tuple(found.told))
+    told = tuple(found.told)
+    return Other(source, rows, found.prediction, found.code, told, _doubt(counterparts))
+
+
+def _doubt(stars: pa.Table) -> Array:
+    """Return what companions and variability add to the errors of magnitudes, mag."""
+    is_double, is_variable = (
+        pc.fill_null(stars[f"is_flagged_{what}"], False).to_numpy()
+        for what in ("double", "variable")
+    )
+    companions = companion_error(
+        is_double,
+        pc.is_valid(stars["double_flag"]).to_numpy(),
+        floats_of(stars, "companion_separation_arcsec"),
+        floats_of(stars, "companion_delta_mag"),
+    )
+    return np.hypot(companions, variation_error(is_variable, floats_of(stars, "amplitude_mag")))
 
 
 def _predicted(

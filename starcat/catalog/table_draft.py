@@ -48,8 +48,9 @@ _RULES = (
 """Key, UCD and name (in small letters and digits) of what a column may be, in this order."""
 
 _BANDS = (
+    r"m(ag(nitude)?)?|(?P<band>[ubvri])",
     r"phot_(?P<band>g|bp|rp)_mean_mag",
-    r"(?P<band>[a-z]{1,2}[0-9]?)_?(t)?mag(nitude)?( .*)?",
+    r"(?P<band>(?!m?mag)[a-z]{1,2}[0-9]?)_?(t)?mag(nitude)?( .*)?",
     r"m(ag(nitude)?)?_?(?P<band>[a-z]{1,3})",
     r"(psf)?_?flux_?(?P<band>[a-z]{1,2})(_.*)?",
     r"(?P<band>[jhk])_m",
@@ -81,6 +82,8 @@ class Draft:
             f'name = "{"my-" if name in source_names() else ""}{name or "mine"}"',
         ]
         lines += [f"{key} = {value}" for key, value in self.top.items()]
+        if "epoch" not in self.top:
+            lines.append("# epoch = 2000.0  # a guess: the table does not say it; state it here")
         for section in ("columns", "magnitudes", "magnitude_errors", "flags"):
             keys = [key for key in self.found if key.split(".")[0] == section]
             needed = {"columns": ("columns.star_id", "columns.ra", "columns.dec")}.get(section, ())
@@ -172,7 +175,7 @@ def _magnitudes(made: Draft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
             told = next(filter(None, matches), None)
         if told:
             kind = "magnitude_errors" if is_error else "magnitudes"
-            yield f"{kind}.{_band(told['band'])}", name
+            yield f"{kind}.{_band(told['band'] or 'V')}", name
 
 
 def _band(text: str) -> str:
@@ -310,6 +313,8 @@ def _place_and_time(made: Draft) -> None:
     if "epoch" not in made.top:
         is_gaia = any(name.startswith("phot_g") for name in made.columns)
         system = "B" if top.get("frame") == '"FK4"' else "J"
-        moment = f'"{system}{year[1]}"' if year else "2016.0" if is_gaia else "2000.0"
-        top["epoch"] = f"{moment}  # a guess: the table does not say it"
+        if year:
+            top["epoch"] = f'"{system}{year[1]}"  # after the names of the columns: look at it'
+        elif is_gaia:
+            top["epoch"] = "2016.0  # after the names of the columns: look at it"
     made.top = {**top, **made.top}

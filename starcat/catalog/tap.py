@@ -179,7 +179,7 @@ class _Fetch:
                         "magnitudes; write the limit into a --query",
                         key="limit_mag",
                     )
-                self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag:g}"
+                self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag!r}"
         known = opened.columns.get(column)
         if known is None or known.is_text:
             raise ConfigError(

@@ -56,8 +56,9 @@ def print_calibration(
         _print_turned(turned)
     if not calibration.has_square_pixels:
         say(
-            "The frames do not fit a camera with square pixels (aspect and skew above): the "
-            "images may have been resized, or the lens may need another model."
+            "Aspect and skew (above) differ from 0 by more than their errors, and no camera file "
+            "has them. If the difference across the detector matters, look for resized images or "
+            "another model of the lens."
         )
 
 

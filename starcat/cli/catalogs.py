@@ -111,6 +111,7 @@ def ingest(
     """
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
+    from starcat.exchange.formats import expect_parquet
     from starcat.store.plan import StoreOptions
     from starcat.store.reading import brought
 
@@ -121,6 +122,7 @@ def ingest(
     given = inputs_by_source(inputs, None if merge else source)
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
+        expect_parquet(output)
         read = _read_to_file([source, *(merge or [])], given, output, workers=workers, **how)
         print_ingested(read, output, as_json=json)
         return
@@ -180,11 +182,13 @@ def crossmatch(
     Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
     For two catalog stores of any size use LSDB, or crossmatch() of 'starcat sql'.
 
-    Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
+    Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
+    from starcat.exchange.formats import expect_parquet
     from starcat.pipeline.counterparts import match_files
     from starcat.specs.product_sections import Crossmatch
 
+    expect_parquet(output)
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
     names = {"a": a.stem, "b": b.stem}
     facts = {**names, **found.as_dict(), "output": str(output)}

@@ -12,6 +12,7 @@ from starcat.cli.console import print_facts, print_table, print_things, say, sho
 from starcat.cli.options import Json, to_either
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
 
 if TYPE_CHECKING:
     from starcat.exchange.export import Exported
@@ -182,10 +183,6 @@ def print_exported_solver(exported: ExportedSolver) -> None:
     print_facts(f"{exported.facts['database']} for {exported.solver}", facts)
 
 
-LIBRARY_STARS = 192
-"""Stars in a field that the onboard library holds unless it is told otherwise."""
-
-
 def _say_left_out(exported: ExportedImage) -> None:
     fitted, made = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
@@ -196,10 +193,13 @@ def _say_left_out(exported: ExportedImage) -> None:
             f"{fitted.stars_before - fitted.stars:,} stars are left out, to fit: those that are "
             f"not among the {fitted.stars_per_field} brightest of a field"
         )
-    if made.most_near > LIBRARY_STARS:
+    for sentence in stars_in_flight(made.most_near):
+        say(sentence)
+    if made.most_near > FLIGHT_CENTROIDS:
         say(
-            f"a field may have {made.most_near} stars: compile the onboard library with "
-            f"-DSTARCAT_MAX_STARS={made.most_near}, as it holds {LIBRARY_STARS} otherwise"
+            f"a frame may show {made.most_near} stars: give the onboard library the brightest "
+            f"{FLIGHT_CENTROIDS} centroids, or compile it with "
+            f"-DSTARCAT_MAX_CENTROIDS={made.most_near}; it refuses a frame with more"
         )
 
 
@@ -211,6 +211,7 @@ def print_exported_image(exported: ExportedImage) -> None:
         ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
         ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
+        ("a frame in flight", f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"),
         *_patch_rows(exported),
         *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),

@@ -48,7 +48,10 @@ def new(
 
 
 @keys.command("show")
-def show_roles(registry: Registry, json: Json = False) -> None:
+def show_roles(
+    registry: Annotated[str, typer.Argument(help="Folder or http(s) address of the registry.")],
+    json: Json = False,
+) -> None:
     """Show which keys a registry is signed with, and until when, after checking it against itself.
 
     Example: starcat keys show registry

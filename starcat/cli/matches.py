@@ -16,7 +16,9 @@ from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import Frame
 
 NAMED = 3  # frames that are named where some were not identified
@@ -182,6 +184,8 @@ def as_options(text: str) -> str:
 
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
     heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+    if len(stars) > MAX_CENTROIDS:  # a terminal takes minutes to lay out tens of thousands
+        stars = [star for star in stars if star["star"]]
     lines = [
         (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
          f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
@@ -227,7 +231,20 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
     heads = (*names, "origin") if is_tracked else names
     counted = f"{len(answers)} frames" if len(answers) > 1 else "1 frame"
     print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    if database.image is not None:
+        _say_crowded(answers)
     print_sky_in_time(known)
+
+
+def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
+    """Say how many frames the library in flight refuses; of a single frame a remark says it."""
+    counts = [len(answer.frame.centroids_px) for answer in answers]
+    crowded = sum(count > FLIGHT_CENTROIDS for count in counts)
+    for sentence in centroids_in_flight(max(counts)):
+        say(
+            f"{crowded:,} of {len(counts):,} frames have more than {FLIGHT_CENTROIDS} centroids: "
+            f"{sentence}"
+        )
 
 
 def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:

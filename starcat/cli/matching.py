@@ -252,7 +252,7 @@ def _print_file_answers(
 def calibrate(
     artifact: Folder,
     files: Annotated[
-        list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+        list[str], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
     ],
     output: Annotated[Path, opt.to_file("Where the camera (TOML) goes.")],
     camera: Annotated[
@@ -291,17 +291,19 @@ def calibrate(
     from starcat.calibration.earth_rotation import times_of_frames
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
+    from starcat.images.batch import frame_files
     from starcat.images.figure_file import check_kind
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
-    when = times_of_frames(files, times) if earth_rotation or times else None
+    paths = frame_files(files)
+    when = times_of_frames(paths, times) if earth_rotation or times else None
     known = read_camera(camera) if camera else None
     size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
         found = calibrate_files(
-            Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
+            Matcher.open(artifact, method), paths, camera=known, size_px=size_px, fov_deg=fov_deg,
             flip=flip, progress=progress,
         )  # fmt: skip
     write_camera(found, output)

@@ -135,7 +135,8 @@ def print_result(found: ResultTable) -> None:
             facts = [(c.name, cell, c.unit) for c, cell in zip(found.columns, row, strict=True)]
             print_table(f"row {k + 1}", ["column", "value", "unit"], facts)
     if found.is_cut:
-        say(f"the first {len(cells)} rows; --rows N shows more, -o FILE writes all")
+        first = "the first row" if len(cells) == 1 else f"the first {len(cells)} rows"
+        say(f"{first}; --rows N shows more, -o FILE writes all")
 
 
 def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
@@ -155,7 +156,7 @@ def print_views(session: Session, *, as_json: bool) -> None:
     if as_json:
         print_json([_view_facts(target, view) for target, view in views])
         return
-    names = [f"{target.name}.{view.name}" for target, view in views]
+    names = [f"{target.short_name}.{view.name}" for target, view in views]
     rows = [
         (name, _row_count(session, name), view.schema.summary if view.schema else "")
         for name, (_, view) in zip(names, views, strict=True)
@@ -166,7 +167,7 @@ def print_views(session: Session, *, as_json: bool) -> None:
 def _view_facts(target: Target, view: View) -> dict[str, Any]:
     columns = view.schema.columns if view.schema else ()
     return {
-        "schema": target.name,
+        "schema": target.short_name,
         "view": view.name,
         "description": view.schema.description if view.schema else "",
         "columns": [

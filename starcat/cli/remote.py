@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from starcat.cli.console import say
-from starcat.errors import ConfigError, FileMissing, QueryError
+from starcat.errors import ConfigError, FileMissing, QueryError, SourceError
 
 if TYPE_CHECKING:
     from starcat.cli.queries import Question
@@ -106,12 +106,16 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
     from starcat.cli.options import identify_options
+    from starcat.specs.reading import MOST_BYTES
+    from starcat.storage.regular_files import read_regular_file
 
     camera: Path | None = given["camera"]
     try:
-        text = None if camera is None else camera.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{camera}: cannot be read ({error})", key="camera") from error
+        text = None
+        if camera is not None:
+            text = read_regular_file(camera, MOST_BYTES).decode("utf-8")
+    except (SourceError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{error}; expected a camera file", key="camera") from error
     options = identify_options(given) | {"camera": text}
     return {name: value for name, value in options.items() if value is not None}
 

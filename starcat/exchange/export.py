@@ -136,23 +136,23 @@ def export_tables(
     """
     _check_asked(file_format, folder)
     columns: list[tuple[str, ...]] = []
-    with whole_folder(folder) as partial:
+    with whole_folder(folder) as part:
         files = []
         for product in tables.chosen(products):
             table = tables.readers[product]()
             if file_format != "hats":
                 label = Label(product, tables.artifact, tables.version)
-                files.append(_write_file(table, partial, label, file_format))
+                files.append(_write_file(table, part, label, file_format))
                 columns += _described(product, table.schema)
             elif products or set(NEEDED) <= set(table.column_names):
                 name = f"{tables.name}-{product}" if product != tables.name else product
-                files.append(_write_hats(table, partial / product, name, max_partition_rows))
+                files.append(_write_hats(table, part / product, name, max_partition_rows))
         if not files:
             raise ConfigError(f"{tables.name} has no star table, which HATS is for")
         has_columns = file_format in FORMATS and not FORMATS[file_format].has_units
         if has_columns:
-            _write_columns(partial / COLUMNS_NAME, folder / COLUMNS_NAME, columns)
-        _publish(partial, folder, replace=replace)
+            _write_columns(part / COLUMNS_NAME, folder / COLUMNS_NAME, columns)
+        _publish(part, folder, replace=replace)
     return Exported(tables.name, file_format, folder, tuple(files), has_columns)
 
 
@@ -242,10 +242,10 @@ def _read_columns(path: Path) -> list[tuple[str, ...]]:
         return [tuple(row) for row in csv.reader(stream)]
 
 
-def _publish(partial: Path, folder: Path, *, replace: bool) -> None:
-    entries = sorted(path.name for path in partial.iterdir())
+def _publish(part: Path, folder: Path, *, replace: bool) -> None:
+    entries = sorted(path.name for path in part.iterdir())
     for name in entries:
-        old, new = folder / name, partial / name
+        old, new = folder / name, part / name
         if not old.exists() or _is_same(old, new) or _is_columns(old):
             continue
         if not replace:
@@ -257,9 +257,9 @@ def _publish(partial: Path, folder: Path, *, replace: bool) -> None:
             raise OutputError(f"{old} is something else; choose another --output", path=old)
     folder.mkdir(parents=True, exist_ok=True)
     for name in entries:
-        old, new = folder / name, partial / name
+        old, new = folder / name, part / name
         if old.is_dir():
-            shutil.move(old, partial / f".{name}.old")
+            shutil.move(old, part / f".{name}.old")
         new.replace(old)
 
 

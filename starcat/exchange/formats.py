@@ -90,6 +90,9 @@ FORMATS = {
 """All formats by name."""
 
 FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
+WHOLE_FORMATS = ("fits", "ecsv", "npz")
+"""Formats that are written from a table that is in memory as a whole."""
+
 PAGE_FORMATS: tuple[PageFormat, ...] = get_args(PageFormat)
 TEXT_FORMATS = tuple(name for name in FILE_FORMATS if FORMATS[name].is_text)
 EXPORT_FORMATS = (*FILE_FORMATS, "hats")
@@ -113,6 +116,17 @@ def format_of(path: str | Path) -> FileFormat:
         f"{path}: the name says no format that starcat writes; end it with one of {choices}",
         value=str(path),
     )
+
+
+def expect_parquet(path: Path) -> None:
+    """Refuse the name of a file that is written as Parquet and ends otherwise."""
+    if path.suffix.lower() not in FORMATS["parquet"].suffixes:
+        raise ConfigError(
+            f"{path}: this file is written as Parquet; end its name with .parquet, and turn it "
+            "into another format with 'starcat sql' or 'starcat export'",
+            key="output",
+            value=str(path),
+        )
 
 
 def response_format(text: str | None) -> Format:

@@ -1,8 +1,8 @@
 """Attitudes: quaternions, direction-cosine matrices and Wahba's problem.
 
-Quaternions are scalar-last ``[x, y, z, w]``, unit, ``w >= 0``, and ``q_body_from_icrs`` turns
-ICRS components into camera components (x right, y down, z along the boresight). Matrices do
-the same: ``body = matrix @ icrs``.
+Quaternions are scalar-last ``[x, y, z, w]``, unit, ``w >= 0``. ``q_body_from_icrs`` stands for the
+matrix that converts ICRS components into camera components (x right, y down, z along the
+boresight): ``body = matrix @ icrs``. `matrix_from_quaternion` has the formula.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ _SINGULAR = 1e-13
 
 
 def matrix_from_quaternion(q: Array) -> Array:
-    """Return the rotation matrix of a quaternion, which is normalised here."""
+    """Return the attitude matrix of a quaternion, which is normalised here.
+
+    With ``v = [x, y, z]`` it is ``(w^2 - v.v) I + 2 v v^T - 2 w [v x]`` (Wertz 1978; Shuster 1993;
+    Markley and Crassidis 2014), the matrix of ``scipy``'s ``Rotation.from_quat(q).inv()``.
+    """
     x, y, z, w = q.tolist()
     length = math.hypot(x, y, z, w)
     x, y, z, w = x / length, y / length, z / length, w / length

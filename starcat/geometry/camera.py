@@ -42,9 +42,9 @@ class Camera:
 
     Raises
     ------
-    ValueError
-        If a value is out of range, the scale is missing or contradictory, or the distortion
-        folds the image back on the detector.
+    ConfigError
+        A ``ValueError`` too: if a value is out of range, the scale is missing or contradictory, or
+        the distortion folds the image back on the detector.
 
     Examples
     --------
@@ -71,7 +71,11 @@ class Camera:
     ) -> None:
         w, h = _size("width_px", width_px), _size("height_px", height_px)
         if not isinstance(distortion, Distortion):
-            raise ValueError(f"distortion is {distortion!r}; expected a Distortion")
+            raise ConfigError(
+                f"distortion is {distortion!r}; expected a Distortion",
+                key="distortion",
+                value=distortion,
+            )
         # A frozen dataclass refuses assignments; its dictionary is filled directly.
         vars(self).update(
             width_px=w,
@@ -240,9 +244,11 @@ def _focal_length_px(
     scales = {"focal_length_px": focal_length_px, "fov_x_deg": fov_x_deg, "fov_y_deg": fov_y_deg}
     given = [name for name, value in scales.items() if value is not None]
     if not given or focal_length_px is not None:
-        raise ValueError(
+        raise ConfigError(
             f"found {' and '.join(given) or 'no scale'}; "
-            "expected one of focal_length_px, fov_x_deg and fov_y_deg"
+            "expected one of focal_length_px, fov_x_deg and fov_y_deg",
+            key=given[0] if given else "focal_length_px",
+            fields=tuple(scales),
         )
     if fov_x_deg is None:
         return _focal_length_from_fov("fov_y_deg", fov_y_deg, height_px)

@@ -94,6 +94,11 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
     return list(found)
 
 
+def frame_files(inputs: Sequence[str]) -> list[Path]:
+    """Return the files that folders, patterns and names stand for, or stdin (``-``) alone."""
+    return files_of(inputs) if not inputs or is_batch(inputs) else [Path(inputs[0])]
+
+
 def _is_pattern(given: str) -> bool:
     return glob.has_magic(given) and not Path(given).exists()
 
@@ -136,6 +141,8 @@ def identify_files(
         workers = min(multiprocessing.cpu_count(), _MOST_WORKERS) if len(paths) > _FEW else 0
     for path, measured in zip(paths, _measured_files(paths, chosen, own, workers), strict=True):
         if isinstance(measured, ConfigError):
+            if tracker is not None:  # time passes in a frame that cannot be read, too
+                tracker.record(None)
             yield BatchItem(path, error=measured)
             continue
         try:

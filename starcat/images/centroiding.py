@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
-from starcat.arrays import Array, Mask, Pixels
+from starcat.arrays import Array, Mask, Pixels, Rows
 from starcat.errors import ConfigError
 from starcat.images.background import (
     Levels,
@@ -166,6 +166,30 @@ def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
     drifts = is_blended & (np.hypot(*(centroids - start).T) > 0.5 * window)
     # sep counts from the centre of the first pixel.
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
+
+
+def centres_of_mass(light: Array, places: Pixels, box_px: int) -> Pixels:
+    """Return the centres of mass in boxes around the brightest pixels within 1 px of places.
+
+    ``light`` has no background, shape (rows, columns); pixels outside of it are dark.
+    """
+    half = box_px // 2
+    dark = np.pad(light, half + 1)
+    middle = np.floor(places).astype(np.int64) + half + 1  # column and row
+
+    def around(centre: Rows, reach: int) -> Array:
+        steps = np.arange(-reach, reach + 1)
+        rows = np.clip(centre[:, 1, None] + steps, 0, dark.shape[0] - 1)
+        columns = np.clip(centre[:, 0, None] + steps, 0, dark.shape[1] - 1)
+        return np.asarray(dark[rows[:, :, None], columns[:, None, :]])
+
+    brightest = around(middle, 1).reshape(len(places), -1).argmax(axis=1)
+    down, right = np.divmod(brightest, 3)
+    middle = middle + np.stack([right, down], axis=1) - 1
+    box, steps = around(middle, half), np.arange(-half, half + 1)
+    total = box.sum(axis=(1, 2))
+    moved = [np.einsum("ijk,k->i", box, steps), np.einsum("ijk,j->i", box, steps)]
+    return np.asarray(middle - half - 1 + 0.5 + np.stack(moved, axis=1) / total[:, None])
 
 
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:

@@ -39,7 +39,9 @@ class IdentifyOptions(BaseModel):
     min_share: float | None = Field(
         None, ge=0, le=1, description="Least share of the frame to be explained; a third."
     )
-    max_steps: int | None = Field(None, ge=1, description="Steps of a search.")
+    max_steps: int | None = Field(
+        None, ge=1, description="Candidates that the numpy matcher may compare."
+    )
     time_limit_s: float | None = Field(None, ge=0.001, description="Seconds that a frame may take.")
     flip: bool | None = Field(None, description="First row at the bottom; y upwards.")
     time: str | None = Field(

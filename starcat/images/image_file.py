@@ -28,9 +28,10 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, reason
+from starcat.errors import ConfigError, FileMissing, SourceError
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
+from starcat.storage.regular_files import read_regular_file
 from starcat.version import install_command
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ WRITTEN_KINDS = {
 }  # fmt: skip
 # Files that may say when they were taken.
 KNOWS_TIME = (".fits", ".fit", ".fts", ".jpg", ".jpeg", ".tif", ".tiff", ".png")
+MAX_FILE_BYTES = 4 << 30
 _LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
@@ -105,11 +107,11 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
 
 def _unpacked(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
+        data = read_regular_file(path, MAX_FILE_BYTES)
+    except FileMissing as error:
         raise FileMissing(f"{path}: no such file; give an image") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected an image") from error
     if not data.startswith(b"\x1f\x8b"):
         return data
     try:
@@ -240,6 +242,8 @@ def time_in_file(path: Path) -> datetime | None:
     data = _unpacked(path)
     try:
         found = _time_of_fits(data) if data.startswith(b"SIMPLE  =") else _time_of_exif(data)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         _log.info("%s: no time can be read (%s)", path, error)
         return None
@@ -253,8 +257,26 @@ def _time_of_fits(data: bytes) -> datetime | None:
         headers = [part.header for part in parts if "DATE-OBS" in part.header]
         if not headers:
             return None
-        start = datetime.fromisoformat(str(headers[0]["DATE-OBS"]))
-        return _middle(start, headers[0].get("EXPTIME", 0.0))
+        return _middle(_start_of_fits(headers[0]), headers[0].get("EXPTIME", 0.0))
+
+
+_CLOCK_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTC", "UTSTART")  # beside a DATE-OBS without hours
+
+
+def _start_of_fits(header: Any) -> datetime:
+    """Return the start of an exposure: DATE-OBS, with the time of day of another key if need be."""
+    date = str(header["DATE-OBS"]).strip()
+    if "T" not in date and " " not in date:
+        clocks = (str(header.get(key, "")).strip() for key in _CLOCK_KEYS)
+        clock = next((text for text in clocks if ":" in text), None)
+        if clock is None:
+            raise ConfigError(
+                f"DATE-OBS is {date!r}, a date without a time of day, and the header has none of "
+                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00; state the time of each frame (times)",
+                fields=("times",),
+            )
+        date = f"{date}T{clock}"
+    return datetime.fromisoformat(date)
 
 
 def _time_of_exif(data: bytes) -> datetime | None:

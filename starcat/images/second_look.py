@@ -32,11 +32,12 @@ def look_again(
     fov_error: float,
     *,
     is_scale_free: bool,
+    flip: bool | None = None,
 ) -> MatchResult:
     """Return a refused answer with a refusal that says what was found in a second look, if any."""
     mirrored = search(upside_down(frame, camera.height_px), fov_error)
     if mirrored.ok:
-        return _refused(refused, mirrored, "mirrored", None)
+        return _refused(refused, mirrored, "mirrored", None, flip)
     if is_scale_free:
         scaled = search(frame, WIDE_FOV_ERROR)
         if scaled.ok and scaled.camera is not None:
@@ -46,12 +47,16 @@ def look_again(
 
 
 def _refused(
-    refused: MatchResult, found: MatchResult, reason: Reason, focal_error: float | None
+    refused: MatchResult,
+    found: MatchResult,
+    reason: Reason,
+    focal_error: float | None,
+    flip: bool | None = None,
 ) -> MatchResult:
     usable = len(found.star_index) - len(found.dropped)
     chance = found.false_match_probability
     why = Refusal(
         reason, found.n_matched, chance, n_centroids=usable, camera=found.camera,
-        focal_error=focal_error,
+        focal_error=focal_error, flip=flip,
     )  # fmt: skip
     return replace(refused, refusal=why)

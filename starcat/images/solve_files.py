@@ -64,7 +64,7 @@ class LocalInputs:
     track: bool = False  # the frames are a sequence
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeasuredFile:
     """The centroids of a file, and the image (height, width) that they were found in, if any.
 
@@ -187,11 +187,15 @@ class FileAnswers:
 
     def __iter__(self) -> Iterator[FrameAnswer]:
         self._check_size()
-        search, error = self._search(), self._fov_error
+        tracker = (self.tracker or Tracker(self.matcher)) if self.local.track else None
+        search, error = self._search(tracker), self._fov_error
         for given in self.measured.frames:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
-            yield self._answer(frame, search, error)
+            answer = self._answer(frame, search, error)
+            if tracker is not None:  # however often the frame was searched for, it is one frame
+                tracker.record(answer.result, self.camera)
+            yield answer
 
     def _answer(self, frame: MeasuredFrame, search: Search, fov_error: float) -> FrameAnswer:
         observer, spots = self.local.observer, self.measured.spots
@@ -207,8 +211,9 @@ class FileAnswers:
                 return deeper
             if self._is_lost_in_space and result.status == "no_match":
                 result = look_again(
-                    search, frame, self.camera, result, fov_error, is_scale_free=self._is_scale_free
-                )
+                    search, frame, self.camera, result, fov_error,
+                    is_scale_free=self._is_scale_free, flip=self.options.flip,
+                )  # fmt: skip
         return FrameAnswer(frame, result, observer, spots)
 
     def _deeper(self, search: Search, fov_error: float) -> FrameAnswer | None:
@@ -257,9 +262,10 @@ class FileAnswers:
     def _is_scale_free(self) -> bool:
         return self.matcher.method in SCALE_FREE
 
-    def _search(self) -> Search:
+    def _search(self, tracker: Tracker | None) -> Search:
         """Return how a frame is identified with an error of the focal length."""
-        matcher, camera, observer, way = self.matcher, self.camera, self.local.observer, self._way()
+        matcher, camera, observer = self.matcher, self.camera, self.local.observer
+        way = self._way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
                 "--track does not tell planets from stars; leave out --time, or --track"
@@ -284,17 +290,17 @@ class FileAnswers:
 
         return search
 
-    def _way(self) -> Callable[..., MatchResult]:
+    def _way(self, tracker: Tracker | None) -> Callable[..., MatchResult]:
         """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
         options = self.options
-        if options.prior_q is None and not self.local.track:
+        if options.prior_q is None and tracker is None:
             return partial(self.matcher.identify, fov_deg=options.fov_deg)
         if options.fov_deg is not None:
             raise ConfigError(
                 "--fov is for frames of an unknown camera; leave out --track and --prior-q"
             )
-        if self.local.track:
-            return (self.tracker or Tracker(self.matcher)).identify
+        if tracker is not None:
+            return tracker.attempt
         prior, error_deg = list(options.prior_q or ()), options.prior_error_deg
         return partial(self.matcher.identify, prior=prior, prior_error_deg=error_deg)
 
@@ -309,7 +315,9 @@ class FileAnswers:
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
                 "attitude are those of the middle of the exposure."
             )
-        if self.is_image and not is_any_identified:
+        refusal = None if first is None else first.result.refusal
+        is_said = refusal is not None and refusal.reason == "mirrored" and refusal.flip is not None
+        if self.is_image and not is_any_identified and not is_said:
             notes.append(f"An image that was read upside down is never identified: try {flip}.")
         return notes
 

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import import_module
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
+from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
@@ -100,8 +100,8 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 
 
 @dataclass(frozen=True)
-class BatchResult(Sequence[MatchResult]):
-    """The answers of the C library to many frames of one camera."""
+class _Batch:
+    """What the library has written for many frames of one camera."""
 
     # A ``starcat_answer`` a frame, by its names in ``many.h``; attitudes are zeros unless it is
     # identified.
@@ -111,48 +111,21 @@ class BatchResult(Sequence[MatchResult]):
     frames: Frames
     search: Search
 
-    def __len__(self) -> int:
-        return len(self.records)
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the library took all frames; a camera or limit may be beyond it."""
-        return all(code in STATUSES for code in self._codes)
-
     @cached_property
-    def _codes(self) -> list[int]:
+    def codes(self) -> list[int]:
+        """Return the number that each frame came to."""
         codes: list[int] = self.records["status"].tolist()
         return codes
 
-    @property
-    def status(self) -> list[Status]:
-        """What each frame came to."""
-        return [STATUSES[code] for code in self._codes]
-
-    @property
-    def seconds(self) -> NDArray[np.float64]:
-        """Time that each frame took, without the call."""
-        return np.asarray(self.records["seconds"])
-
-    @property
-    def q_body_from_icrs(self) -> NDArray[np.float64]:
-        """Scalar-last attitudes, shape (N, 4); NaN unless identified."""
+    def result(self) -> BatchResult:
+        """Return it as Python has it; a frame that the library did not take is a no_match."""
         found = self.records
-        return np.where(found["status"][:, None] == 0, found["q_body_from_icrs"], np.nan)
+        attitudes = np.where(found["status"][:, None] == 0, found["q_body_from_icrs"], np.nan)
+        status = [STATUSES.get(code, "no_match") for code in self.codes]
+        return BatchResult(status, found["seconds"].copy(), attitudes, self._answer)
 
-    @overload
-    def __getitem__(self, frame: int) -> MatchResult: ...
-    @overload
-    def __getitem__(self, frame: slice) -> list[MatchResult]: ...
-    def __getitem__(self, frame: int | slice) -> MatchResult | list[MatchResult]:
-        if isinstance(frame, slice):
-            return [self[n] for n in range(*frame.indices(len(self)))]
-        frame = range(len(self))[frame]
-        return MatchResult.later(STATUSES[self._codes[frame]], self._facts, frame)
-
-    def __iter__(self) -> Iterator[MatchResult]:
-        for frame, code in enumerate(self._codes):
-            yield MatchResult.later(STATUSES[code], self._facts, frame)
+    def _answer(self, frame: int) -> MatchResult:
+        return MatchResult.later(STATUSES[self.codes[frame]], self._facts, frame)
 
     def _facts(self, n: int) -> dict[str, Any]:
         stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
@@ -253,11 +226,12 @@ class Search:
             return found
         return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
 
-    def many(self, frames: Frames, threads: int = 1) -> BatchResult | None:
-        """Identify the stars of frames; None where the library does not take one of them."""
+    def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
+        """Identify the stars of frames; return the answers, and the frames that have none.
+
+        The library does not take the latter: a camera or a number is beyond its limits.
+        """
         count, starts = len(frames), frames.starts
-        if np.diff(starts).max(initial=0) > self._most:
-            return None
         records, star_index = np.zeros(count, _answer_dtype()), np.full(starts[-1], -1, np.int32)
         ffi = _onboard.ffi
         arrays = (
@@ -282,8 +256,8 @@ class Search:
         else:
             with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
                 list(pool.map(run, parts))
-        answers = BatchResult(records, star_index, frames, self)
-        return answers if answers.is_whole else None
+        batch = _Batch(records, star_index, frames, self)
+        return batch.result(), [n for n, code in enumerate(batch.codes) if code not in STATUSES]
 
     def _facts_of_bytes(
         self,

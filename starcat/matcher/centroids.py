@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import reprlib
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, OutputError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
+from starcat.storage.regular_files import read_regular_file
 
 BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
 """Names of a column of brightness; the first that a file has is used."""
@@ -29,7 +31,7 @@ _LIGHT = ("flux", "sum")
 SIGMA = "sigma_px"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeasuredFrame:
     """The centroids of one frame, as a file has them."""
 
@@ -43,6 +45,9 @@ class MeasuredFrame:
     ignored: tuple[str, ...] = ()
 
 
+MAX_BYTES = 1 << 30
+"""Of a file of centroids: ten million of them as text."""
+
 HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a CSV file whose first line is numbers."""
 
@@ -52,15 +57,33 @@ def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     path = Path(path)
     try:
         # Spreadsheets put a mark of the byte order before the header.
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
+        text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
+    except FileMissing as error:
         text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
         raise FileMissing(text) from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected centroids (CSV, JSON)") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file ({error}); expected CSV or JSON") from error
+        raise _not_text(path, error) from error
     return _json_frames(text, path) if path.suffix.lower() == ".json" else [_csv_frame(text, path)]
+
+
+# How files begin that are often given in place of a list of centroids, and that no reader knows.
+_OTHER_FORMATS = {
+    b"BM": "a BMP image", b"GIF8": "a GIF image", b"RIFF": "a WebP image, video or sound",
+    b"%PDF": "a PDF document", b"PK": "a ZIP archive", b"PAR1": "a Parquet file",
+    b"\x89HDF": "an HDF5 file",
+}  # fmt: skip
+
+
+def _not_text(path: Path, error: UnicodeDecodeError) -> ConfigError:
+    begin = bytes(error.object[:4])
+    names = (name for start, name in _OTHER_FORMATS.items() if begin.startswith(start))
+    found = next(names, f"not a text file ({error})")
+    return ConfigError(
+        f"{path}: is {found}, which is not supported; convert it to an image (FITS, PNG, TIFF, "
+        "JPEG, HEIC), or to centroids (CSV, JSON)"
+    )
 
 
 def _csv_frame(text: str, path: Path) -> MeasuredFrame:
@@ -121,7 +144,7 @@ def _unknown(names: Iterable[str], places: tuple[str, ...]) -> tuple[str, ...]:
 def _json_frames(text: str, path: Path) -> list[MeasuredFrame]:
     try:
         content = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not JSON ({error})") from error
     if isinstance(content, dict) and "frames" in content:
         content = content["frames"]
@@ -148,7 +171,7 @@ def _json_frame(frame: Any, name: str, where: str) -> MeasuredFrame:
     for number, pair in enumerate(frame["centroids_px"], start=1):
         at = f"{where}: centroid {number}"
         if not isinstance(pair, list) or len(pair) != 2:
-            raise ConfigError(f"{at}: {json.dumps(pair)}; expected a pair of numbers [x, y]")
+            raise ConfigError(f"{at}: {reprlib.repr(pair)}; expected a pair of numbers [x, y]")
         measured.append([_number(pair[0], "x", at), _number(pair[1], "y", at)])
     brightness = next((key for key in BRIGHTNESS if frame.get(key) is not None), None)
     mag = None
@@ -193,8 +216,9 @@ def _number(value: Any, name: str, where: str) -> float:
         if isinstance(value, bool):
             raise ValueError
         return float(value)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{where}: {name} is {value!r}; expected a number") from None
+    except (TypeError, ValueError, OverflowError):  # an integer of 400 digits is no float
+        found = reprlib.repr(value)
+        raise ConfigError(f"{where}: {name} is {found}; expected a number") from None
 
 
 def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
@@ -207,7 +231,7 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
         return
     try:
         json.loads(first)
-    except ValueError:  # JSON over several lines
+    except (ValueError, RecursionError):  # JSON over several lines
         yield from _json_frames(first + "".join(line for _, line in rest), Path(name))
         return
     for number, line in chain([(begin, first)], filled):

@@ -8,6 +8,7 @@ its file is followed (`starcat.storage.hdf5`).
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import mmap
@@ -21,8 +22,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arguments import database_path
 from starcat.arrays import Array, Directions
-from starcat.errors import ConfigError, ProductError, SchemaVersionError, StarcatError, no_database
+from starcat.errors import (
+    ConfigError,
+    ProductError,
+    SchemaVersionError,
+    StarcatError,
+    no_database,
+    quoted,
+)
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.onboard.reading import OnboardImage, read_image
@@ -35,8 +44,15 @@ from starcat.storage.product_table import (
     SMALLEST,
     Numbers,
 )
+from starcat.storage.regular_files import check_regular_file, read_regular_file
 
 Made = TypeVar("Made")
+
+DATABASE_NAME = "database.h5"
+MANIFEST_NAME = "manifest.json"
+
+MAX_MANIFEST_BYTES = 1 << 26
+"""Largest manifest that is read."""
 
 READABLE_LAYOUT = 1
 """Major version of the HDF5 layout that this matcher reads."""
@@ -73,6 +89,7 @@ class Database:
     mag: Array
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
+    folder: Path | None = field(default=None, compare=False)  # that it was read from
     # The onboard image that all this was read from, which has no products.
     image: OnboardImage | None = None
     _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -107,9 +124,43 @@ def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     `SchemaVersionError` if its layout or a product's schema is of another major version.
     """
     path = _database_file(artifact)
+    check_regular_file(path)
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
         return _read(file, mapped, path, tuple(products))
+
+
+def check_digest(artifact: Path) -> None:
+    """Compare ``database.h5`` with its digest in the manifest; `ProductError` if it differs.
+
+    A ``database.h5`` without a manifest is not compared.
+    """
+    path = _database_file(artifact)
+    manifest = path.with_name(MANIFEST_NAME)
+    if path.name != DATABASE_NAME or not manifest.exists():
+        return
+    try:
+        content = json.loads(read_regular_file(manifest, MAX_MANIFEST_BYTES))
+        expected = content["files"][DATABASE_NAME]["sha256"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ProductError(
+            f"{manifest}: does not state the digest of {DATABASE_NAME} "
+            f"({type(error).__name__}: {error}); build the database again, or fetch it again",
+            path=manifest,
+        ) from error
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != expected:
+        raise ProductError(
+            f"{path}: its SHA-256 is {found}; the manifest states {quoted(str(expected), 64)}. The "
+            "file was changed after the build: build the database again, or fetch it again",
+            path=path,
+        )
+
+
+def as_database(name: str, value: Any) -> Database:
+    """Return the database of an argument: a `Database`, or what `database_path` takes."""
+    return value if isinstance(value, Database) else open_database(database_path(name, value))
 
 
 def open_image(path: Path) -> Database:
@@ -135,7 +186,7 @@ def products_in(artifact: Path) -> tuple[str, ...]:
 
 
 def _database_file(artifact: Path) -> Path:
-    path = artifact / "database.h5" if artifact.is_dir() else artifact
+    path = artifact / DATABASE_NAME if artifact.is_dir() else artifact
     if not path.is_file():
         raise no_database(artifact)
     return path
@@ -181,6 +232,7 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
         mag=stars["mag"],
         designation=stars["designation"],
         products={name: _product(file, mapped, name, path, count) for name in products},
+        folder=path.parent if path.name == DATABASE_NAME else path,
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,15 +18,19 @@ from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
+from starcat.arguments import HasFolder, database_path, whole_number
+from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
+from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.database import Database, open_database, open_image, products_in
+from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_arrays, as_frame, as_frames
-from starcat.matcher.prior import prior_of
+from starcat.matcher.prior import Prior, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
@@ -84,7 +88,7 @@ class Matcher(Settings, _WithDatabase):
     @classmethod
     def open(
         cls,
-        artifact: str | os.PathLike[str],
+        artifact: HasFolder | str | os.PathLike[str],
         method: str | None = "triangle",
         *,
         tolerance_px: float | None = None,
@@ -96,18 +100,26 @@ class Matcher(Settings, _WithDatabase):
         min_share: float = MIN_SHARE,
         max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
+        verify: bool = True,
     ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
         Parameters
         ----------
-        artifact : str or path-like
-            The artifact's folder, or an image as `starcat export --to onboard` writes it.
+        artifact : Artifact, str or path-like
+            What ``starcat.open`` returns, the folder of a database, or an image as
+            `starcat export --to onboard` writes it.
         method : str, default "triangle"
             A key of `METHODS`; None for the best that the products allow. An image has its own.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
         min_share, max_steps, time_limit_s
             As the fields of `Settings`.
+        verify : bool, default True
+            Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
+            any change since the build: about 2 ms for each MB of the file. The manifest itself
+            is believed, and a ``database.h5`` without one is not compared; `starcat.verify`
+            checks everything. With False only types, lengths, ranges and references are checked.
+            An onboard image has checksums of its own, which are always checked.
 
         Raises
         ------
@@ -116,7 +128,7 @@ class Matcher(Settings, _WithDatabase):
         ProductError, SchemaVersionError
             If the artifact cannot be read, or lacks a product that the method needs.
         """
-        path = Path(artifact)
+        path = database_path("artifact", artifact)
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
@@ -127,6 +139,8 @@ class Matcher(Settings, _WithDatabase):
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable))
+            if verify:  # last, as what is missing or of another version has an error of its own
+                check_digest(path)
         return cls(
             database,
             chosen,
@@ -158,13 +172,18 @@ class Matcher(Settings, _WithDatabase):
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels, in any order. Those that are not finite, outside of the frame or repeat
-            another get no star and are reported. `starcat.Matcher` also takes the path of a file.
+            Pixels, in any order. Those that are not finite (or masked), outside of the frame or
+            repeat another get no star and are reported. Of more than 512 the brightest are
+            searched, and `MatchResult.n_not_searched` counts the others. A table (astropy, pandas,
+            polars, Arrow, structured array, mapping) is read by name: ``x_px``, ``y_px``, and
+            ``mag`` and ``sigma_px`` if it has them. `starcat.Matcher` also takes the path of a
+            file.
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
             They decide what is tried first; with ``noise_mag`` also what is accepted, and their
-            zero point has to be that of the database.
+            zero point has to be that of the database. NaN, a masked entry, and any number outside
+            of -100 to 100 are unknown magnitudes.
         sigma_px : array_like of float64, shape (N,), optional
             Standard deviation of each centroid on each axis, NaN where it is not known: weights of
             the attitude of an answer, of which its covariance is made. Stars do not depend on them.
@@ -192,30 +211,48 @@ class Matcher(Settings, _WithDatabase):
         camera = self._camera(camera)
         px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
         near = prior_of(prior, prior_error_deg)
+        if len(px) <= MAX_CENTROIDS:
+            return self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
+        part = brightest_of(as_frame(px, camera, mags, sigma))
+        few = part.frame
+        searched = few.centroids_px, camera, few.magnitudes, few.sigma_px
+        return part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+
+    def _search(
+        self,
+        px: Pixels,
+        camera: Camera,
+        mags: Array | None,
+        sigma: Array | None,
+        fov_error: float,
+        near: Prior | None,
+        fov_deg: tuple[float, float] | None,
+    ) -> MatchResult:
+        """Identify the stars of a frame of at most `MAX_CENTROIDS`, in C if possible."""
         if fov_deg is not None:
             frame = as_frame(px, camera, mags, sigma)
             return self._timed(frame, partial(identify_blind, fov_deg=fov_deg))
         error = self._checked_fov_error(fov_error)
         in_c = None if error and near else self._in_c(camera, error)  # C has not both at once
-        if in_c and (found := in_c.one(px, mags, near, sigma)):
+        if in_c is not None and (found := in_c.one(px, mags, near, sigma)) is not None:
             return found
         frame = as_frame(px, camera, mags, sigma)
         return self._timed(frame, partial(solve, fov_error=error, prior=near))
 
     def identify_many(
         self,
-        frames: Sequence[ArrayLike],
+        frames: Iterable[ArrayLike],
         camera: Camera | None = None,
         *,
-        magnitudes: Sequence[ArrayLike] | None = None,
-        sigma_px: Sequence[ArrayLike] | None = None,
+        magnitudes: Iterable[ArrayLike] | None = None,
+        sigma_px: Iterable[ArrayLike] | None = None,
         threads: int | None = None,
-    ) -> Sequence[MatchResult]:
+    ) -> BatchResult:
         """Identify the stars of many frames of one camera.
 
         Parameters
         ----------
-        frames : sequence of array_like of float64, shape (n, 2)
+        frames : iterable of array_like of float64, shape (n, 2)
             Centroids of each frame, as `identify` takes them.
         camera : Camera, optional
             The database's own by default.
@@ -227,9 +264,8 @@ class Matcher(Settings, _WithDatabase):
 
         Returns
         -------
-        sequence of MatchResult
-            One a frame. `BatchResult`, with arrays over all frames, where the library took them
-            all.
+        BatchResult
+            A sequence with one `MatchResult` per frame, and arrays over all frames.
 
         Raises
         ------
@@ -238,9 +274,15 @@ class Matcher(Settings, _WithDatabase):
         """
         camera = self._camera(camera)
         given = as_frames(frames, camera, magnitudes, sigma_px)
+        searched, crowded = brightest_of_frames(given)
+        workers = (os.cpu_count() or 1) if threads is None else whole_number("threads", threads, 1)
         in_c = self._in_c(camera)
-        found = None if in_c is None else in_c.many(given, threads or os.cpu_count() or 1)
-        return [self._timed(frame, solve) for frame in given] if found is None else found
+        if in_c is None:
+            found, left = no_answers(len(given)), list(range(len(given)))
+        else:
+            found, left = in_c.many(searched, workers)
+        found = found.with_answers({n: self._timed(searched[n], solve) for n in left})
+        return found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
 
     def _camera(self, camera: Camera | None) -> Camera:
         if camera is None:

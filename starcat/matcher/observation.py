@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, overload
@@ -10,8 +11,9 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcat.arguments import columns_of, numbers_of
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
-from starcat.errors import ConfigError
+from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
 
@@ -23,10 +25,12 @@ Dropped = tuple[tuple[int, str], ...]
 ``duplicate``."""
 
 
-FLOAT64 = np.dtype(np.float64)
+LARGEST_MAG = 100.0
+"""Magnitudes from -100 to 100 are known ones; any other number is as unknown as NaN. Instrumental
+magnitudes, of light in any unit, lie far within. ``onboard/python/many.c`` has the same limit."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The centroids of a frame as they were given, and the camera that they were given with."""
 
@@ -40,7 +44,7 @@ class Frame:
         return len(self.centroids_px)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frames(Sequence[Frame]):
     """Frames of one camera, one after the other."""
 
@@ -83,7 +87,17 @@ def as_frame(
 def as_arrays(
     centroids_px: ArrayLike, magnitudes: ArrayLike | None = None, sigma_px: ArrayLike | None = None
 ) -> tuple[Pixels, Array | None, Array | None]:
-    """Return the arrays of a frame; `ConfigError` unless numbers are as expected."""
+    """Return the arrays of a frame; `ConfigError` unless numbers are as expected.
+
+    A table is read by the names of its columns. Its brightness and noise count unless they are
+    given separately.
+    """
+    if type(centroids_px) is not np.ndarray or centroids_px.dtype.names:
+        columns = columns_of(centroids_px)
+        if columns is not None:
+            centroids_px = _pixels_of(columns)
+            magnitudes = columns.get("mag") if magnitudes is None else magnitudes
+            sigma_px = columns.get("sigma_px") if sigma_px is None else sigma_px
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     if given.shape[1:] != (2,):
         if given.size:
@@ -95,6 +109,21 @@ def as_arrays(
     if sigma_px is not None:
         sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(given)))
     return given, mag, sigma
+
+
+def _pixels_of(columns: dict[str, Any]) -> Pixels:
+    lacking = {"x_px", "y_px"} - set(columns)
+    if lacking:
+        raise ConfigError(
+            f"centroids_px is a table with the columns {', '.join(columns) or '(none)'}; expected "
+            "the columns x_px and y_px, and optionally mag and sigma_px",
+            key="centroids_px",
+            fields=("centroids_px",),
+        )
+    x, y = (numbers_of(name, columns[name], "(N,)") for name in ("x_px", "y_px"))
+    if x.ndim != 1 or x.shape != y.shape:
+        raise _error_of_shape("the column x_px has", x, "(N,), as y_px", "centroids_px")
+    return np.column_stack([x, y])
 
 
 def _one_each(name: str, values: ArrayLike, count: int) -> Array:
@@ -117,27 +146,28 @@ def _checked_sigma(sigma_px: Array) -> Array:
 
 
 def as_frames(
-    centroids_px: Sequence[ArrayLike],
+    centroids_px: Iterable[ArrayLike],
     camera: Camera,
-    magnitudes: Sequence[ArrayLike] | None = None,
-    sigma_px: Sequence[ArrayLike] | None = None,
+    magnitudes: Iterable[ArrayLike] | None = None,
+    sigma_px: Iterable[ArrayLike] | None = None,
 ) -> Frames:
     """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
-    beside = {"magnitudes": magnitudes, "sigma_px": sigma_px}
+    pixels = _sequence("frames", centroids_px)
+    beside = {
+        name: None if given is None else _sequence(name, given)
+        for name, given in (("magnitudes", magnitudes), ("sigma_px", sigma_px))
+    }
     for name, given in beside.items():
-        if given is not None and len(given) != len(centroids_px):
-            text = f"{name} of {len(given)} frames; expected {len(centroids_px)}"
+        if given is not None and len(given) != len(pixels):
+            text = f"{name} of {len(given)} frames; expected {len(pixels)}"
             raise ConfigError(text, key=name, value=given)
-    joined = _joined(centroids_px, *beside.values())
+    joined = _joined(pixels, *beside.values())
     if joined is None:  # one after the other, which finds what is wrong, or not an array
-        none = [None] * len(centroids_px)
+        none = [None] * len(pixels)
         columns = [none if given is None else given for given in beside.values()]
-        each = [as_arrays(*row) for row in zip(centroids_px, *columns, strict=True)]
+        each = [as_arrays(*row) for row in zip(pixels, *columns, strict=True)]
         counts = [len(px) for px, *_ in each]
-        mag, sigma = (
-            None if given is None else _known([row[n] for row in each], counts)
-            for n, given in enumerate(beside.values(), start=1)
-        )
+        mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
         joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
     counts, all_px, all_mags, all_sigmas = joined
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
@@ -145,8 +175,23 @@ def as_frames(
     return Frames(starts, all_px, all_mags, camera, all_sigmas)
 
 
-def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array:
-    """Return arrays of frames joined; NaN for a frame that has None."""
+def _sequence(name: str, values: Any) -> Sequence[Any]:
+    """Return an argument that has to have an entry for each frame; an iterator is run through."""
+    if not isinstance(values, str | bytes) and columns_of(values) is None:
+        with suppress(TypeError):
+            return values if hasattr(values, "__len__") else list(values)
+    raise ArgumentTypeError(
+        f"{name} is of type {type(values).__name__}; expected a sequence with one array per frame",
+        key=name,
+        value=values,
+        fields=(name,),
+    )
+
+
+def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
+    """Return arrays of frames joined; NaN for a frame that has None, None if no frame has one."""
+    if all(one is None for one in arrays):
+        return None
     given = zip(arrays, counts, strict=True)
     whole = [np.full(count, np.nan) if one is None else one for one, count in given]
     return np.concatenate([np.empty(0), *whole])
@@ -155,8 +200,15 @@ def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array:
 def _joined(
     centroids_px: Sequence[ArrayLike], *beside: Sequence[ArrayLike] | None
 ) -> tuple[list[int], Pixels, Array | None, Array | None] | None:
-    """Return the sizes of frames and their arrays joined in one go; None where they do not fit."""
+    """Return the sizes of frames and their arrays joined in one go.
+
+    None if they do not fit, or are not all plain arrays of numbers: what a list, a table, a masked
+    array or a quantity holds is found by `as_arrays`.
+    """
     arrays: list[Array | None] = []
+    for given in (centroids_px, *beside):
+        if given is not None and not all(_is_plain(one) for one in given):
+            return None
     try:
         counts = [len(given) for given in centroids_px]  # type: ignore[arg-type]
         px = np.asarray(np.concatenate(centroids_px, dtype=np.float64))
@@ -175,20 +227,8 @@ def _joined(
     return counts, px, mag, None if sigma is None else _checked_sigma(sigma)
 
 
-def numbers_of(name: str, values: ArrayLike, shape: str | tuple[int, ...]) -> Array:
-    """Return an argument as an array of real numbers."""
-    if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
-        return values
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError("complex numbers")
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigError(
-            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
-            key=name,
-            value=values,
-        ) from error
+def _is_plain(values: object) -> bool:
+    return type(values) is np.ndarray and values.dtype.kind in "fiu"
 
 
 def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigError:
@@ -278,15 +318,15 @@ def observe(
 ) -> Observation:
     """Return the usable centroids of a frame, in order."""
     given, mag, camera = frame.centroids_px, frame.magnitudes, frame.camera
-    if mag is not None:  # an infinite one is as unknown as NaN
-        mag = np.where(np.isfinite(mag), mag, np.nan)
+    if mag is not None:
+        mag = known_magnitudes(mag)
     usable = camera.contains(given)
     if usable.all():
         dropped, rows = [], _own_order(given, mag, camera)
     else:
-        rows, dropped = usable.nonzero()[0], _unusable(given, usable)
+        rows, dropped = usable.nonzero()[0], unusable(given, usable)
         rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
-    rows, repeats = _without_repeats(rows, given)
+    rows, repeats = without_repeats(rows, given)
     kept = given[rows]
     return Observation(
         rows,
@@ -302,7 +342,13 @@ def observe(
     )
 
 
-def _unusable(given: Pixels, usable: Mask) -> list[tuple[int, str]]:
+def known_magnitudes(mag: Array) -> Array:
+    """Return magnitudes with NaN for those outside of -`LARGEST_MAG` to `LARGEST_MAG`."""
+    return np.where(np.abs(mag) <= LARGEST_MAG, mag, np.nan)
+
+
+def unusable(given: Pixels, usable: Mask) -> list[tuple[int, str]]:
+    """Return row and reason of the centroids that are not usable."""
     finite = np.asarray(np.isfinite(given).all(axis=1))
     return [
         (int(row), "out_of_frame" if finite[row] else "not_finite")
@@ -317,7 +363,8 @@ def _own_order(centroids_px: Pixels, mag: Array | None, camera: Camera) -> Rows:
     return np.lexsort((y, x, distance) if mag is None else (y, x, distance, mag))
 
 
-def _without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
+def without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
+    """Return rows without those at exactly the place of an earlier one, and the latter."""
     x = np.sort(given[rows, 0])
     if not (x[1:] == x[:-1]).any():
         return rows, []

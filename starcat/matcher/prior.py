@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcat.arguments import numbers_of
 from starcat.arrays import Array, Directions, Rows
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Candidates, Observation, numbers_of
+from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match

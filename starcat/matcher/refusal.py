@@ -76,6 +76,9 @@ class Refusal:
         The camera that a second look found the frame with, if there was one.
     focal_error : float or None
         By how much its focal length is longer than stated, relative.
+    flip : bool or None
+        Whether the caller stated that the frame is turned over (``flip``); None without a
+        statement. It changes the words about a mirrored frame.
     """
 
     reason: Reason
@@ -85,11 +88,14 @@ class Refusal:
     n_centroids: int = 0
     camera: Camera | None = None
     focal_error: float | None = None
+    flip: bool | None = None
 
     @property
     def message(self) -> str:
         """The reason as a sentence begins, with the numbers of the best agreement."""
         text = MESSAGES[self.reason]
+        if self.reason == "mirrored" and self.flip:
+            text = "the frame matches only mirrored: it was turned over, and was upright before"
         if self.focal_error is not None:
             longer = "longer" if self.focal_error > 0.0 else "shorter"
             text = f"the focal length is {abs(self.focal_error):.1%} {longer} than stated"
@@ -105,6 +111,8 @@ class Refusal:
     @property
     def hint(self) -> str:
         """What to try."""
+        if self.reason == "mirrored" and self.flip is not None:
+            return "leave this option out (flip)"
         if self.focal_error is None or self.camera is None:
             return HINTS[self.reason]
         return (

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix
-from starcat.errors import NotIdentifiedError
+from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
@@ -30,6 +30,7 @@ from starcat.matcher.stars import (
     matched_stars,
     reduced_chi_square,
 )
+from starcat.onboard.flight_limits import centroids_in_flight
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -41,7 +42,7 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 Origin = Literal["lost_in_space", "tracking"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchResult:
     """The answer to one frame of centroids.
 
@@ -69,6 +70,13 @@ class MatchResult:
         Why there is no answer; None for an answer.
     time_s : float
         Time that the answer took; NaN where nobody measured. It is no part of the answer.
+    n_not_searched : int
+        Usable centroids that the search left out, because the frame has more than the 512
+        brightest; their stars are not known. 0 in nearly all frames.
+
+    Notes
+    -----
+    ``bool(result)`` is `ok`: false without an identification.
     """
 
     status: Status
@@ -81,6 +89,7 @@ class MatchResult:
     focal_length_error_px: float | None = None
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
+    n_not_searched: int = 0
     # The frame as it was given, the stars, and the noise of a centroid where it was stated: what
     # the properties are made of when they are asked for.
     frame: Frame | None = field(default=None, repr=False, compare=False)
@@ -117,10 +126,18 @@ class MatchResult:
                 raise AttributeError(f"'MatchResult' object has no attribute {name!r}")
             return content[name]
 
+    def facts(self) -> dict[str, Any]:
+        """Return the fields, and what is kept for `q_body_from_icrs`; without what is derived."""
+        names = {"_quaternion", *(one.name for one in fields(self))}
+        return {name: value for name, value in self._complete().items() if name in names}
+
     @property
     def ok(self) -> bool:
         """Whether the frame was identified."""
         return self.status == "identified"
+
+    def __bool__(self) -> bool:
+        return self.ok
 
     @property
     def n_matched(self) -> int:
@@ -138,7 +155,10 @@ class MatchResult:
 
     @cached_property
     def q_body_from_icrs(self) -> NDArray[np.float64]:
-        """Scalar-last attitude, shape (4,); NaN unless identified."""
+        """Attitude [x, y, z, w], shape (4,); NaN unless identified.
+
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        """
         own = self._complete().get("_quaternion")
         return quaternion_from_matrix(self.matrix) if own is None else own
 
@@ -167,7 +187,7 @@ class MatchResult:
         if not self.ok:
             return NO_STARS
         if self.frame is None or self.database is None or self.camera is None:
-            raise ValueError("this MatchResult does not hold the frame that was asked about")
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
         return matched_stars(
             self.star_index, self.matrix, self.camera, self.frame, self.database, self.noise_px
         )
@@ -202,12 +222,21 @@ class MatchResult:
     def remarks(self) -> tuple[str, ...]:
         """What a reader of the answer should know beside it, in sentences."""
         told, count = [], len(self.star_index)
+        if self.n_not_searched:
+            searched = count - len(self.dropped) - self.n_not_searched
+            told.append(
+                f"{searched} of {count} centroids were searched: the brightest, or without "
+                f"magnitudes a selection that disregards positions. The other "
+                f"{self.n_not_searched} have no star; give fewer centroids"
+            )
         outside = sum(why == "out_of_frame" for _, why in self.dropped)
         if outside >= NOTABLE_OUTSIDE * count > 0:
             told.append(
                 f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
                 "count from the outer corner of the top-left pixel, not from the centre"
             )
+        if self.database is not None and self.database.image is not None:
+            told += centroids_in_flight(count)
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(
@@ -224,7 +253,7 @@ class MatchResult:
         """
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:
-            raise ValueError("this MatchResult does not hold the frame that was asked about")
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
         px = np.column_stack([stars.x_px, stars.y_px])
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
@@ -296,7 +325,7 @@ class MatchResult:
         """
         self._expect_ok("WCS")
         if self.camera is None:
-            raise ValueError("this MatchResult does not hold the camera that it was found with")
+            raise ConfigError("this MatchResult does not hold the camera that it was found with")
         return sky_objects.wcs(self.camera, self.matrix, bottom_up)
 
     def _expect_ok(self, what: str) -> None:

@@ -23,7 +23,7 @@ STEP_PX = 0.01
 """Step of the differences that say how a direction moves with its pixel."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchedStars:
     """The stars of a frame, one row each, in the order of the centroids.
 

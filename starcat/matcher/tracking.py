@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.errors import ConfigError
+from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -72,6 +72,14 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        matcher: object = self.matcher
+        if not isinstance(matcher, Matcher):
+            raise ArgumentTypeError(
+                f"matcher is of type {type(matcher).__name__}; expected a starcat.Matcher",
+                key="matcher",
+                value=matcher,
+                fields=("matcher",),
+            )
         turn_deg: object = self.max_turn_deg
         if (
             not isinstance(turn_deg, int | float | np.floating)
@@ -121,6 +129,30 @@ class Tracker:
         ConfigError, ValueError
             As `Matcher.identify`, or if the time is no later than the one before.
         """
+        found = self.attempt(
+            centroids_px, camera, magnitudes=magnitudes, sigma_px=sigma_px, fov_error=fov_error,
+            prior=prior, prior_error_deg=prior_error_deg, time_s=time_s,
+        )  # fmt: skip
+        self.record(found, camera, time_s=time_s)
+        return found
+
+    def attempt(
+        self,
+        centroids_px: ArrayLike,
+        camera: Camera | None = None,
+        *,
+        magnitudes: ArrayLike | None = None,
+        sigma_px: ArrayLike | None = None,
+        fov_error: float = 0.0,
+        prior: ArrayLike | None = None,
+        prior_error_deg: float | None = None,
+        time_s: float | None = None,
+    ) -> MatchResult:
+        """Identify the stars of the next frame as `identify` does, and remember nothing.
+
+        A frame can be attempted several times, with other centroids or another ``fov_error``.
+        `record` then ends the frame.
+        """
         now = self._next_time(time_s)
         camera = camera or self.matcher.database.camera
         expected, error_deg = prior, prior_error_deg
@@ -135,18 +167,31 @@ class Tracker:
             found = identify(prior=expected, prior_error_deg=error_deg)
         if found is None or found.status == "no_match":
             found = identify()
-        self._time = now
-        if found.ok:
-            x, y, z, w = found.q_body_from_icrs.tolist()
-            is_new = found.origin == "lost_in_space"
-            # Beyond the prediction the motion is another one: the next attitude is expected to be
-            # the same, within the largest turn.
-            self._motion = (
-                _Motion((x, y, z, w), now)
-                if is_new or self._motion is None
-                else self._learnt(self._motion, (x, y, z, w), now, camera)
-            )
         return found
+
+    def record(
+        self,
+        found: MatchResult | None,
+        camera: Camera | None = None,
+        *,
+        time_s: float | None = None,
+    ) -> None:
+        """End a frame with its result, or with None if the frame could not be read."""
+        now = self._next_time(time_s)
+        self._time = now
+        if found is None or not found.ok:
+            return
+        x, y, z, w = found.q_body_from_icrs.tolist()
+        is_new = found.origin == "lost_in_space"
+        # Beyond the prediction the motion is another one: the next attitude is expected to be
+        # the same, within the largest turn.
+        self._motion = (
+            _Motion((x, y, z, w), now)
+            if is_new or self._motion is None
+            else self._learnt(
+                self._motion, (x, y, z, w), now, camera or self.matcher.database.camera
+            )
+        )
 
     def follow(self, frames: Iterable[ArrayLike]) -> Iterator[MatchResult]:
         """Identify frames one after the other, each when its answer is asked for.

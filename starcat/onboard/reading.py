@@ -15,12 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ArtifactMissing, OnboardImageError, SchemaVersionError, quoted, reason
+from starcat.errors import (
+    ArtifactMissing,
+    FileMissing,
+    OnboardImageError,
+    SchemaVersionError,
+    SourceError,
+    quoted,
+)
 from starcat.geometry.camera import LARGEST_PX, Camera
 from starcat.onboard import layout
 from starcat.onboard.grid import MAX_CELLS, Grid
 from starcat.onboard.layout import ByteOrder, Sizes, check_bytes, has_check_blocks, in_order, scrub
+from starcat.storage.regular_files import check_regular_file, read_regular_file
 
+MAX_IMAGE_BYTES = 4 << 30  # the image has 32-bit offsets
 MAX_NAMED = 5
 """Damaged blocks that a message names."""
 
@@ -95,9 +104,10 @@ class OnboardImage:
 def is_image(path: Path) -> bool:
     """Return whether a file begins as an onboard image does."""
     try:
+        check_regular_file(path)
         with path.open("rb") as file:
             return file.read(len(layout.MAGIC)) == layout.MAGIC
-    except OSError:  # a folder, or no such file: others say so
+    except (OSError, SourceError):  # a folder, or no such file: others say so
         return False
 
 
@@ -141,15 +151,15 @@ def read_image(source: bytes | Path) -> OnboardImage:
 def bytes_of_file(path: Path) -> bytes:
     """Return the content of a file that should be an image."""
     try:
-        return path.read_bytes()
-    except FileNotFoundError:
+        return read_regular_file(path, MAX_IMAGE_BYTES)
+    except FileMissing:
         raise ArtifactMissing(
             f"{path}: does not exist; give an onboard image, as 'starcat export --to onboard' "
             "writes it",
             path=path,
         ) from None
-    except OSError as error:
-        raise OnboardImageError(f"{path}: cannot be read ({reason(error)})", path=path) from error
+    except SourceError as error:
+        raise OnboardImageError(f"{error}; expected an onboard image", path=path) from error
 
 
 def _damaged(where: str, problem: str, path: Path | None) -> OnboardImageError:

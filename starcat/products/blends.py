@@ -1,13 +1,14 @@
 """Blends: where a centroid settles when other stars are in its window, and with how much light.
 
 Input are neighbours around stars as offsets and ratios of light, output are the offset of the
-windowed centroid and the light of its aperture, for Gaussian spots. The widths are those of our
+centroid and the light that is measured with it, for Gaussian spots. The centroid is one in a
+Gaussian window or the centre of mass in a box of pixels. The widths of the window are those of our
 own centroiding (`starcat.images.centroiding`), which takes them from here.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -29,6 +30,9 @@ _STEP = 1e-6  # widths; a shorter step is the last one
 _MOST_STEPS = 200  # only two equal stars that are just one spot need more
 
 
+_PHASES = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
+"""Places of a peak in its pixel, in pixels from the middle, that a box is averaged over."""
+
 _PARTED = (2.75, 0.61)
 """Two equal stars are found apart from so many widths of a smoothed spot on, and from so many more
 for each magnitude that one is fainter: measured of our own detection (docs/algorithms.md)."""
@@ -41,6 +45,8 @@ class Widths:
     spot: float  # of the spot as the pixels show it
     window: float  # of the Gaussian that weights the pixels of a centroid
     smoothed: float  # of the spot in the filtered image that stars are found in
+    pixel: float = 1.0  # side of a pixel
+    box_px: int | None = None  # pixels on a side of a box; without one the window counts
 
     @property
     def both(self) -> float:
@@ -49,23 +55,32 @@ class Widths:
 
     @property
     def reach(self) -> float:
-        """How far a star may be to count."""
+        """How far a star can be to count."""
+        if self.box_px is not None:
+            return _REACH * self.spot + 0.75 * (self.box_px + 1) * self.pixel
         return _REACH * self.both
 
     def times(self, scale: float) -> Widths:
         """Return the same widths in another unit."""
-        return Widths(self.spot * scale, self.window * scale, self.smoothed * scale)
+        return replace(
+            self, spot=self.spot * scale, window=self.window * scale,
+            smoothed=self.smoothed * scale, pixel=self.pixel * scale,
+        )  # fmt: skip
 
 
-def widths_px(psf_sigma_px: float, window_px: float | None = None) -> Widths:
+def widths_px(
+    psf_sigma_px: float, window_px: float | None = None, box_px: int | None = None
+) -> Widths:
     """Return the widths for a spot that pixels sample; the window is that of our centroiding.
+
+    With ``box_px`` the centroid is the centre of mass in a box of that many pixels on a side.
 
     >>> widths_px(1.0).window == widths_px(1.0).spot, widths_px(0.5).window
     (True, 1.0)
     """
     spot = float(np.sqrt(psf_sigma_px**2 + PIXEL_VARIANCE))
     window = max(spot, NARROWEST_WINDOW_PX) if window_px is None else window_px
-    return Widths(spot, window, float(np.hypot(spot, psf_sigma_px)))
+    return Widths(spot, window, float(np.hypot(spot, psf_sigma_px)), 1.0, box_px)
 
 
 @dataclass(frozen=True)
@@ -73,8 +88,9 @@ class Blends:
     """What neighbours do to the spots of N stars."""
 
     offset: Array  # shape (N, 2): of the centroid from the star, in the unit of the widths
-    brightening: Array  # shape (N,): light in the aperture over that of the star alone
-    contamination: Array  # shape (N,): share of the light in the aperture that is of other stars
+    # shape (N,): light in the aperture, or in the box, over that of the star alone
+    brightening: Array
+    contamination: Array  # shape (N,): share of that light which is of other stars
     is_lost: (
         Mask  # shape (N,): not found beside a brighter star, so that its centroid is that one's
     )
@@ -92,6 +108,11 @@ def blends(
     brightest neighbour that it is not told apart from, by steps to the mean of the places weighted
     by ``f exp(...)``. The aperture's share of a spot is that of the noncentral chi-squared
     distribution.
+
+    With a box, `Widths.box_px`, the centroid is the centre of mass of the pixels in a box around
+    the brightest pixel, where the star's own maximum of light is or the maximum of the brightest
+    neighbour that it is not told apart from. Where that maximum is in its pixel is not known: all
+    places in the pixel are averaged.
 
     Parameters
     ----------
@@ -114,6 +135,9 @@ def blends(
     """
     start, is_lost = _starts(count, star, offset, light, is_brighter, widths)
     star, offset, light = _with_the_stars(count, star, offset, light)
+    if widths.box_px is not None:
+        return _boxed(_settled(start, star, offset, light, widths.spot), star, offset, light,
+                      widths, is_lost)  # fmt: skip
     centroid = _settled(start, star, offset, light, widths.both)
     apart = np.sum(((offset - centroid[star]) / widths.spot) ** 2, axis=1)
     alone = -np.expm1(-0.5 * APERTURE_SIGMA**2)
@@ -121,6 +145,74 @@ def blends(
     total = np.bincount(star, part, count).astype(np.float64)  # whole numbers of no stars
     own = part[:count]  # the stars themselves are first
     return Blends(centroid, total, 1.0 - own / total, is_lost)
+
+
+def _boxed(
+    peak: Array, star: Rows, offset: Array, light: Array, widths: Widths, is_lost: Mask
+) -> Blends:
+    """Return centres of mass in boxes around the pixels of peaks; the stars are the first rows."""
+    count = len(peak)
+    away = (offset - peak[star]) / widths.pixel
+    nowhere = np.zeros((1, 2))
+    (along, across), _ = _in_pixels(nowhere, nowhere, widths)
+    own_light = float(np.mean(along) * np.mean(across))
+    parts, moments = _in_pixels(away, _brightest_pixel(star, away, light, widths)[star], widths)
+    moved, total, of_star = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
+    for i, j in np.ndindex(len(_PHASES), len(_PHASES)):
+        seen = light * parts[0][i] * parts[1][j]
+        whole = np.bincount(star, seen, count)
+        for axis, weight in enumerate((moments[0][i] * parts[1][j], parts[0][i] * moments[1][j])):
+            moved[:, axis] += np.bincount(star, light * weight, count) / whole
+        total += whole
+        of_star += seen[:count]
+    cells = len(_PHASES) ** 2
+    centroid = peak + moved / cells * widths.pixel
+    return Blends(centroid, total / cells / own_light, 1.0 - of_star / total, is_lost)
+
+
+def _brightest_pixel(star: Rows, away: Array, light: Array, widths: Widths) -> Array:
+    """Return where the middle of the brightest pixel is on average, in pixels from the peak.
+
+    A peak that falls off more slowly on one side is brightest in that side's pixel more often: the
+    middles lie between two places one pixel apart where the light is the same. One step of Newton
+    from half a pixel on both sides finds them.
+    """
+    spot_px = widths.spot / widths.pixel
+    middle = np.zeros((int(star.max(initial=-1)) + 1, 2))
+    for axis in (0, 1):
+        heights, slopes = [], []
+        for side in (-0.5, 0.5):
+            beside = away.copy()
+            beside[:, axis] -= side
+            bright = light * np.exp(-0.5 * np.sum((beside / spot_px) ** 2, axis=1))
+            heights.append(np.bincount(star, bright))
+            slopes.append(np.bincount(star, bright * beside[:, axis]) / spot_px**2)
+        curved = slopes[1] - slopes[0]
+        step = np.where(curved < 0.0, (heights[0] - heights[1]) / np.minimum(curved, -1e-300), 0.0)
+        middle[:, axis] = np.clip(step, -0.5, 0.5)
+    return middle
+
+
+def _in_pixels(away: Array, middle: Array, widths: Widths) -> tuple[Array, Array]:
+    """Return parts of light in a box and their first moments about the peak, shape (2, P, M).
+
+    The axes are x and y, the place of the box, and the star, whose distance from the peak is in
+    pixels. The boxes are around pixels whose middles are spread over a pixel about ``middle``.
+    """
+    box_px = widths.box_px or 1
+    spot_px = widths.spot / widths.pixel
+    sigma = float(np.sqrt(max(spot_px**2 - PIXEL_VARIANCE, 1e-4)))
+    edges = np.arange(box_px + 1) - 0.5 * box_px
+    parts = np.zeros((2, len(_PHASES), len(away)))
+    moments = np.zeros_like(parts)
+    for phase, shift in enumerate(_PHASES):
+        centre = middle + shift
+        below = scipy.special.ndtr((edges[:, None, None] + centre - away) / sigma)
+        part = np.diff(below, axis=0)
+        whole = part.sum(axis=0)
+        parts[:, phase] = whole.T
+        moments[:, phase] = (np.tensordot(edges[:-1] + 0.5, part, axes=1) + centre * whole).T
+    return parts, moments
 
 
 def _starts(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import os
-import pickle
 import shutil
 import signal
 import subprocess
@@ -17,20 +16,34 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.progress import Progress, no_progress
+from starcat.query.frames import (
+    READ_BYTES,
+    MalformedMessage,
+    Receiver,
+    decoded_rows,
+    encoded,
+    from_json,
+    json_content,
+    send_message,
+    write_message,
+)
 from starcat.query.messages import (
+    ARROW,
     BROKEN,
     DONE,
     ENDINGS,
+    HARMLESS,
     INTERRUPT,
+    LARGE,
     PART,
     PROGRESS,
-    REFUSED,
+    REQUEST,
     SHORT,
     Opening,
 )
@@ -38,7 +51,10 @@ from starcat.query.messages import (
 CLOCK_TIMES = 10  # how much longer something short may take than its time of a processor
 HEARING_S = 0.5  # how long a process may take to hear that it is interrupted
 TICKS = os.sysconf("SC_CLK_TCK") if os.name == "posix" else 1
+MESSAGE_BYTES = 1 << 30  # size of a message of the process at most
 PATIENT = 19  # the priority of a process that leaves the processors to others
+GONE_S = 1.0  # after this time nothing of a process that ended is read any more
+MAX_SAID_BYTES = 1 << 16  # what is read of the last words of a process
 OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
 
@@ -124,11 +140,18 @@ class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
     """A process that ended by itself while it was asked, with what is known of why."""
 
 
+class AnswerTooLarge(QueryLimitError):  # noqa: N818 - the name reads as the fact
+    """The answer of a query is larger than it may be."""
+
+
 class Engine:
     """A process with a DuckDB, started again when it was ended."""
 
-    def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
-        self._opening = Opening(scratch / "spill", memory_gb, disk_gb, os.getpid())
+    def __init__(
+        self, scratch: Path, memory_gb: float, disk_gb: float, message_bytes: int = MESSAGE_BYTES
+    ) -> None:
+        spill = scratch / "spill"
+        self._opening = Opening(spill, memory_gb, disk_gb, os.getpid(), message_bytes)
         self._opened: tuple[Any, ...] | None = None
         self._asking = threading.RLock()
         self._ending = threading.Lock()
@@ -142,8 +165,9 @@ class Engine:
 
         The SQL names them from a folder on; ``macros`` are those that stand after FROM.
         """
-        self.ask("open", sql, folder, files, macros)
-        self._opened = sql, folder, files, macros
+        opened = sql, folder, files, sorted(macros)
+        self.ask("open", *opened)
+        self._opened = opened
 
     def ask(
         self,
@@ -151,15 +175,21 @@ class Engine:
         *arguments: Any,
         allowance: Allowance | None = None,
         progress: Progress = no_progress,
+        max_bytes: int | None = None,
     ) -> list[Any]:
-        """Ask the process for something, and wait for the answer."""
+        """Ask the process for something, and wait for the answer.
+
+        The last item is the answer: plain values as JSON has them, or the bytes of an Arrow stream.
+        Those before it are rows, in parts. `AnswerTooLarge` if there are more than ``max_bytes``.
+        """
         with self._asking:
             if not self.is_running:
                 self.close()
                 self._process = self._started()
                 if self._opened is not None:
                     self._answered("open", self._opened, Allowance(OPENING_S))
-            return self._answered(name, arguments, allowance or Allowance(OPENING_S), progress)
+            given = allowance or Allowance(OPENING_S)
+            return self._answered(name, arguments, given, progress, max_bytes)
 
     @property
     def is_running(self) -> bool:
@@ -184,9 +214,11 @@ class Engine:
             process = _waiting.pop(0)
         except IndexError:
             process = _spawned()
-        self.is_patient = False
+        self.is_patient, self._gone_s = False, 0.0
+        opening = json_content({**asdict(self._opening), "spill": str(self._opening.spill)})
         with suppress(OSError):
-            _write(process, self._opening)
+            if process.stdin is not None:
+                write_message(process.stdin, REQUEST, opening)
         return process
 
     def _answered(
@@ -195,30 +227,40 @@ class Engine:
         arguments: tuple[Any, ...],
         allowance: Allowance,
         progress: Progress = no_progress,
+        max_bytes: int | None = None,
     ) -> list[Any]:
         try:
-            content = pickle.dumps(arguments)
+            given = [encoded(argument) for argument in arguments]
         except Exception as error:  # whatever somebody's own class does
             raise QueryError(f"a value of the query cannot be passed on: {error}") from error
         parts: list[Any] = []
-        kind = ""
+        kind, is_over = "", False
         try:
             with self._within(allowance):
-                _write(self._process, (name, allowance.left_s, content))
-                while kind not in ENDINGS:
-                    kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
+                if self._process.stdin is None:
+                    raise EOFError
+                request = json_content([name, allowance.left_s, given])
+                send_message(self._process.stdin, REQUEST, request, self._is_gone)
+                for kind, content in self._replies(max_bytes):
                     if kind == PROGRESS:
-                        progress("query", found, 100)
-                    elif kind in (PART, DONE):
-                        parts.append(found)
-        except (EOFError, OSError, pickle.UnpicklingError) as error:
+                        progress("query", _percent(content), 100)
+                    elif kind == PART:
+                        parts.append(decoded_rows(content))
+                    elif kind == ARROW:
+                        parts.append(content)
+                    else:
+                        parts.append(from_json(content))
+            is_over = kind in HARMLESS
+        except (EOFError, OSError) as error:
             raise self._ended(allowance) from error
         finally:
             # A question that was dropped halfway, as by Ctrl-C, would be answered to the next.
-            if kind not in (DONE, REFUSED):
+            if not is_over:
                 self.close()
-        if kind == DONE:
+        if kind in (DONE, ARROW):
             return parts
+        if kind == LARGE:
+            raise _too_large(max_bytes or self._opening.message_bytes)
         if kind == SHORT:
             raise QueryLimitError(
                 f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
@@ -227,8 +269,31 @@ class Engine:
             )
         if self._is_late:
             raise _late(allowance)
-        told = "DuckDB failed: " if kind == BROKEN else ""
-        raise QueryError(f"{told}{found}")
+        raise _refusal(parts[-1], kind)
+
+    def _replies(self, max_bytes: int | None) -> Iterator[tuple[str, bytes | bytearray]]:
+        """Give what the process sends until it is at an end."""
+        stream, kind, size = self._process.stdout, "", 0
+        if stream is None:
+            raise EOFError
+        receiver = Receiver(stream, self._opening.message_bytes, self._is_gone)
+        while kind not in ENDINGS:
+            if kind and self._is_gone():
+                raise EOFError
+            kind, content = receiver.receive()
+            if kind not in ENDINGS | {PART, PROGRESS}:
+                raise MalformedMessage("the process of the query sent a message of no known kind")
+            size += len(content) if kind == PART else 0
+            if max_bytes is not None and size > max_bytes:
+                raise _too_large(max_bytes)
+            yield kind, content
+
+    def _is_gone(self) -> bool:
+        """Return whether the process ended some time ago, so that nothing of it is on its way."""
+        if self.is_running:
+            return False
+        self._gone_s = self._gone_s or time.monotonic()
+        return time.monotonic() - self._gone_s > GONE_S
 
     @contextmanager
     def _within(self, allowance: Allowance) -> Iterator[None]:
@@ -290,10 +355,15 @@ class Engine:
     def _used_s(self) -> float:
         """Return the time of processors that it has taken, where that can be read, or any time."""
         try:
-            text = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii")
+            # Twice for each question, so without what `Path` and decoding take.
+            descriptor = os.open(f"/proc/{self._process.pid}/stat", os.O_RDONLY)
         except OSError:
             return time.monotonic()
-        user, system = text.rpartition(")")[2].split()[11:13]
+        try:
+            text = os.read(descriptor, READ_BYTES)
+        finally:
+            os.close(descriptor)
+        user, system = text.rpartition(b")")[2].split()[11:13]
         return (int(user) + int(system)) / TICKS
 
     def _ended(self, allowance: Allowance) -> QueryError:
@@ -303,7 +373,7 @@ class Engine:
             self._process.wait(1.0)
         self._process.kill()
         pipe = self._process.stderr
-        lines = pipe.read().decode(errors="replace").strip().splitlines() if pipe else []
+        lines = _last_lines(pipe) if pipe else []
         self.close()
         code = self._process.returncode
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -327,7 +397,35 @@ def _late(allowance: Allowance) -> QueryLimitError:
     )
 
 
-def _write(process: subprocess.Popen[bytes], content: Any) -> None:
-    if process.stdin is not None:
-        pickle.dump(content, process.stdin, pickle.HIGHEST_PROTOCOL)
-        process.stdin.flush()
+def _too_large(max_bytes: int) -> AnswerTooLarge:
+    return AnswerTooLarge(
+        f"the answer has more than {max_bytes / 1e6:,.0f} MB; ask for fewer rows or columns"
+    )
+
+
+def _refusal(found: Any, kind: str) -> QueryError:
+    """Return the error that a process has sent; MalformedMessage if it is none."""
+    try:
+        words, fields = found
+        failed = "DuckDB failed: " if kind == BROKEN else ""
+        return QueryError(f"{failed}{words}", fields=tuple(map(str, fields)))
+    except (TypeError, ValueError):
+        return MalformedMessage("the process of the query sent no error that can be read")
+
+
+def _percent(content: bytes | bytearray) -> int:
+    found = from_json(content)
+    if not isinstance(found, int):
+        raise MalformedMessage("the process of the query sent a progress that is not a number")
+    return min(max(found, 0), 100)
+
+
+def _last_lines(pipe: IO[bytes]) -> list[str]:
+    """Return what is in the pipe of a process that ended, which a child of it may keep open."""
+    if os.name == "posix":
+        os.set_blocking(pipe.fileno(), False)
+    try:
+        found = os.read(pipe.fileno(), MAX_SAID_BYTES)
+    except OSError:
+        return []
+    return found.decode(errors="replace").strip().splitlines()

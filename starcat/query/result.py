@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.errors import ConfigError
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine
+from starcat.query.frames import MalformedMessage
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped, unused-ignore]
@@ -220,7 +221,9 @@ class RunningQuery:
         known: Mapping[str, Facts],
         allowance: Allowance,
         progress: Progress = no_progress,
+        max_bytes: int | None = None,
     ) -> None:
+        self._max_bytes = max_bytes  # of the rows that `rows` returns
         self._ask = partial(engine.ask, allowance=allowance, progress=progress)
         self._text = text
         self._values = values
@@ -230,7 +233,7 @@ class RunningQuery:
     def columns(self) -> list[tuple[str, str]]:
         """Names and DuckDB's types of the columns, in order."""
         [found] = self._ask("columns", self._text, self._values)
-        return list(found)
+        return _names_and_types(found)
 
     def table(self, count: int) -> ResultTable:
         """Return the first rows with what is known of their columns."""
@@ -241,8 +244,11 @@ class RunningQuery:
     def rows(self, count: int) -> list[tuple[Any, ...]]:
         """Return the first rows."""
         # The columns are known now, without looking at the files once more.
-        *parts, (self.columns, last) = self._ask("rows", self._text, self._values, count)
-        return list(chain(*parts, last))
+        *parts, found = self._ask(
+            "rows", self._text, self._values, count, self._max_bytes, max_bytes=self._max_bytes
+        )
+        self.columns = _names_and_types(found)
+        return list(chain(*parts))
 
     def batches(self) -> pa.RecordBatchReader:
         """Return all rows as Arrow batches, with units and meanings in the field metadata.
@@ -251,19 +257,31 @@ class RunningQuery:
         """
         import pyarrow as pa
 
-        [begun] = self._ask("batches", self._text, self._values)
-        schema = pa.schema(
-            field.with_metadata(column_facts(field.name, self._known))
-            for field in pa.ipc.open_stream(begun).schema
-        )
-        return pa.RecordBatchReader.from_batches(schema, self._batches(schema))
+        from starcat.query.arrow_stream import schema_of
 
-    def _batches(self, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+        [begun] = self._ask("batches", self._text, self._values)
+        sent = schema_of(begun)
+        schema = pa.schema(
+            field.with_metadata(column_facts(field.name, self._known)) for field in sent
+        )
+        return pa.RecordBatchReader.from_batches(schema, self._batches(sent, schema))
+
+    def _batches(self, sent: pa.Schema, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
         import pyarrow as pa
 
+        from starcat.query.arrow_stream import batches_of
+
         while (found := self._ask("next_batch")[0]) is not None:
-            for batch in pa.ipc.open_stream(found):
+            for batch in batches_of(found, sent):
                 yield pa.record_batch(batch.columns, schema=schema)
+
+
+def _names_and_types(found: Any) -> list[tuple[str, str]]:
+    """Return the columns that a process sent; MalformedMessage if there are none."""
+    try:
+        return [(str(name), str(kind)) for name, kind in found]
+    except (TypeError, ValueError) as error:
+        raise MalformedMessage("the process of the query sent no columns") from error
 
 
 def cell_text(value: Any) -> str:

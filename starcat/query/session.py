@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.engine import Allowance, Engine, WorkerEnded
+from starcat.query.engine import MESSAGE_BYTES, Allowance, Engine, WorkerEnded
 from starcat.query.gallery import macros
 from starcat.query.messages import Statement
 from starcat.query.names import quoted, short_names
@@ -31,7 +33,11 @@ from starcat.query.spatial_macros import (
     reading,
 )
 from starcat.query.targets import Target, View, open_targets
+from starcat.storage.locks import locked
 
+SCRATCH_PREFIX = "starcat-sql-"
+ABANDONED_S = 60.0
+"""Age from which a folder that no process has locked was left by one that was killed."""
 PREAMBLE_GB = 1.0  # memory for looking into the footers of Parquet files
 MAX_COLUMNS = 100_000  # how many columns a DESCRIBE tells of at most
 MAX_CHECKED = 200
@@ -45,6 +51,8 @@ class Limits:
     time_s: float = 60.0  # seconds until it is stopped
     memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
     disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
+    message_bytes: int = MESSAGE_BYTES  # size of a row, and of what is sent at once
+    rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
 
 
 @dataclass(frozen=True)
@@ -71,14 +79,15 @@ class Session:
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""
         [found] = self._engine.ask("statements", text)
-        return list(found)
+        return list(map(str, found))
 
     def check(self, text: str, allowance: Allowance | None = None) -> Statement:
         """Check that a text is a query that may run."""
         known = self._checked.pop(text, None)
         if known is None:
             given = allowance or self._allowance()
-            [known] = self._engine.ask("check", text, allowance=given)
+            [found] = self._engine.ask("check", text, allowance=given)
+            known = Statement.from_json(found)
         self._checked[text] = known
         if len(self._checked) > MAX_CHECKED:
             del self._checked[next(iter(self._checked))]
@@ -100,7 +109,10 @@ class Session:
         if statement.is_description:
             runs = self._described(statement, used, allowance)
             used = None
-        yield RunningQuery(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
+        known = facts_by_name(self.views)
+        yield RunningQuery(
+            self._engine, runs, used, known, allowance, progress, self.limits.rows_bytes
+        )
 
     def _allowance(self) -> Allowance:
         return self.allowance or Allowance(self.limits.time_s)
@@ -127,30 +139,66 @@ class Session:
 
 @contextmanager
 def open_session(
-    given: Sequence[str], limits: Limits | None = None, progress: Progress = no_progress
+    given: Sequence[str],
+    limits: Limits | None = None,
+    progress: Progress = no_progress,
+    within: Path | None = None,
 ) -> Iterator[Session]:
-    """Open a session about some targets."""
+    """Open a session about some targets.
+
+    What does not fit into the memory is written to a folder ``within`` another one, or within the
+    system's folder for temporary files.
+    """
     allowed = limits or Limits()
-    scratch = Path(tempfile.mkdtemp(prefix="starcat-sql-"))
-    try:
-        engine = Engine(scratch, allowed.memory_gb, allowed.disk_gb)
+    with _scratch_folder(within) as scratch:
+        engine = Engine(scratch, allowed.memory_gb, allowed.disk_gb, allowed.message_bytes)
         try:
             targets = open_targets(given, scratch, engine, progress)
             _make_views(engine, targets)
             yield Session(targets, allowed, engine)
         finally:
             engine.close()
+
+
+@contextmanager
+def _scratch_folder(within: Path | None = None) -> Iterator[Path]:
+    """Give a new folder, which is removed afterwards, or by the next session if this is killed.
+
+    The folder is locked meanwhile. The lock ends with this process, however it ends.
+    """
+    parent = Path(tempfile.gettempdir() if within is None else within)
+    _remove_abandoned(parent)
+    folder = Path(tempfile.mkdtemp(prefix=SCRATCH_PREFIX, dir=parent))
+    try:
+        with locked(folder, wait=False):
+            yield folder
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_abandoned(parent: Path) -> None:
+    """Remove the folders of this user's processes that were killed."""
+    if os.name != "posix":  # Windows has no such locks
+        return
+    for folder in parent.glob(f"{SCRATCH_PREFIX}*"):
+        with suppress(OSError):  # another process removes it, or it is in use
+            facts = folder.lstat()
+            is_own = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid()
+            # A new folder is not locked yet.
+            if not is_own or time.time() - facts.st_mtime < ABANDONED_S:
+                continue
+            with locked(folder, wait=False) as is_locked:
+                if is_locked:
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
     """Return targets by their schemas.
 
-    A target alone is ``main`` and its own name; several are ``a``, ``b`` ... and their names.
+    A target alone is ``main`` and its own names; several are ``a``, ``b`` ... and their names.
     """
     short = ["main"] if len(targets) == 1 else short_names(len(targets))
-    named = {target.name: target for target in targets}
+    named = {name: target for target in targets for name in (target.name, target.alias) if name}
     return {**dict(zip(short, targets, strict=True)), **named}
 
 
@@ -194,14 +242,14 @@ def _named_views(targets: Sequence[Target]) -> dict[str, tuple[str, View]]:
 
 def preamble_of(given: Sequence[str]) -> str:
     """Return the preamble of databases and Parquet files by name, for any DuckDB."""
-    with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
-        engine = Engine(Path(folder), PREAMBLE_GB, PREAMBLE_GB)
+    with _scratch_folder() as folder:
+        engine = Engine(folder, PREAMBLE_GB, PREAMBLE_GB)
         try:
-            targets = open_targets(given, Path(folder), engine)
+            targets = open_targets(given, folder, engine)
         finally:
             engine.close()
         for target in targets:
-            if any(Path(folder) in p.parents for view in target.views for p in view.paths):
+            if any(folder in p.parents for view in target.views for p in view.paths):
                 raise QueryError(
                     f"{target.name}: an archive file has no tables that another DuckDB could "
                     "read; write them with 'starcat ingest' and give the Parquet file"

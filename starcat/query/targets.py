@@ -13,6 +13,7 @@ from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
 from starcat.query.names import distinct, identifier, short_names
+from starcat.specs.product_sections import version_numbers
 from starcat.storage.schema import ProductSchema, SchemaColumn, product_schema
 
 if TYPE_CHECKING:
@@ -50,9 +51,18 @@ class View:
 class Target:
     """Something that a query is about."""
 
-    name: str  # the schema of its views: the name of the database, the source or the file
+    # The schema of its views: ``name_1_2_3`` for a database, else the name of the source or the
+    # file. It stays the same, whatever other targets there are.
+    name: str
     version: str  # the version of a database; empty for anything else
     views: tuple[View, ...]
+    # A second schema: the name of the database alone, for the newest version that there is.
+    alias: str = ""
+
+    @property
+    def short_name(self) -> str:
+        """The shortest schema of its own."""
+        return self.alias or self.name
 
 
 def open_targets(
@@ -62,13 +72,26 @@ def open_targets(
     targets = [
         _open_target(text, scratch / str(k), engine, progress) for k, text in enumerate(given)
     ]
-    names = [target.name for target in targets]
-    if len(set(names)) < len(names):
-        names = [identifier(f"{target.name}_{target.version}".strip("_")) for target in targets]
+    full = [
+        identifier(f"{target.name}_{target.version}") if target.version else target.name
+        for target in targets
+    ]
     taken = short_names(len(targets)) if len(targets) > 1 else []
+    named = [
+        replace(target, name=name, alias=target.name if target.version else "")
+        for target, name in zip(targets, distinct(full, taken), strict=True)
+    ]
+    newest: dict[str, Target] = {}
+    for target in (one for one in named if one.alias):
+        known = newest.get(target.alias)
+        if known is None or version_numbers(known.version) < version_numbers(target.version):
+            newest[target.alias] = target
+    reserved = {*taken, *(target.name for target in named)}
     return tuple(
-        replace(target, name=name)
-        for target, name in zip(targets, distinct(names, taken), strict=True)
+        target
+        if newest.get(target.alias) is target and target.alias not in reserved
+        else replace(target, alias="")
+        for target in named
     )
 
 
@@ -200,7 +223,8 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [(found, columns)] = engine.ask("footer", str(path.resolve()))
+        [(schema_name, names)] = engine.ask("footer", str(path.resolve()))
+        found, columns = str(schema_name), tuple(map(str, names))
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(

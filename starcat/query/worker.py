@@ -9,30 +9,40 @@ locked before the first query. What it may take of the machine is limited by the
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import duckdb
 
 from starcat.errors import QueryError
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
+from starcat.query.frames import (
+    decoded,
+    encoded_rows,
+    from_json,
+    json_content,
+    read_message,
+    write_message,
+)
 from starcat.query.messages import (
+    ARROW,
     BROKEN,
     DONE,
     INTERRUPT,
+    LARGE,
     PART,
     PROGRESS,
     REFUSED,
     SHORT,
     Opening,
-    Statement,
 )
 from starcat.query.names import quoted_name
 from starcat.query.statement import check_statement
@@ -40,7 +50,6 @@ from starcat.query.statement import check_statement
 if TYPE_CHECKING:
     import pyarrow as pa
 
-BATCH_ROWS = 1 << 16
 ROWS_AT_ONCE = 1 << 12
 
 WATCH_S = 0.2  # how often a running query is looked at
@@ -63,12 +72,17 @@ def serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     requests = sys.stdin.buffer
     try:
-        worker = Worker(pickle.load(requests), replies)
+        opening = from_json(read_message(requests)[1])
+        worker = Worker(Opening(**{**opening, "spill": Path(opening["spill"])}), replies)
         while True:
-            worker.answer(*pickle.load(requests))
+            worker.answer(*from_json(read_message(requests)[1]))
     except (EOFError, BrokenPipeError):
         # The other end is closed. Threads of a query that still runs are not waited for.
         os._exit(0)
+
+
+class _TooLarge(Exception):  # noqa: N818 - the name reads as the fact
+    """An answer is larger than the session takes."""
 
 
 class Worker:
@@ -80,6 +94,7 @@ class Worker:
         self._sending = threading.Lock()
         self._is_running = False
         self._reader: pa.RecordBatchReader | None = None
+        self._streams: Iterator[bytes] = iter(())  # what is left of a batch of the reader
         self._macros: frozenset[str] = frozenset()
         # Before DuckDB starts its threads.
         forbid_writing(except_in=opening.spill)
@@ -89,20 +104,26 @@ class Worker:
         if os.name == "posix":
             threading.Thread(target=self._hear, daemon=True).start()
 
-    def answer(self, name: str, time_s: float, arguments: bytes) -> None:
-        """Answer a request."""
+    def answer(self, name: str, time_s: float, arguments: list[Any]) -> None:
+        """Answer a request; the arguments are as `starcat.query.frames.encoded` writes them."""
         limit_time(max(1.0, time_s) * (os.cpu_count() or 1) + 1.0)
         with self._sending:
             self._is_running = True
         try:
             if name != "next_batch":
                 self._let_go()
-            kind, found = DONE, getattr(self, name)(*pickle.loads(arguments))
+            found = getattr(self, name)(*map(decoded, arguments))
+            kind, content = DONE, found
+            if isinstance(found, bytes):
+                kind = ARROW
+            else:
+                content = json_content(found)
         except Exception as error:
-            kind, found = _failure(error)
+            kind, words = _failure(error)
+            content = json_content([words, list(getattr(error, "fields", ()))])
         with self._sending:
             self._is_running = False
-            self._send(kind, found)
+            self._send(kind, content)
 
     def footer(self, path: str) -> tuple[str, tuple[str, ...]]:
         """Return the schema's name, or nothing, and the columns that a Parquet file tells."""
@@ -121,7 +142,7 @@ class Worker:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
         )
 
-    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
+    def open(self, sql: str, folder: str, files: list[str], macros: list[str]) -> None:
         """Make the views, and allow no other file and no other setting from here on.
 
         Views name their files from the folder on.
@@ -130,7 +151,7 @@ class Worker:
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
-        self._macros = macros
+        self._macros = frozenset(macros)
         # Progress is kept, and printed by who asks for it. Times have the zone UTC everywhere.
         self._connection.execute(
             "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
@@ -147,9 +168,9 @@ class Worker:
         except duckdb.Error:
             return [text]
 
-    def check(self, text: str) -> Statement:
-        """Return what may run of a text."""
-        return check_statement(text, self._connection, self._macros)
+    def check(self, text: str) -> dict[str, Any]:
+        """Return what may run of a text, for `Statement.from_json`."""
+        return asdict(check_statement(text, self._connection, self._macros))
 
     def columns(self, text: str, values: dict[str, Any] | None) -> list[tuple[str, str]]:
         """Return names and types of the columns of a query."""
@@ -157,47 +178,73 @@ class Worker:
         return [(name, str(kind)) for name, kind in zip(bound.columns, bound.types, strict=True)]
 
     def rows(
-        self, text: str, values: dict[str, Any] | None, count: int
-    ) -> tuple[list[tuple[str, str]], list[tuple[Any, ...]]]:
-        """Send the first rows of a query in parts; return its columns, and the last part."""
+        self, text: str, values: dict[str, Any] | None, count: int, max_bytes: int | None = None
+    ) -> list[tuple[str, str]]:
+        """Send the first rows of a query in parts; return its columns."""
         running = self._connection.execute(text, values)
         columns = [(str(column[0]), str(column[1])) for column in running.description]
         zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
         if zoned:
             running = self._connection.execute(_without_zones(text, columns), values)
-        part: list[tuple[Any, ...]] = []
-        for following in _parts(running, count):
-            if part:
+        size, types = 0, [kind for _, kind in columns]
+        for part in _parts(running, count):
+            for content in self._contents(_in_utc(part, zoned) if zoned else part, types):
+                size += len(content)
+                if max_bytes is not None and size > max_bytes:
+                    raise _TooLarge
                 with self._sending:
-                    self._send(PART, part)
-            part = _in_utc(following, zoned) if zoned else following
+                    self._send(PART, content)
         self._connection.abort()
-        return columns, part
+        return columns
+
+    def _contents(self, rows: list[tuple[Any, ...]], types: list[str]) -> Iterator[bytes]:
+        """Give rows as contents of messages."""
+        if not rows:
+            return
+        content = encoded_rows(rows, types)
+        if len(content) <= self._opening.message_bytes:
+            yield content
+        elif len(rows) == 1:
+            raise _TooLarge
+        else:
+            half = len(rows) // 2
+            yield from self._contents(rows[:half], types)
+            yield from self._contents(rows[half:], types)
 
     def batches(self, text: str, values: dict[str, Any] | None) -> bytes:
         """Begin to read all rows as Arrow batches; return their schema as an Arrow stream."""
+        from starcat.query.arrow_stream import BATCH_ROWS, stream_of
+
         relation = self._connection.sql(text, params=values)
         self._reader = relation.to_arrow_reader(BATCH_ROWS)
-        return _as_stream(self._reader.schema)
+        return stream_of(self._reader.schema)
 
     def next_batch(self) -> bytes | None:
-        """Return the next batch as an Arrow stream; none at the end."""
+        """Return the next rows as an Arrow stream; none at the end."""
+        from starcat.query.arrow_stream import RowTooLarge, streams_of
+
         if self._reader is None:
             raise QueryError("rows were asked for after the end, or after another query")
-        for batch in self._reader:
-            return _as_stream(batch.schema, batch)
+        try:
+            for stream in self._streams:
+                return stream
+            for batch in self._reader:
+                self._streams = streams_of(batch, self._opening.message_bytes)
+                for stream in self._streams:
+                    return stream
+        except RowTooLarge as error:
+            raise _TooLarge from error
         return None
 
     def _let_go(self) -> None:
         """Drop what is left of an answer, which DuckDB keeps open otherwise."""
         if self._reader is not None:
             self._reader.close()
-            self._reader = None
+            self._reader, self._streams = None, iter(())
         self._connection.abort()
 
-    def _send(self, kind: str, found: Any) -> None:
-        pickle.dump((kind, found), self._replies, pickle.HIGHEST_PROTOCOL)
-        self._replies.flush()
+    def _send(self, kind: str, content: bytes) -> None:
+        write_message(self._replies, kind, content, more=kind == PART)
 
     def _hear(self) -> None:
         """Interrupt what runs when that is wanted."""
@@ -216,7 +263,10 @@ class Worker:
             with self._sending:
                 percent = self._connection.query_progress() if self._is_running else -1.0
                 if percent >= 0.0:
-                    self._send(PROGRESS, int(percent))
+                    try:
+                        self._send(PROGRESS, json_content(int(percent)))
+                    except OSError:  # the one that asks has gone since it was looked for
+                        os._exit(1)
 
 
 def _settings(opening: Opening) -> dict[str, Any]:
@@ -267,18 +317,10 @@ def _in_utc(rows: list[tuple[Any, ...]], zoned: list[int]) -> list[tuple[Any, ..
     ]
 
 
-def _as_stream(schema: pa.Schema, batch: pa.RecordBatch | None = None) -> bytes:
-    import pyarrow as pa
-
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, schema) as stream:
-        if batch is not None:
-            stream.write_batch(batch)
-    return bytes(sink.getvalue())
-
-
 def _failure(error: Exception) -> tuple[str, str]:
     words = str(error).strip() or type(error).__name__
+    if isinstance(error, _TooLarge):
+        return LARGE, words
     if isinstance(error, QueryError):
         return REFUSED, words
     if isinstance(error, (duckdb.OutOfMemoryException, MemoryError)) or words.startswith(

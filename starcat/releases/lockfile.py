@@ -14,7 +14,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import ConfigError, FileMissing, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.pulling import Pulled, pull_release
 from starcat.releases.registry import Registry, has_signatures, is_trusted, open_registry
@@ -23,9 +23,11 @@ from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
 from starcat.storage.download import DownloadOptions, is_address
 from starcat.storage.locks import locked
+from starcat.storage.regular_files import read_regular_file
 
 LOCK_NAME = "starcat.lock"
 LOCK_VERSION = "1.0.0"
+MAX_LOCK_BYTES = 16 << 20
 
 
 class Pin(Release):
@@ -48,8 +50,8 @@ class _Lock(_Head):
 def read_pins(path: Path) -> dict[str, Pin]:
     """Read a lock file."""
     try:
-        data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
+        data = read_regular_file(path, MAX_LOCK_BYTES)
+    except FileMissing:
         return {}
     where, advice = str(path), "restore the lock file, or remove it and pull again"
     try:

@@ -176,9 +176,15 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
             _check_blob(final, blob)
             return False
         arriving = part if is_mine else unique(part.parent, part.name)
-        copy_to_part(source, blob, arriving)
-        make_folder(final.parent)
-        arriving.replace(final)
+        try:
+            copy_to_part(source, blob, arriving)
+            make_folder(final.parent)
+            arriving.replace(final)
+        except OSError as error:
+            # A part is gone on with later, but not at the price of a disk that stays full.
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                arriving.unlink(missing_ok=True)
+            raise
         # Not before: a part has to be writable for who goes on with it.
         final.chmod(final.stat().st_mode & 0o555)
         if not is_mine:

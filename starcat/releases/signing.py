@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -12,9 +14,10 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from securesystemslib.signer import SSlibKey
-from tuf.api.metadata import Root, TargetFile
+from tuf.api.exceptions import RepositoryError
+from tuf.api.metadata import Metadata, Root, Snapshot, TargetFile, Timestamp
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, ProductError
 from starcat.releases.metadata import (
     ROLES,
     TARGETS_DAYS,
@@ -29,8 +32,10 @@ from starcat.releases.metadata import (
     sign_tree,
     unknown_key,
 )
-from starcat.releases.tree import LOCK, METADATA, Listed, release_bytes
+from starcat.releases.registry import FolderRegistry, Registry, open_registry
+from starcat.releases.tree import LOCK, MAX_METADATA_BYTES, METADATA, Listed, release_bytes
 from starcat.storage.atomic import writing
+from starcat.storage.download import NotFound
 from starcat.storage.locks import locked
 
 PUBLISHING = ROLES[1:]
@@ -143,19 +148,70 @@ def change_roles(
     return _facts(tree)
 
 
-def roles_of(registry: Path) -> tuple[RoleFacts, ...]:
-    """Return who may sign what, after checking that all of it was signed."""
-    return _facts(_signed(registry))
+def roles_of(registry: str) -> tuple[RoleFacts, ...]:
+    """Return who may sign what in a folder or at an address, after checking all signatures."""
+    opened = open_registry(registry)
+    if isinstance(opened, FolderRegistry):
+        return _facts(_signed(Path(registry)))
+    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+        copy = Path(folder)
+        _copy_metadata(opened, copy / METADATA)
+        try:
+            return _facts(load_tree(copy))
+        except ProductError as error:
+            found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
+            raise ProductError(
+                f"{registry}: its signatures do not agree ({found}); do not trust it, and ask who "
+                "publishes it"
+            ) from error
+
+
+MAX_ROOTS = 1000
+"""Roots of a registry at an address that are read; each change of the roles makes one."""
+
+
+def _copy_metadata(registry: Registry, folder: Path) -> None:
+    """Copy the signed metadata that a web server offers, for `load_tree` to check."""
+
+    def fetch(name: str) -> bytes:
+        data = registry.read(f"{METADATA}/{name}", MAX_METADATA_BYTES)
+        (folder / name).write_bytes(data)
+        return data
+
+    folder.mkdir()
+    number = 1
+    try:
+        fetch("1.root.json")
+    except NotFound:
+        registry.releases()  # says so if nothing is there at all
+        raise _unsigned(registry.address) from None
+    with suppress(NotFound):
+        while number < MAX_ROOTS:
+            number += 1
+            fetch(f"{number}.root.json")
+    try:
+        timestamp = Metadata[Timestamp].from_bytes(fetch("timestamp.json")).signed
+        version = timestamp.snapshot_meta.version
+        snapshot = Metadata[Snapshot].from_bytes(fetch(f"{version}.snapshot.json")).signed
+        fetch(f"{snapshot.meta['targets.json'].version}.targets.json")
+    except (RepositoryError, KeyError) as error:
+        raise ProductError(
+            f"{registry.address}: the signed metadata is damaged ({error}); ask who publishes it"
+        ) from error
+
+
+def _unsigned(registry: str) -> ConfigError:
+    return ConfigError(
+        f"{registry}: nothing is signed there, as it has no {METADATA}/; "
+        "'starcat publish --sign KEY' signs what it publishes",
+        key="registry",
+        value=registry,
+    )
 
 
 def _signed(registry: Path) -> SignedTree:
     if not is_signed(registry):
-        raise ConfigError(
-            f"{registry}: nothing is signed there, as it has no {METADATA}/; "
-            "'starcat publish --sign KEY' signs what it publishes",
-            key="registry",
-            value=str(registry),
-        )
+        raise _unsigned(str(registry))
     return load_tree(registry)
 
 

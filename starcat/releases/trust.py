@@ -36,6 +36,7 @@ from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.download import NotFound
 from starcat.storage.keys import is_public_key, raw_public, read_public, short_name
 from starcat.storage.locks import locked
+from starcat.storage.regular_files import read_regular_file
 
 _NOT_USED = "nothing of it is used"
 _SIGNED_BY = re.compile(r"was signed by (\d+)/(\d+) keys")
@@ -85,7 +86,7 @@ def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
             value=str(trust),
         )
     if not is_public_key(trust):
-        data = trust.read_bytes()
+        data = read_regular_file(trust, MAX_METADATA_BYTES)
         _check_root(data, trust)
         return data
     key = SSlibKey.from_crypto(read_public(trust))

@@ -15,7 +15,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import Zones, zones_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One simulated frame."""
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcat.arguments import numbers_of
 from starcat.arrays import Array, Matrix
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -24,9 +25,10 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import Database, as_database
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
+from starcat.resources import PathLike
 from starcat.sky.bodies import RADII_KM, Bodies, bodies_seen
 from starcat.sky.observer import AU_KM, Observer
 
@@ -60,7 +62,7 @@ class BodyInFrame:
     row: int | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SkyInTime:
     """What a time adds to the answer to a frame.
 
@@ -69,7 +71,8 @@ class SkyInTime:
     time : str
         UTC, ISO 8601.
     q_body_from_icrs : ndarray of float64, shape (4,)
-        Attitude with light deflection and aberration taken into account, scalar last.
+        Attitude with light deflection and aberration taken into account, in the convention of
+        `MatchResult`.
     boresight_ra_deg, boresight_dec_deg, roll_deg : float
         The same as angles.
     correction_arcsec : float
@@ -105,12 +108,12 @@ class SkyInTime:
 
 def sky_in_time(
     result: MatchResult,
-    database: Database,
+    database: Database | PathLike,
     centroids_px: ArrayLike,
     camera: Camera,
     observer: Observer,
     *,
-    parallax_mas: Array | None = None,
+    parallax_mas: ArrayLike | None = None,
 ) -> SkyInTime | None:
     """Return what the time adds to the answer to a frame.
 
@@ -118,7 +121,7 @@ def sky_in_time(
     ----------
     result : MatchResult
         The answer, best of `starcat.sky.spots.identify_in_time`.
-    database : Database
+    database : Database, Artifact, str or path-like
         The stars that it names.
     centroids_px : array_like of float64, shape (N, 2)
         The frame.
@@ -126,7 +129,7 @@ def sky_in_time(
         The camera, with the focal length that the frame was identified with.
     observer : Observer
         When, from where and how fast.
-    parallax_mas : ndarray of float64, shape (S,), optional
+    parallax_mas : array_like of float64, shape (S,), optional
         Parallaxes of the database's stars, mas, NaN where unknown. The databases themselves
         have none; a parallax moves a star by 0.8 arcsec at most.
 
@@ -137,10 +140,13 @@ def sky_in_time(
     """
     if result.status != "identified":
         return None
+    database = as_database("database", database)
     frame = as_frame(centroids_px, camera).centroids_px
     rows = np.flatnonzero(result.star_index >= 0)
     stars = result.star_index[rows]
-    parallax = None if parallax_mas is None else parallax_mas[stars]
+    parallax = None
+    if parallax_mas is not None:
+        parallax = numbers_of("parallax_mas", parallax_mas, "(S,), one per star")[stars]
     icrs = observer.apparent(database.directions[stars], parallax)
     body = camera.directions_from_pixels(frame[rows])
     matrix = solve_wahba_svd(body, icrs)

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, get_args
 
 import erfa
 import numpy as np
+from numpy.typing import ArrayLike
 
-from starcat.arrays import Array, Directions
+from starcat.arguments import numbers_of as numbers_of_array
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 
 LIGHT_KM_S = 299_792.458  # speed of light in vacuum (exact)
@@ -105,8 +106,8 @@ class Observer:
         cls,
         time: str | datetime,
         *,
-        position_km: Sequence[float] | Array | None = None,
-        velocity_km_s: Sequence[float] | Array | None = None,
+        position_km: ArrayLike | None = None,
+        velocity_km_s: ArrayLike | None = None,
         origin: Origin = "earth",
     ) -> Observer:
         """Return the observer at a time.
@@ -115,8 +116,9 @@ class Observer:
         ----------
         time : str or datetime
             UTC, such as ``2026-11-22T10:00:00``; a time zone in it is heeded.
-        position_km, velocity_km_s : sequence of float, shape (3,), optional
-            Relative to the origin, km and km/s, ICRS axes (of the Earth: GCRS, for which J2000
+        position_km, velocity_km_s : array_like of float64, shape (3,), optional
+            Relative to the origin, km and km/s (quantities with another unit of length and
+            velocity are converted), ICRS axes (of the Earth: GCRS, for which J2000
             axes will do; not those of a two-line element set); those of the Earth by default.
         origin : {"earth", "barycentre"}
             What both are relative to; relative to the barycentre both have to be given.
@@ -160,15 +162,16 @@ class Observer:
         sun_au = earth_au - np.array(heliocentric["p"])
         return cls(moment, tt, position_au, velocity, sun_au, earth_au, place is not None)
 
-    def apparent(self, directions: Directions, parallax_mas: Array | None = None) -> Array:
+    def apparent(self, directions: ArrayLike, parallax_mas: ArrayLike | None = None) -> Array:
         """Return where stars of a catalog are seen.
 
         With parallax (mas, NaN where unknown), light deflection by the Sun and aberration:
         astropy's GCRS to 1 mas.
         """
-        u = directions
+        u = numbers_of_array("directions", directions, "(N, 3)")
         if parallax_mas is not None:
-            u = _displaced_by_parallax(u, parallax_mas, self.position_au)
+            parallax = numbers_of_array("parallax_mas", parallax_mas, "(N,)")
+            u = _displaced_by_parallax(u, parallax, self.position_au)
         return aberrated(_deflected(u, self.position_au - self.sun_au), self.velocity_km_s)
 
 
@@ -189,13 +192,11 @@ def numbers_of(name: str, text: str, count: int) -> list[float]:
     return numbers
 
 
-def _three(name: str, given: Sequence[float] | Array) -> Array:
-    try:
-        numbers = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
+def _three(name: str, given: ArrayLike) -> Array:
+    numbers = numbers_of_array(name, given, (3,))
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ConfigError(f"{name} is {given!r}; expected three finite numbers", key=name)
+        text = f"{name} is {given!r}; expected three finite numbers"
+        raise ConfigError(text, key=name, value=given, fields=(name,))
     return numbers
 
 

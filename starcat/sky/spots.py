@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike
 from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import Database, as_database
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
+from starcat.resources import PathLike
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 
@@ -33,7 +34,7 @@ BRIGHTEST = 3  # so many of the brightest spots may be planets that a frame was 
 
 def identify_in_time(
     identify: Callable[..., MatchResult],
-    database: Database,
+    database: Database | PathLike,
     centroids_px: ArrayLike,
     camera: Camera,
     observer: Observer,
@@ -48,7 +49,7 @@ def identify_in_time(
     ----------
     identify : callable
         `Matcher.identify`, its camera and options filled in.
-    database, observer : Database, Observer
+    database, observer : Database (or Artifact or path), Observer
         The stars that it names; when and from where the frame was taken.
     centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
         Pixels, and magnitudes of any zero point.
@@ -64,6 +65,7 @@ def identify_in_time(
         not identified is asked again without one or two of its three brightest spots; such an
         answer counts if planets are there, with the probability of all these questions.
     """
+    database = as_database("database", database)
     given = as_frame(centroids_px, camera, magnitudes)
     frame, mag = given.centroids_px, given.magnitudes
     found = identify(frame, magnitudes=mag)

@@ -36,6 +36,7 @@ MOST_BINS = 10_000_000
 
 
 LATER_KEYS = (
+    *("selection.neighbours.centroid", "selection.neighbours.box_px"),
     *("products.levels", "catalog.motions", "selection.neighbours"),
     "catalog.merged",
     *("selection.thinning", "selection.observed", "selection.doubles.join"),

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from starcat.bands.response import Response, checked_response, read_response, shipped, shipped_names
 from starcat.bands.synthetic import checked_zero_point
 from starcat.errors import ConfigError
+from starcat.specs.local_files import LocalFile
 from starcat.specs.product_sections import Section
 
 MOST_ROWS = 2000
@@ -32,9 +33,8 @@ class CameraResponse(Section):
         "of the one that follows; default: magnitudes stay in the catalog's band",
         examples=["silicon-cmos"],
     )
-    file: str | None = Field(
+    file: Annotated[str, LocalFile("wavelength_nm and value")] | None = Field(
         None,
-        max_length=1000,
         description="CSV of wavelengths in nm and responses, beside the spec; the built spec has "
         "its numbers",
         examples=["sensor.csv"],
@@ -44,9 +44,10 @@ class CameraResponse(Section):
     )
     wavelength_nm: Column = Field((), description="wavelengths of the response, rising")
     value: Column = Field((), description="response at each wavelength, of any scale")
-    optics_file: str | None = Field(
+    optics_file: (
+        Annotated[str, LocalFile("optics_wavelength_nm and optics_transmission")] | None
+    ) = Field(
         None,
-        max_length=1000,
         description="CSV of wavelengths in nm and transmissions of the lens and filters",
         examples=["lens.csv"],
     )
@@ -82,11 +83,6 @@ class CameraResponse(Section):
         if self.name is None:
             self._check_that_nothing_is_stated()
             return None
-        if self.file or self.optics_file:
-            raise ConfigError(
-                "a file is read where the spec is a file on this machine; elsewhere state "
-                "wavelength_nm and value (optics_wavelength_nm and optics_transmission)"
-            )
         found = self._own() if self.wavelength_nm or self.value else shipped(self.name)
         if self.optics_wavelength_nm or self.optics_transmission:
             columns = (self.optics_wavelength_nm, self.optics_transmission)
@@ -120,7 +116,11 @@ class CameraResponse(Section):
 
 
 def with_files_read(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the content of a spec file with the numbers of the files that its response names."""
+    """Return the content of a spec with the numbers of the files that its response names.
+
+    This is the only function that opens a file that a spec names. Only `read_spec` and
+    `local_preset` call it, for specs that the user of this machine has written.
+    """
     camera = content.get("camera")
     if not isinstance(camera, dict) or not isinstance(camera.get("response"), dict):
         return content

@@ -22,7 +22,9 @@ class Doubles(Section):
         description="a companion fainter by more does not count; default: every one counts",
     )
     companion_limit_mag: Mag | None = Field(
-        None, description="stars up to here count as companions; default: faint_limit_mag"
+        None,
+        description="only stars up to this magnitude form doubles, as either of the two; "
+        "default: faint_limit_mag",
     )
     action: Literal["remove", "merge", "keep"] = Field(
         "remove", description="remove both, merge them into their photocentre, or keep them"

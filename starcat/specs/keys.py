@@ -148,7 +148,9 @@ def spec_toml(spec: BuildSpec) -> str:
             values = values[name]
         lines = _comment(section.description)
         if section.path:
-            lines.append(f"[{'.'.join(section.path)}]")
+            # A header without keys would keep another text from being appended with this header.
+            is_empty = all(_is_default(key, values[key.name]) for key in section.keys)
+            lines.append(f"{'# ' if is_empty else ''}[{'.'.join(section.path)}]")
         for key in section.keys:
             lines += _lines(key, values[key.name])
         parts.append("\n".join(lines))
@@ -177,12 +179,15 @@ def toml_value(value: Any) -> str:
 
 def _lines(key: SpecKey, value: Any) -> list[str]:
     told = key.description + (f" ({key.range})" if key.kind == "one of" else "")
-    is_default = key.default is not REQUIRED and value == key.default
-    if not is_default:
+    if not _is_default(key, value):
         return [*_comment(told), f"{key.name} = {toml_value(value)}"]
     shown = key.example if value is None else value
     set_to = f"{key.name} = {'...' if shown is None else toml_value(shown)}"
     return [*_comment(told), f"# {set_to}" + ("" if value is None else "    # the default")]
+
+
+def _is_default(key: SpecKey, value: Any) -> bool:
+    return key.default is not REQUIRED and value == key.default
 
 
 def _comment(text: str) -> list[str]:

@@ -33,6 +33,19 @@ class NeighbourRule(Section):
         "spot on the pixels, at least 1",
         examples=[1.04],
     )
+    centroid: Literal["window", "box"] = Field(
+        "window",
+        description="how the sensor measures a star: in a Gaussian window that is moved until it "
+        "is centred on the light, or as the centre of mass of the pixels in a box around the "
+        "brightest pixel",
+    )
+    box_px: int | None = Field(
+        None,
+        ge=3,
+        le=51,
+        description='pixels on a side of the box, an odd number; with centroid = "box"',
+        examples=[5],
+    )
     max_offset_px: float | None = Field(
         None,
         ge=0.0,
@@ -64,6 +77,16 @@ class NeighbourRule(Section):
             raise ValueError(
                 "psf_sigma_px is missing: without the width of a spot there are no blends; state "
                 "it, such as psf_sigma_px = 1.0, or leave the section out"
+            )
+        if (self.centroid == "box") != (self.box_px is not None):
+            raise ValueError(
+                f'centroid is "{self.centroid}" and box_px is {self.box_px}; state both centroid = '
+                '"box" and the size of the box, such as box_px = 5, or neither'
+            )
+        if self.box_px is not None and (self.box_px % 2 == 0 or self.window_px is not None):
+            raise ValueError(
+                f"box_px is {self.box_px} and window_px is {self.window_px}; a box has an odd "
+                "number of pixels on a side, around the brightest one, and no window"
             )
         return self
 

@@ -10,10 +10,12 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from starcat.errors import ConfigError, FileMissing, quoted, reason, suggest
+from starcat.arguments import path_of
+from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.camera_response import with_files_read
+from starcat.storage.regular_files import read_regular_file
 
 
 class _Shown(reprlib.Repr):
@@ -32,6 +34,9 @@ _SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
 MOST_CHARACTERS, MOST_POINTS = 100_000, 200
 """Of the text of a spec, and of full stops in a line of it."""
+
+MOST_BYTES = 4 * MOST_CHARACTERS
+"""Of the file of a spec or of a camera."""
 
 Changes = Mapping[str, str]
 """Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
@@ -58,21 +63,22 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     ConfigError
         If the file is missing or not TOML, or a key is unknown, missing or out of range.
     """
-    path = Path(path)
+    path = path_of("path", path, "the path of a spec")
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     content = changed(content_of_toml(text, str(path)), changes or {})
     return spec_from_dict(with_files_read(content, path.parent), path.name)
 
 
 def text_of_toml(path: Path, missing: str) -> str:
-    """Read a TOML file; ``missing`` is what to say where there is none."""
+    """Read a TOML file; ``missing`` is what the error says if the file does not exist."""
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+        return read_regular_file(path, MOST_BYTES).decode("utf-8")
+    except FileMissing:
         raise FileMissing(f"{path}: {missing}") from None
-    except (OSError, ValueError) as error:
-        why = reason(error) if isinstance(error, OSError) else error
-        raise ConfigError(f"{path}: not a readable TOML file: {why}") from error
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
 
 
 def content_of_toml(text: str, origin: str) -> dict[str, Any]:
@@ -93,10 +99,30 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
                 f"{MOST_POINTS} are read, and a key of a spec has two"
             )
     try:
-        return tomllib.loads(text)
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
+    _check_integers(content, origin)
+    return content
+
+
+def _check_integers(content: dict[str, Any], origin: str) -> None:
+    """Refuse integers that TOML does not have: Python cannot write one of 4,300 digits as text."""
+    left: list[tuple[str, Any]] = list(content.items())
+    while left:
+        key, value = left.pop()
+        if isinstance(value, dict):
+            left += [(f"{key}.{name}", one) for name, one in value.items()]
+        elif isinstance(value, list):
+            left += [(key, one) for one in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            shown = _shown_key(key)
+            raise ConfigError(
+                f"{origin}: {shown}: found {_SHOWN.repr(value)}; an integer of TOML is from -2^63 "
+                "to 2^63 - 1",
+                key=shown,
+            )
 
 
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
@@ -200,7 +226,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset.
+    """Return a preset. Files that the changes name are refused, not read.
 
     Parameters
     ----------
@@ -217,13 +243,28 @@ def preset(name: str, changes: Changes | None = None) -> BuildSpec:
     Raises
     ------
     ConfigError
-        If there is no such preset, or a change is no value of its key.
+        If there is no such preset, or a change is no value of its key, or names a file.
     """
+    return spec_from_dict(changed(_preset_content(name), changes or {}), f"{name}.toml")
+
+
+def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
+    """Return a preset as `preset` does, with the files read that the changes name.
+
+    Relative names are taken from the current folder. It is for the user of this machine only: the
+    service must never call it.
+    """
+    content = with_files_read(changed(_preset_content(name), changes or {}), Path())
+    return spec_from_dict(content, f"{name}.toml")
+
+
+def _preset_content(name: str) -> dict[str, Any]:
     if name not in preset_names():
-        hint = suggest(name, preset_names())
+        hint = suggest(str(name), preset_names())
         raise ConfigError(
-            f"unknown preset {name!r}; {hint}known presets: {', '.join(preset_names())}",
+            f"unknown preset {quoted(str(name))}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",
             value=name,
         )
-    return read_spec(resource_folder("specs/presets") / f"{name}.toml", changes)
+    path = resource_folder("specs/presets") / f"{name}.toml"
+    return content_of_toml(text_of_toml(path, "no such preset"), path.name)

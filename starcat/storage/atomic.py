@@ -9,16 +9,20 @@ from __future__ import annotations
 
 import errno
 import filecmp
+import logging
 import os
 import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
 from starcat.errors import OutputError, reason
+from starcat.storage.locks import locked
+
+_logger = logging.getLogger(__name__)
 
 Outcome = Literal["written", "unchanged", "replaced"]
 
@@ -80,22 +84,47 @@ def replace_file(path: Path, data: bytes, beside: Path) -> None:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Give a folder to write into, beside the final one, and remove it afterwards."""
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
-    except OSError as error:
-        raise OutputError(
-            f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
-            "with --output",
-            path=final.parent,
-        ) from error
-    try:
-        made.chmod(0o755)
-        with writing(final.parent, "nothing was left there"):
-            yield made
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+    """Give a folder to write into, beside the final one, and remove it afterwards.
+
+    The process holds a lock of the folder. Folders for the same name that nobody locks any more
+    were left by processes that were killed, and are removed first.
+    """
+    is_new = not final.parent.exists()
+    with ExitStack() as held:
+        try:
+            final.parent.mkdir(parents=True, exist_ok=True)
+            with locked(final.parent):  # so that nobody finds the folder before it is locked
+                _remove_abandoned(final)
+                made = Path(
+                    tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent)
+                )
+                held.enter_context(locked(made))
+        except OSError as error:
+            raise OutputError(
+                f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
+                "with --output",
+                path=final.parent,
+            ) from error
+        try:
+            made.chmod(0o755)
+            with writing(final.parent, "nothing was left there"):
+                yield made
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+            if is_new:
+                with suppress(OSError):  # it is not empty
+                    final.parent.rmdir()
+
+
+def _remove_abandoned(final: Path) -> None:
+    for path in final.parent.glob(f".{final.name}.*.partial"):
+        # What `move_into_place` puts aside may be the only copy of what had the name before.
+        if path.name.endswith(".old.partial") or not path.is_dir() or path.is_symlink():
+            continue
+        with suppress(OSError), locked(path, wait=False) as is_certain:
+            if is_certain:
+                _logger.info("%s: removed; the process that wrote it was killed", path)
+                shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager

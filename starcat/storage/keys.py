@@ -9,10 +9,11 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from starcat.errors import ConfigError, FileMissing, OutputError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
+from starcat.storage.regular_files import read_regular_file
 
 PRIVATE_SUFFIX, PUBLIC_SUFFIX = ".key", ".pub"
-MAX_KEY_BYTES = 1 << 16
+MAX_KEY_BYTES = 1 << 20
 """More than the file of any key has."""
 
 _PRIVATE_MARK, _PUBLIC_MARK = b"PRIVATE KEY-----", b"-----BEGIN PUBLIC KEY-----"
@@ -95,17 +96,13 @@ def is_public_key(path: Path) -> bool:
 
 def _read(path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_KEY_BYTES + 1)
-    except FileNotFoundError as error:
+        return read_regular_file(path, MAX_KEY_BYTES)
+    except FileMissing as error:
         raise FileMissing(
             f"{path}: no such key; 'starcat keys new NAME' makes one", key="key", value=str(path)
         ) from error
-    except OSError as error:
-        raise ConfigError(
-            f"{path}: the key cannot be read ({reason(error)})", key="key", value=str(path)
-        ) from error
-    return data[:MAX_KEY_BYTES]
+    except SourceError as error:
+        raise ConfigError(f"{error}; expected a key", key="key", value=str(path)) from error
 
 
 def _no_key(path: Path, found: str, advice: str) -> ConfigError:

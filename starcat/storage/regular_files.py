@@ -12,6 +12,20 @@ from pathlib import Path
 
 from starcat.errors import FileMissing, SourceError, reason
 
+CHUNK_BYTES = 1 << 20
+
+
+def check_regular_file(path: Path) -> None:
+    """Raise a `SourceError` if a path exists and is not a regular file; links are followed.
+
+    It is for readers of files of any size, before they open one: opening a pipe can wait for ever.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return  # the reader itself says why it cannot open the file
+    _check_mode(mode, path)
+
 
 def read_regular_file(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file.
@@ -38,21 +52,32 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
     try:
         # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise FileMissing(f"{path}: no such file") from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         why = reason(error) if isinstance(error, OSError) else str(error)
         raise SourceError(f"{path}: cannot be read ({why})", path=path) from error
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
+    try:
+        _check_mode(os.fstat(descriptor).st_mode, path)
+    except SourceError:
         os.close(descriptor)
-        what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise SourceError(f"{path}: is {what}; give a file", path=path)
+        raise
     with os.fdopen(descriptor, "rb") as file:
+        # Not `read(max_bytes)`: Python would allocate as much before it reads.
+        parts = [file.read(min(os.fstat(descriptor).st_size, max_bytes) + 1)]
+        size = len(parts[0])
         # The size that the system states can be wrong, as in /proc: what arrives is counted.
-        content = file.read(max_bytes + 1)
-    if len(content) > max_bytes:
+        while size <= max_bytes and (part := file.read(CHUNK_BYTES)):
+            parts.append(part)
+            size += len(part)
+    if size > max_bytes:
         raise SourceError(
             f"{path}: has more than {max_bytes:,} bytes; a file of this kind is smaller", path=path
         )
-    return content
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def _check_mode(mode: int, path: Path) -> None:
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
+        raise SourceError(f"{path}: is {what}; give a file", path=path)

@@ -78,7 +78,7 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
     source, name = ("tycho1", "tyc_main.dat.gz") if infrared else ("hipparcos", "hip_main.dat.gz")
     found = {}
     for band in ("V", "BT", "VT") if infrared else ("V", "BT", "VT", "Hp"):
-        stars = _read(source, catalogs / name, band, 2016.0)
+        stars = read_stars(source, catalogs / name, band, 2016.0)
         found[band] = floats_of(stars, "mag")
     found["B"] = floats_of(stars, "colour_mag") + found["V"]
     found["I"] = found["V"] - floats_of(stars, "second_colour_mag")
@@ -88,21 +88,21 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
         kept = ~(stars["is_flagged_double"].to_numpy() | stars["is_flagged_variable"].to_numpy())
     else:
         kept = np.isin(stars["star_id"].to_numpy(), single_and_constant(catalogs / name))
-    gaia = _read("gaia", embedded_sky(), None, 2016.0)
-    place, near = _nearest(directions_of(stars), directions_of(gaia))
+    gaia = read_stars("gaia", embedded_sky(), None, 2016.0)
+    place, near = nearest(directions_of(stars), directions_of(gaia))
     near &= gaia["star_id"].to_numpy()[place] > 0  # not those that Hipparcos itself supplied
     found["G"] = np.where(near, floats_of(gaia, "mag")[place], np.nan)
     found["BP"] = np.where(near, floats_of(gaia, "second_mag")[place], np.nan)
     found["RP"] = found["BP"] - floats_of(gaia, "colour_mag")[place]
-    found |= _infrared(catalogs, directions_of(_read(source, catalogs / name, "V", 1999.5)))
+    found |= _infrared(catalogs, directions_of(read_stars(source, catalogs / name, "V", 1999.5)))
     return {band: mag[kept] for band, mag in {**found, "type": types}.items()}
 
 
 def _infrared(catalogs: Path, u: Array) -> dict[str, Array]:
     """Return the 2MASS magnitudes at directions of 1999.5, where all three are sound."""
-    read = {b: _read("2mass", catalogs / "psc_measured.gz", b, None) for b in ("J", "H", "Ks")}
+    read = {b: read_stars("2mass", catalogs / "psc_measured.gz", b, None) for b in ("J", "H", "Ks")}
     flags = np.bitwise_or.reduce([one["quality_flags"].to_numpy() for one in read.values()])
-    place, near = _nearest(u, directions_of(read["J"]))
+    place, near = nearest(u, directions_of(read["J"]))
     near &= (flags & NOT_SOUND == 0)[place]
     return {
         band: np.where(near, floats_of(one, "mag")[place], np.nan) for band, one in read.items()
@@ -121,14 +121,14 @@ def single_and_constant(path: Path) -> list[int]:
     return numbers
 
 
-def _read(source: str, path: Path, band: str | None, epoch_jyear: float | None) -> pa.Table:
+def read_stars(source: str, path: Path, band: str | None, epoch_jyear: float | None) -> pa.Table:
     read = read_catalog(
         source, [path], band=band, epoch_jyear=epoch_jyear, read_limit_mag=None, neighbours=False
     )
     return read.stars
 
 
-def _nearest(u: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def nearest(u: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the row of the nearest other star, and whether it is near."""
     distance, place = cKDTree(others).query(u)
     return place, distance < np.radians(WITHIN_ARCSEC / 3600.0)

@@ -87,15 +87,19 @@ def in_background(server: socketserver.BaseServer) -> Iterator[None]:
 
 
 @contextmanager
-def serve(root: Path, log: Path, **settings: object) -> Iterator[Served]:
+def serve(
+    root: Path, log: Path, program: str | None = None, **settings: object
+) -> Iterator[Served]:
     """Run ``starcat serve`` until the context ends; it has to end with 0 then.
 
-    ``settings`` are what ``service.toml`` is to say, ``log`` is the file for its stderr.
+    ``settings`` are what ``service.toml`` is to say, ``log`` is the file for its stderr. With
+    ``program``, Python runs this text, which changes the server before it runs it.
     """
     root.mkdir(parents=True, exist_ok=True)
     lines = [f"{name} = {json.dumps(value)}" for name, value in settings.items()]
     (root / "service.toml").write_text("\n".join(lines) + "\n")
-    command = [sys.executable, "-m", "starcat", "serve", "--root", root, "--port", "0", "--json"]
+    start = ["-m", "starcat"] if program is None else ["-c", program]
+    command = [sys.executable, *start, "serve", "--root", root, "--port", "0", "--json"]
     with log.open("w") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
     try:

@@ -30,7 +30,8 @@ Matrix3d matrix_of(const double (&mrp)[3]) {
   return Eigen::Map<const RowMajor>(&rows[0][0]);
 }
 
-// The quaternion of the library: of body from ICRS, scalar last, from that of Eigen.
+// Return the quaternion of starcat.h for the matrix of body from ICRS. Eigen has Hamilton's
+// convention, in which the transposed matrix has these components.
 void quaternion_of(const Matrix3d &matrix, double (&q)[4]) {
   const Eigen::Quaterniond turn(Matrix3d(matrix.transpose()));
   const double sign = turn.w() < 0.0 ? -1.0 : 1.0;

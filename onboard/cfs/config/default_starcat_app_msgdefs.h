@@ -84,7 +84,7 @@ typedef struct {
   uint16 Matched;            /* centroids that are stars of the image */
   uint16 Usable;             /* centroids that could be used */
   uint32 Steps;              /* steps that were taken */
-  double Quaternion[4];      /* camera from ICRS, scalar last */
+  double Quaternion[4];      /* x, y, z, w: camera = A icrs, A and an example in starcat.h */
   double Covariance_rad2[6]; /* of turns about the camera's axes: xx, xy, xz, yy, yz, zz */
   double LogChance;          /* natural logarithm of the bound on chance */
   double Residual_rad;       /* root mean square of the matched centroids */

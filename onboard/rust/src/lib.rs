@@ -376,12 +376,15 @@ pub struct Answer<'m> {
 }
 
 impl<'m> Answer<'m> {
-    /// Scalar-last; turns ICRS into camera components.
+    /// The attitude as [x, y, z, w], scalar last and w >= 0. It stands for the matrix that `matrix`
+    /// returns; the head of `starcat.h` has the formula and an example. It is the conjugate of the
+    /// quaternion that `nalgebra` and other libraries of Hamilton's convention have for this matrix.
     pub fn quaternion(&self) -> [Real; 4] {
         self.found.q_body_from_icrs
     }
 
-    /// The same attitude by rows: body = matrix * icrs.
+    /// The same attitude by rows: it converts ICRS components into camera components,
+    /// camera = matrix * icrs.
     pub fn matrix(&self) -> &'m [Real; 9] {
         &self.found.matrix
     }

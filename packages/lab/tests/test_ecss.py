@@ -7,6 +7,7 @@ import json
 import math
 import runpy
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,7 +34,7 @@ from starcat_lab.ecss.bench import (
     random_day,
     turned,
 )
-from starcat_lab.ecss.errors import attitude_variance, centroid_noise_px, contributions
+from starcat_lab.ecss.errors import _centroids, attitude_variance, centroid_noise_px, contributions
 from starcat_lab.ecss.figures import expected_bias, spread, temporal_noise
 from starcat_lab.ecss.trials import Trial, guide_stars, point, star_noise, trials_of
 
@@ -61,6 +62,23 @@ def bench_of(random_directions, sky_of):
         return Bench(sensor_from({**PERFECT, **keys}, "test"), matcher, sky, 1)
 
     return make
+
+
+def test_a_box_of_pixels_is_measured_as_the_spec_says(bench_of):
+    """A wide box sees the light of the star beside it, a window hardly."""
+    window = bench_of()
+    box = replace(window, box_px=9)
+    places = np.array([[100.5, 100.5], [104.7, 100.5]])
+    light = window.light(places, np.full(2, 3.0))
+    moved = [_centroids(bench, light, places[:1]) - places[:1] for bench in (window, box)]
+    alone = _centroids(box, window.light(places[:1], np.full(1, 3.0)), places[:1])
+    assert alone == pytest.approx(places[:1], abs=1e-3)
+    assert moved[0][0, 0] < 0.1 < 1.0 < moved[1][0, 0]
+    image = box.recorded(light + box.sensor.background_e, np.random.default_rng(1))
+    expected = _centroids(box, light, places)
+    assert np.sort(box.centroids(image), axis=0) == pytest.approx(
+        np.sort(expected, axis=0), abs=0.1
+    )
 
 
 def test_the_noise_of_a_star_is_that_of_the_closed_form(bench_of):

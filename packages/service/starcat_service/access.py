@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import binascii
 import ipaddress
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
@@ -39,7 +40,8 @@ NOVA = (
 """Whose clients send no header: a session is in their JSON, a number in their addresses."""
 
 OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
-"""What everybody may see, also where a token is needed for all else."""
+"""Paths that everybody may see, also if a token is needed for all others. A path that ends with a
+slash stands for all paths below it."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")
 """Paths whose programs send a name and a password only when they are asked for them."""
@@ -54,6 +56,9 @@ MOST_KNOWN = 1_000
 GUESSES_PER_MINUTE = 10
 """Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
 not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
+
+ANONYMOUS = "anonymous"
+"""Name of whoever has no token."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +112,7 @@ class Identities:
         self.sessions = SessionStore(records, settings.session_hours)
         self.guessed = Buckets(GUESSES_PER_MINUTE)
         self._known: OrderedDict[str, tuple[Token, float]] = OrderedDict()
+        self._lock = threading.Lock()
 
     def of_token(self, text: str) -> Token | None:
         """Return the token of a text; None where there is no valid one."""
@@ -118,23 +124,25 @@ class Identities:
 
     def sign_out(self, secret: str) -> None:
         """End a session at once."""
-        self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
         self.sessions.close(secret)
+        with self._lock:  # a look-up that found the session before it was closed is over now
+            self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
 
     def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
         key, now_s = f"{type(store).__name__} {digest_of(secret)}", time.monotonic()
         known = self._known.get(key)
         if known is not None and known[1] > now_s:
             return known[0]
-        # One look-up by an index in a file that is in memory: less than handing it to a thread.
-        token = store.find(secret)
-        if token is None:
-            self._known.pop(key, None)
-            return None
-        self._known[key] = token, now_s + KNOWN_S
-        if len(self._known) > MOST_KNOWN:
-            self._known.popitem(last=False)
-        return token
+        with self._lock:
+            # One look-up by an index in a file that is in memory: less than handing it to a thread.
+            token = store.find(secret)
+            if token is None:
+                self._known.pop(key, None)
+                return None
+            self._known[key] = token, now_s + KNOWN_S
+            if len(self._known) > MOST_KNOWN:
+                self._known.popitem(last=False)
+            return token
 
 
 class Authentication:
@@ -143,7 +151,7 @@ class Authentication:
     def __init__(self, settings: Settings, identities: Identities) -> None:
         self._settings = settings
         self._identities = identities
-        self._anonymous = Principal("anonymous", settings.anonymous_role)
+        self._anonymous = Principal(ANONYMOUS, settings.anonymous_role)
         self._asked = Buckets(settings.requests_per_minute)
 
     def check(self, scope: Scope) -> None:
@@ -163,7 +171,7 @@ class Authentication:
                     headers=later(wait_s),
                 )
         principal = self._anonymous if found is None else Principal(found.name, found.role)
-        if principal.role == Role.NONE and not path.startswith(OPEN_PATHS):
+        if principal.role == Role.NONE and not is_open(path):
             raise self._unknown(scope)
         scope.setdefault("state", {})["principal"] = principal
 
@@ -195,6 +203,18 @@ class Authentication:
             "this needs a token; send it as 'Authorization: Bearer TOKEN', or sign in on the page",
             headers={"WWW-Authenticate": BASIC if path.startswith(CHALLENGED) else BEARER},
         )
+
+
+def is_open(path: str) -> bool:
+    """Return whether everybody may see a path.
+
+    Examples
+    --------
+    >>> is_open("/sign-in"), is_open("/sign-inx"), is_open("/static/page.css")
+    (True, False, True)
+    """
+    below = tuple(one for one in OPEN_PATHS if one.endswith("/"))
+    return path in OPEN_PATHS or path.startswith(below)
 
 
 def token_in(authorization: str) -> str | None:

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
-from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
@@ -18,6 +17,7 @@ from starcat_service.jobs.slots import JobSlots
 from starcat_service.pages.rendering import add_missing_page
 from starcat_service.problems import REFUSALS, add_problem_handlers
 from starcat_service.removal import keep_removing
+from starcat_service.sandbox.places import in_thread
 from starcat_service.security import metrics
 from starcat_service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
 from starcat_service.security.origin import Origins
@@ -87,7 +87,7 @@ def make_app(settings: Settings) -> FastAPI:
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
     slots: JobSlots = app.state.slots
-    await to_thread.run_sync(slots.start)
+    await in_thread(slots.start)
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -96,5 +96,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
-        await to_thread.run_sync(slots.stop)
+        await in_thread(slots.stop)  # a thread of its own: those of requests can all be busy
         service.close()

@@ -40,7 +40,7 @@ WAIT_S = 25.0
 RETRY_S = 5
 """Seconds after which to ask again."""
 
-READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 1 << 30, 128 << 20, 64 << 20
+READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 640 << 20, 128 << 20, 64 << 20
 """Memory for catalogs that were read, for guide stars, and for estimates."""
 
 MOST_INPUT_BYTES = 2 << 30
@@ -97,13 +97,16 @@ class Catalogs:
 
     def offered(self) -> list[Offered]:
         """Return the catalogs that a spec may name."""
-        with self._lock:
-            known = [catalog for _, catalog in self._read.values()]
-        found = []
+        known, found = self.known(), []
         for name in (*CATALOGS, *filter(is_here, set(star_sources()) - set(CATALOGS))):
             read = tuple(one for one in known if one.source == name)
             found.append(Offered(data_source(name), is_here(name), read))
         return sorted(found, key=lambda one: not one.is_here)
+
+    def known(self) -> list[CatalogRead]:
+        """Return what is known of the catalogs that were read."""
+        with self._lock:
+            return [catalog for _, catalog in self._read.values()]
 
     def estimate(self, spec: BuildSpec) -> Estimate:
         """Estimate what a spec will give."""

@@ -13,6 +13,7 @@ import typer
 from starcat.cli.console import print_json, print_json_line, print_table, say, show
 from starcat.cli.options import Json
 from starcat.errors import ConfigError, TargetMissing
+from starcat.version import install_command
 
 if TYPE_CHECKING:
     from starcat_service.security.tokens import Token, TokenStore
@@ -161,5 +162,5 @@ def _service_installed() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"the service needs {error.name}: python -m pip install 'starcat-guide-stars[service]'"
+            f"the service needs {error.name}; {install_command('service')}"
         ) from error

@@ -46,6 +46,11 @@ class Database:
         return f"{self.name}-{self.version}"
 
     @property
+    def built_ns(self) -> int:
+        """When its manifest was written, nanoseconds since 1970."""
+        return (self.folder / MANIFEST_NAME).stat().st_mtime_ns
+
+    @property
     def spec(self) -> dict[str, Any]:
         """The spec, with all defaults."""
         return dict(self.manifest["spec"])
@@ -102,7 +107,10 @@ class Library:
     def databases(self) -> list[Database]:
         """Return all databases that can be read, by name, version and id."""
         found = []
-        for path in self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"):
+        paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
+        for gone in set(self._known) - set(paths):
+            self._known.pop(gone, None)
+        for path in paths:
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:

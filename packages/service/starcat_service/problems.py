@@ -96,11 +96,7 @@ def problem_of(error: Exception) -> ProblemDetails:
         part, _, name = where.partition(".")
         detail = f"{part} {name}".strip() + f": {found}; /api/docs says what is expected"
         return ProblemDetails(
-            title="Unprocessable Content",
-            status=422,
-            detail=shown(detail, 500),
-            code=2,
-            key=name or None,
+            title=title_of(422), status=422, detail=shown(detail, 500), code=2, key=name or None
         )
     status = next((number for kind, number in STATUS if isinstance(error, kind)), 500)
     if status == 500:
@@ -119,7 +115,27 @@ def problem_of(error: Exception) -> ProblemDetails:
 
 
 def _problem(status: int, detail: str, **facts: Any) -> ProblemDetails:
-    return ProblemDetails(title=HTTPStatus(status).phrase, status=status, detail=detail, **facts)
+    return ProblemDetails(title=title_of(status), status=status, detail=detail, **facts)
+
+
+_TITLES = {
+    413: "Content Too Large",
+    414: "URI Too Long",
+    416: "Range Not Satisfiable",
+    422: "Unprocessable Content",
+}
+"""Titles of RFC 9110. Python before 3.13 has those of older RFCs."""
+
+
+def title_of(status: int) -> str:
+    """Return the title of a status, the same on all versions of Python.
+
+    Examples
+    --------
+    >>> title_of(422), title_of(404)
+    ('Unprocessable Content', 'Not Found')
+    """
+    return _TITLES.get(status) or HTTPStatus(status).phrase
 
 
 _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:;,'\"()]+/)+")

@@ -15,6 +15,7 @@ import shutil
 import time
 from pathlib import Path
 
+from starcat.query.session import SCRATCH_PREFIX
 from starcat_service.jobs.job import ENDED, QUERY, State
 from starcat_service.paths import DATABASE_ID, checked
 from starcat_service.problems import Problem
@@ -102,7 +103,8 @@ def _remove_jobs(service: Service, before_s: float) -> int:
 def _remove_entries(folder: Path, before_s: float) -> int:
     removed = 0
     for path in folder.iterdir():
-        if path.lstat().st_mtime >= before_s:
+        # A query session that is kept has its folder for as long as it lives.
+        if path.lstat().st_mtime >= before_s or path.name.startswith(SCRATCH_PREFIX):
             continue
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import os
 import shutil
 import signal
 import socket
 import sys
+import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
@@ -51,6 +57,18 @@ TOO_MANY = (
 
 HEAD_S = 15.0
 """Seconds in which the head of a request has to be there, and what is left of the one before."""
+
+
+MIN_END_S = 8.0
+LAST_S = 1.5
+"""Seconds from ``shutdown_s``, or from `MIN_END_S` if that is later, until the process is ended
+without waiting for its threads. A signal has ended the server within 10 s if ``shutdown_s`` is not
+longer than by default."""
+
+CLEAN_S = 0.3
+"""Seconds for ending the processes that the server has started, before it ends itself."""
+
+_logger = logging.getLogger(__name__)
 
 
 class OurProtocol(H11Protocol):
@@ -113,6 +131,8 @@ def run_server(settings: Settings, announce: Announce) -> None:
         raise _without_token(settings)  # before anything is made
     with _only_server(paths):
         shutil.rmtree(paths.scratch, ignore_errors=True)
+        # For uploads that are larger than a megabyte, and for what child processes write.
+        os.environ["TMPDIR"] = tempfile.tempdir = str(paths.scratch)
         _serve(settings, announce)
 
 
@@ -164,6 +184,36 @@ class _Server(uvicorn.Server):
         self._service: Service = app.state.service
         self._slots: JobSlots = app.state.slots
         self._announce = announce
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to stop, and see that the process ends in time even if a thread is blocked."""
+        if not self.should_exit:
+            after_s = max(self._service.settings.shutdown_s, MIN_END_S) + LAST_S - CLEAN_S
+            threading.Thread(target=self._end_after, args=(after_s,), daemon=True).start()
+        super().handle_exit(sig, frame)
+
+    def _end_after(self, wait_s: float) -> None:
+        """End the process, with the processes that it has started, after some time.
+
+        Python waits at its end for threads that are not daemons, and so does the event loop. A
+        thread that is blocked in the system would keep both for ever.
+        """
+        time.sleep(wait_s)
+        service = self._service
+        closing = (
+            self._slots.processes.end_all,
+            service.query_pool.close,
+            service.sandbox.close,
+            lambda: _logger.warning("threads were blocked: the server ended without them"),
+        )
+        # Each in a thread of its own: closing can wait for what is blocked.
+        threads = [threading.Thread(target=one, daemon=True) for one in closing]
+        for thread in threads:
+            thread.start()
+        until_s = time.monotonic() + CLEAN_S
+        for thread in threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+        os._exit(0)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to answer."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from starcat_service.catalogs import Catalogs
+from starcat_service.estimates import ChildCatalogs
 from starcat_service.jobs.job import JobStore
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
@@ -36,7 +36,7 @@ class Service:
         self.sandbox = Sandbox(settings, self.paths.scratch)
         self.tap = Tap(settings, self.paths, self.library, self.query_pool, self.sandbox)
         self.query_jobs = QueryJobs(self.records, self.paths, self.tap, self.wake_slots)
-        self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
+        self.catalogs = ChildCatalogs(round(settings.job_memory_gib * GIB))
         self.stopping = threading.Event()
 
     def wake_slots(self) -> None:

@@ -10,10 +10,12 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError, SourceError, suggest
 from starcat.failures import validation_message
+from starcat.storage.regular_files import read_regular_file
 
 FILE_NAME = "service.toml"
+MAX_FILE_BYTES = 1 << 20
 
 RoleName = Literal["none", "reader", "builder", "publisher"]
 
@@ -70,6 +72,11 @@ class Settings(BaseModel):
         2, ge=1, le=64, description="Queries that take long and run at the same time."
     )
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
+    rows_mib: float = Field(
+        16.0,
+        gt=0,
+        description="Size of an answer in rows (JSON) at most, MiB; larger answers are files.",
+    )
     upload_mib: float = Field(64.0, gt=0, description="Size of an upload at most, MiB.")
     upload_time_s: float = Field(60.0, gt=0, description="Seconds that an upload may take.")
     requests_per_minute: int = Field(
@@ -92,7 +99,10 @@ class Settings(BaseModel):
     )
     session_hours: float = Field(12.0, gt=0, description="Hours that a sign-in lasts.")
     shutdown_s: float = Field(
-        20.0, ge=0, description="Seconds that jobs have to end when the service stops."
+        8.0,
+        ge=0,
+        description="Seconds that requests and jobs have to end when the service stops. The "
+        "process ends after 10 s, or 2 s after a longer shutdown_s, whatever still runs.",
     )
 
     @property
@@ -127,8 +137,8 @@ def read_settings(root: Path, **options: object) -> Settings:
     content: dict[str, object] = {}
     if path.exists():
         try:
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            content = tomllib.loads(read_regular_file(path, MAX_FILE_BYTES).decode("utf-8"))
+        except (SourceError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     content |= {name: value for name, value in options.items() if value is not None}
     if "queue_url" in content:

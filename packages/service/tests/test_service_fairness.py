@@ -273,8 +273,9 @@ def test_jobs_of_tap_are_shared_by_address(root, monkeypatch):
         assert "2 of your jobs are not at their end" in refused.text
         assert other.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
         jobs = client.app.state.service.query_jobs
-        for job in jobs.jobs("anonymous"):
-            jobs.delete(job.job_id)
+        for address in ("192.0.2.1", "192.0.2.2"):
+            for job in jobs.jobs("anonymous", address):
+                jobs.delete(job.job_id)
 
 
 def test_jobs_that_wait_are_begun_in_turns(root):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import shutil
 import socket
 import sqlite3
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from services import waiting_build
+from services import add_database, waiting_build
 
 pytest.importorskip("fastapi")
 
@@ -25,6 +26,9 @@ from starcat.errors import ConfigError, TargetMissing
 from starcat_service import access, removal
 from starcat_service.access import Reader, principal_of
 from starcat_service.app import make_app
+from starcat_service.library import Library
+from starcat_service.pages import home
+from starcat_service.paths import ServicePaths
 from starcat_service.security import request_limits
 from starcat_service.security.middleware import JsonFormatter
 from starcat_service.security.request_limits import Buckets
@@ -504,3 +508,38 @@ def test_a_port_that_is_taken_is_told(tmp_path):
         port = listening.getsockname()[1]
         with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1, port {port}: .*--port"):
             listen(Settings(root=tmp_path, port=port))
+
+
+def test_a_path_that_begins_as_an_open_one_is_not_open(client):
+    at = client(anonymous="none")
+    assert at.get("/sign-in").status_code == 200
+    assert at.get("/healthz").status_code == 200
+    for path in ("/sign-inx", "/healthzx", "/api/uploads", "/tap/availability/x"):
+        assert at.get(path).status_code == 401, path
+
+
+def test_a_status_has_one_title_on_every_python(client):
+    at = client()
+    missing = at.post("/api/v1/sql", json={}).json()
+    wrong = at.post("/api/v1/specs/validate", json={"preset": "none"}).json()
+    assert missing["title"] == wrong["title"] == "Unprocessable Content"
+
+
+def test_a_library_forgets_databases_that_were_removed(tmp_path, small_artifact):
+    folder = add_database(tmp_path, small_artifact)
+    library = Library(ServicePaths(tmp_path))
+    assert len(library.databases()) == len(library._known) == 1
+    shutil.rmtree(folder)
+    assert library.databases() == []
+    assert not library._known
+
+
+def test_a_defect_on_a_page_is_told_by_a_page(client, monkeypatch):
+    def fail(*_: object) -> None:
+        raise RuntimeError("a secret")
+
+    monkeypatch.setattr(home, "render", fail)
+    answer = client().get("/")
+    assert answer.status_code == 500
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "a secret" not in answer.text

@@ -359,7 +359,7 @@ def test_a_service_of_an_earlier_version_opens(tmp_path):
     service = Service(Settings(root=tmp_path))
     assert begin(service, service.jobs.all()[0]).job.id == f"{1:032x}"
     assert service.jobs.count() == 1
-    csv, failed = service.query_jobs.jobs("anne")
+    csv, failed = service.query_jobs.jobs("anne", "")
     assert (csv.phase, csv.media_type, csv.error) == ("COMPLETED", "text/csv", "")
     assert (failed.phase, failed.error, failed.run_id) == ("ERROR", "no column", "mine")
     assert failed.parameters == (("QUERY", "SELECT 1"),)

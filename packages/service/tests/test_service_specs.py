@@ -111,7 +111,7 @@ def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkey
         ("[", None, "not a readable TOML file"),
         ("a." * 20_000 + "a = 1", None, "20,000 full stops"),
         ("a = " + "[" * 20_000, None, "nested too deep"),
-        ("x = 0x" + "f" * 50_000, "x", "unknown key"),
+        ("x = 0x" + "f" * 50_000, "x", "found a number of 200,000 bits"),
         ("#" * 150_000, None, "150,000 characters"),
         ("\ud800".encode("utf-8", "surrogatepass"), None, "not a readable TOML file"),
     ],

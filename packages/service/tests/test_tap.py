@@ -28,6 +28,7 @@ from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER
 from starcat_service.protocols.parameters import Question
+from starcat_service.sandbox.places import asker
 from starcat_service.service import Service
 from starcat_service.settings import Settings
 from starcat_service.vo.tap import ClientGone, Spool
@@ -553,7 +554,9 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     settings = Settings(root=root)
     service = Service(settings)
     jobs = service.query_jobs
+    client_of_jobs = asker.set("testclient")  # without a token, jobs belong to their client
     made = [jobs.create("anonymous").job_id for _ in range(3)]
+    asker.reset(client_of_jobs)
     for job_id in made:
         jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
     for job_id in made[:2]:
@@ -580,12 +583,12 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
 
         assert names() == ["tap_schema"]
         add_database(root, small_artifact)
-        assert names() == ["small", "tap_schema"]
+        assert names() == ["small", "small_1_0_0", "tap_schema"]
         other = add_database(root, small_artifact, "fedcba9876543210")
         catalog = f"2mass-{'0' * 16}.parquet"
         shutil.copyfile(stars, root / "catalogs" / catalog)
         quoted = f'"_2mass_{"0" * 16}"'
-        assert names() == ["small_1_0_0", "small_1_0_0_2", quoted, "tap_schema"]
+        assert names() == [quoted, "small", "small_1_0_0", "small_1_0_0_2", "tap_schema"]
         query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
         found = table_of(client.get("/tap/sync", params={"QUERY": query}))
         assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
@@ -594,7 +597,37 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
         (other / "manifest.json").touch()
         catalogs = root / "catalogs"
         (catalogs / catalog).rename(catalogs / f"2mass-{'1' * 16}.parquet")
-        assert names() == ["small", quoted.replace("0", "1"), "tap_schema"]
+        assert names() == [quoted.replace("0", "1"), "small", "small_1_0_0", "tap_schema"]
+
+
+def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, artifact_version):
+    root = tmp_path / "service"
+    versions = {"1.10.0": "a" * 16, "1.9.0": "b" * 16}
+    queries = [
+        f"SELECT star_id, mag FROM {table} ORDER BY star_id"
+        for table in ("small_1_0_0.stars", "small.stars")
+    ]
+    with client_of(root) as client:
+
+        def rows(query: str) -> list[tuple[int, float]]:
+            return [
+                tuple(row) for row in table_of(client.get("/tap/sync", params={"QUERY": query}))
+            ]
+
+        add_database(root, small_artifact)
+        before = rows(queries[0])
+        assert rows(queries[1]) == rows("SELECT star_id, mag FROM stars ORDER BY star_id") == before
+        for version, name in versions.items():
+            add_database(root, artifact_version(version), name)
+        assert [rows(query) for query in queries] == [before, before]
+        about = "SELECT schema_name, description FROM tap_schema.schemas ORDER BY schema_name"
+        told = dict(rows(about))
+        assert list(told) == ["small", "small_1_0_0", "small_1_10_0", "small_1_9_0", "tap_schema"]
+        assert told["small"].startswith("The newest version: the tables of small_1_10_0.")
+        # A database of the same name and version comes after those that are there.
+        add_database(root, picky_artifact, "0" * 16)
+        assert rows(queries[0]) == before
+        assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)
 
 
 def test_without_a_role_nothing_is_told(tmp_path):

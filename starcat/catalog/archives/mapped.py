@@ -29,7 +29,8 @@ from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
 from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 from starcat.errors import ConfigError, quoted
 
-_WHOLE = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
+_WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
+_INT64 = range(-(2**63), 2**63)
 _SEXAGESIMAL = (
     r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
     r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
@@ -272,19 +273,21 @@ class _Reading:
                 np.where(wrong, 0.0, array).astype(np.int64), mask=np.asarray(values.is_null())
             )
         texts = np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
-        if pa.types.is_integer(values.type) and values.type != pa.uint64():
-            return np.array(pc.fill_null(values.cast(pa.int64()), 0)), texts
+        with suppress(pa.ArrowInvalid):
+            if pa.types.is_integer(values.type):
+                return np.array(pc.fill_null(values.cast(pa.int64()), 0)), texts
         return np.array([identity(text) for text in texts], dtype=np.int64), texts
 
 
 def identity(text: str | None) -> int:
     """Return the permanent number of a star that is named by a text; 0 for no text.
 
-    Digits are the number that they write; any other text is 62 bits of its SHA-256.
+    Digits are the number that they write, if 64 bits with a sign hold it (below 2^63). Any other
+    text, and thus a larger number, becomes 62 bits of its SHA-256.
     """
     if text is None:
         return 0
-    if whole := _WHOLE.fullmatch(text):
+    if (whole := _WHOLE.fullmatch(text)) and int(whole[1]) in _INT64:
         return int(whole[1])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 2
 

@@ -16,6 +16,7 @@ from starcat.catalog.readers.records import Rows, line_ends
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
+from starcat.storage.regular_files import check_regular_file
 
 BLOCK_BYTES = 1 << 22
 GZIP_MAGIC = b"\x1f\x8b"
@@ -62,6 +63,7 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
 
     Compression is recognised by content, not by name.
     """
+    check_regular_file(path)
     try:
         with path.open("rb") as file:
             is_gzip = file.read(2) == GZIP_MAGIC

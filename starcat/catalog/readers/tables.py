@@ -325,11 +325,23 @@ def _read_fits(path: Path, number: int, wanted: Sequence[str]) -> Iterator[_Part
             part = data[start : start + BLOCK_ROWS]
             arrays = {}
             for name in wanted:
-                values = np.asarray(part[name])
-                blank = columns[name].null
-                is_blank = values == blank if isinstance(blank, int) else None
-                arrays[name] = _arrow(values, is_blank)
+                is_null = _fits_nulls(part, name, columns[name].null)
+                arrays[name] = _arrow(np.asarray(part[name]), is_null)
             yield _table(arrays, len(part)), None, []
+
+
+def _fits_nulls(part: NDArray[Any], name: str, null: int | str | None) -> NDArray[np.bool_] | None:
+    """Return the rows whose stored value is TNULL; None for a column without TNULL.
+
+    TNULL is compared with the values as they are stored: before TSCAL and TZERO, and in a table of
+    characters before astropy turns null values into zeros.
+    """
+    if null is None:
+        return None
+    stored = part.view(np.ndarray)[name]
+    if stored.dtype.kind == "S":
+        return np.asarray(np.char.strip(stored) == str(null).strip().encode("latin-1"))
+    return np.asarray(stored == null) if isinstance(null, int) else None
 
 
 def _arrow(values: NDArray[Any], is_blank: NDArray[np.bool_] | None = None) -> pa.Array:

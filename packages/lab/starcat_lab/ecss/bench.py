@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix, Pixels, Rows
+from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import (
     after_turn,
@@ -28,7 +29,7 @@ from starcat.geometry.attitude import (
     turn_between,
 )
 from starcat.geometry.camera import Camera
-from starcat.images.centroiding import Spots, find_spots
+from starcat.images.centroiding import Spots, centres_of_mass, find_spots
 from starcat.images.render import Optics, star_electrons
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import REACH
@@ -65,6 +66,7 @@ class Bench:
     matcher: Matcher
     sky: Sky  # as the catalog has it
     seed: int
+    box_px: int | None = None  # of a centroid that is the centre of mass in a box
 
     @property
     def camera(self) -> Camera:
@@ -182,11 +184,15 @@ class Bench:
         return self._found(image).centroids_px
 
     def _found(self, image: NDArray[np.uint16]) -> Spots:
-        return find_spots(
-            image,
-            threshold_sigma=self.sensor.threshold_sigma,
-            psf_sigma_px=self.sensor.psf_sigma_px,
+        sensor = self.sensor
+        found = find_spots(
+            image, threshold_sigma=sensor.threshold_sigma, psf_sigma_px=sensor.psf_sigma_px
         )
+        if self.box_px is None:
+            return found
+        dark = sensor.offset_adu + sensor.background_e / sensor.gain_e_adu
+        light = image.astype(np.float64) - dark
+        return replace(found, centroids_px=centres_of_mass(light, found.centroids_px, self.box_px))
 
     def exposures(
         self,
@@ -256,7 +262,10 @@ class Bench:
 
 def open_bench(artifact: Path, sensor: Sensor, seed: int, method: str | None) -> Bench:
     """Return the bench of a database's own camera and stars."""
-    return Bench(sensor, Matcher.open(artifact, method), catalog_of_artifact(artifact), seed)
+    selection = open_artifact(artifact).manifest["spec"]["selection"]
+    box_px = selection.get("neighbours", {}).get("box_px")
+    sky = catalog_of_artifact(artifact)
+    return Bench(sensor, Matcher.open(artifact, method), sky, seed, box_px)
 
 
 cached_bench = lru_cache(maxsize=1)(open_bench)

@@ -14,6 +14,7 @@ import numpy as np
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.geometry.attitude import information, quaternion_from_matrix, solve_wahba_svd
 from starcat.images.background import load_sep
+from starcat.images.centroiding import centres_of_mass
 from starcat.matcher.stars import ARCSEC
 from starcat.products.blends import widths_px
 from starcat.sky.observer import aberrated
@@ -26,7 +27,7 @@ CONTRIBUTORS = {
     "sampling": "pixel spatial error: sampling of the spot, full well",
     "prnu": "pixel spatial error: PRNU",
     "dsnu": "pixel spatial error: DSNU",
-    "blends": "neighbouring stars in the window",
+    "blends": "neighbouring stars in the window or box",
     "distortion": "FOV spatial error: focal length, principal point and distortion",
     "catalog": "FOV spatial error: catalog",
     "aberration": "aberration residual",
@@ -119,8 +120,13 @@ def contributions(
 
 
 def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
-    """Return where the window settles in light without noise; it starts at the true places."""
+    """Return the centroids of light without noise, as the spec of the database says it is measured.
+
+    A window settles from the true places on; a box is around the brightest pixel next to them.
+    """
     held = np.minimum(light, bench.sensor.full_well_e)
+    if bench.box_px is not None:
+        return centres_of_mass(held, places, bench.box_px)
     start = np.ascontiguousarray((places - 0.5).T)
     window = widths_px(bench.sensor.psf_sigma_px).window
     x, y, _ = load_sep().winpos(held, *start, window, subpix=0)

@@ -10,14 +10,19 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import secrets
+import threading
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import unquote_to_bytes
 
 from cachetools import TTLCache
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, Response
 from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
+from starlette.types import Message
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.images.identify_options import IdentifyOptions
@@ -35,6 +40,9 @@ router = APIRouter(include_in_schema=False)
 
 _MOST, _KEPT_S = 2_000, 3_600.0
 _ANONYMOUS = "anonymous"
+_HEAD_BYTES = 1 << 16
+_SESSION = re.compile(rb'"session"[\s+]*:[\s+]*"([A-Za-z0-9._-]{1,200})"')
+_URLENCODED = "application/x-www-form-urlencoded"
 _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
 """Units of a scale that are of the width of a picture, degrees."""
 
@@ -58,18 +66,25 @@ class Solutions:
     """What was found in the last hour."""
 
     known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, solution: Solution) -> int:
         """Keep a solution and return its number."""
         number = secrets.randbits(52)  # JSON's numbers are exact so far
-        self.known[number] = solution
+        with self.lock:
+            self.known[number] = solution
         return number
+
+    def get(self, number: int) -> Solution | None:
+        """Return the solution of a number, if it is still known."""
+        with self.lock:
+            return self.known.get(number)
 
 
 def solution_of(request: Request, number: int) -> Solution:
     """Return what was found under a number."""
     solutions: Solutions = request.app.state.solutions
-    found = solutions.known.get(number)
+    found = solutions.get(number)
     if found is None:
         raise Problem(404, f"no job {number}: results are kept for an hour, until a restart")
     return found
@@ -78,8 +93,11 @@ def solution_of(request: Request, number: int) -> Solution:
 @router.post("/api/login")
 async def login(request: Request) -> Response:
     """Begin a session: the key is a token of this service, anything where none is needed."""
-    async with request.form(max_files=0, max_fields=2) as form:
-        key = str(_given(form).get("apikey") or "")
+    try:
+        async with request.form(max_files=0, max_fields=2) as form:
+            key = str(_given(form).get("apikey") or "")
+    except (Problem, HTTPException) as error:
+        return _error_of(error)
     identities: Identities = request.app.state.identities
     token = identities.of_token(key.strip())
     if token is not None:
@@ -96,7 +114,7 @@ async def login(request: Request) -> Response:
 async def upload(request: Request, service: TheService) -> Response:
     """Solve a picture, and return the number of its submission."""
     try:
-        async with request.form(max_files=1, max_fields=4) as form:
+        async with (await _with_session(request)).form(max_files=1, max_fields=4) as form:
             given, file = _given(form), form.get("file")
             _check_session(request, given)
             if isinstance(file, UploadFile):
@@ -104,9 +122,8 @@ async def upload(request: Request, service: TheService) -> Response:
             else:
                 frames = _centroids(given)
             solution = await service.sandbox.run(_solve, service, frames, given)
-    except (Problem, StarcatError) as error:
-        problem = problem_of(error)
-        return _error(problem.status, problem.detail)
+    except (Problem, StarcatError, HTTPException) as error:
+        return _error_of(error)
     number = request.app.state.solutions.add(solution)
     return JSONResponse({"status": "success", "subid": number, "hash": f"{number:013x}"})
 
@@ -328,8 +345,38 @@ def _check_session(request: Request, given: dict[str, Any]) -> None:
         raise Problem(401, "no valid session: log in at /api/login first, with a token as apikey")
 
 
+async def _with_session(request: Request) -> Request:
+    """Return a request whose file may be read: that of somebody who may read, or has a session.
+
+    Clients send the session before the file, so the first bytes of the body have it.
+    """
+    if principal_of(request).role >= Role.READER:
+        return request
+    received: list[Message] = []
+    begin = b""
+    is_whole = False
+    while len(begin) < _HEAD_BYTES and not is_whole:
+        received.append(await request.receive())
+        begin += received[-1].get("body", b"")
+        is_whole = not received[-1].get("more_body", False)
+    if request.headers.get("content-type", "").startswith(_URLENCODED):
+        begin = unquote_to_bytes(begin)
+    session = _SESSION.search(begin[:_HEAD_BYTES])
+    _check_session(request, {"session": session[1].decode() if session else ""})
+
+    async def receive() -> Message:
+        return received.pop(0) if received else await request.receive()
+
+    return Request(request.scope, receive)
+
+
 def _names(solution: Solution) -> list[str]:
     return [star["star"] for star in solution.frame["stars"] if star["star"]]
+
+
+def _error_of(error: Exception) -> Response:
+    problem = problem_of(error)
+    return _error(problem.status, problem.detail)
 
 
 def _error(status: int, text: str) -> Response:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
+from starcat.query.engine import AnswerTooLarge
 from starcat.query.gallery import gallery, macros, named_query
 from starcat.query.result import ResultTable
 from starcat.query.targets import View
@@ -143,8 +144,20 @@ def result_table(service: Service, query: SqlQuery) -> ResultTable:
         service.query_pool.session(paths, query.time_s) as session,
         session.ask(query.text, query.values) as running,
     ):
-        found: ResultTable = running.table(query.max_rows)
+        try:
+            found: ResultTable = running.table(query.max_rows)
+        except AnswerTooLarge as error:
+            raise _too_large(service) from error
     return found
+
+
+def _too_large(service: Service) -> Problem:
+    return Problem(
+        413,
+        f"the rows of the answer take more than {service.settings.rows_mib:g} MiB (rows_mib); ask "
+        f"for fewer rows (max_rows) or columns, or for a file (format: {', '.join(FILE_FORMATS)})",
+        key="max_rows",
+    )
 
 
 def result_file(
@@ -244,7 +257,10 @@ def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
 
 def _rows(service: Service, query: SqlQuery) -> Response:
     # What JSON has was made sure of: a model would check every value once more.
-    return JSONResponse(result_table(service, query).as_json())
+    answer = JSONResponse(result_table(service, query).as_json())
+    if len(answer.body) > service.settings.rows_mib * 2**20:
+        raise _too_large(service)
+    return answer
 
 
 def _file(service: Service, query: SqlQuery, form: str) -> Response:
@@ -257,7 +273,7 @@ def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
     with service.query_pool.session([service.library.target(name) for name in targets]) as session:
         return [
             ViewFacts(
-                target=target.name,
+                target=target.short_name,
                 view=view.name,
                 description=view.schema.description if view.schema else "",
                 columns=_columns(view),

@@ -46,7 +46,7 @@ PAUSE_S = 5.0
 DISK_TICK_S = 2.0
 """How often the disk that a job takes is counted."""
 
-GRACE_S = 10.0
+GRACE_S = 1.0
 """Seconds that slots have beyond the time of their jobs to end."""
 
 WAIT_S = 10.0
@@ -107,7 +107,7 @@ class JobSlots:
     def stop(self) -> None:
         """Stop, and wait until all slots have ended."""
         self.begin_stop()
-        until_s = time.monotonic() + self.service.settings.shutdown_s + GRACE_S
+        until_s = (self.stop_at_s or 0.0) + GRACE_S
         for thread in self._threads:
             thread.join(max(0.0, until_s - time.monotonic()))
         self.processes.end_all()

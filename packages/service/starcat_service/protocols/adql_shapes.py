@@ -23,7 +23,6 @@ FRAMES = ("", "ICRS", "UNKNOWNFRAME", "GALACTIC")
 
 _MAX_INTEGER = 2**63 - 1
 _SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
-_FRAME_WORDS = {"ICRS", "GALACTIC", "GEOCENTER", "BARYCENTER", "TOPOCENTER", "SPHERICAL2"}
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
@@ -116,7 +115,7 @@ class GeometryCalls:
         shapes = [shape for shape in found if shape is not None]
         if len(shapes) < count:
             raise Refusal(
-                f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, REGION, CENTROID, written "
+                f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, CENTROID, written "
                 "out as its arguments",
                 part,
             )
@@ -177,20 +176,7 @@ def _polygon(part: exp.Anonymous) -> Shape:
 
 
 def _region(part: exp.Anonymous) -> Shape:
-    check_count(part, 1, 1)
-    [argument] = part.expressions
-    words = argument.name.upper().split() if is_text(argument) else []
-    numbers = [number_sql(word) for word in words if _is_number(word)]
-    name, *frame = words[: len(words) - len(numbers)] or [""]
-    is_read = set(frame) <= _FRAME_WORDS and not any(map(_is_number, frame))
-    made = _made("POINT" if name == "POSITION" else name, numbers) if is_read else None
-    if made is None:
-        raise Refusal(
-            "REGION takes a text such as 'CIRCLE ICRS 10.5 -20 0.1', with POSITION, CIRCLE, BOX or "
-            "POLYGON",
-            part,
-        )
-    return geometry.from_galactic(made) if "GALACTIC" in frame else made
+    raise Refusal("REGION is not supported; write CIRCLE, BOX or POLYGON with numbers", part)
 
 
 def _made(name: str, numbers: list[str]) -> Shape | None:
@@ -256,11 +242,3 @@ def _operand(part: exp.Expr) -> str:
     """Return SQL that arithmetic may be written around."""
     sql = sql_text(part)
     return sql if isinstance(part, (exp.Column, exp.Var)) else f"({sql})"
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return word[-1].isdigit() or word[-1] == "."

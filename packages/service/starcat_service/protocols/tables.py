@@ -114,6 +114,7 @@ class Schema:
     name: str
     description: str
     tables: tuple[Table, ...]
+    is_alias: bool = False  # whether its tables are those of another schema as well
 
 
 class Tables:
@@ -146,7 +147,12 @@ class Tables:
         """Return a table."""
         if schema:
             return self._found.get((schema.lower(), name.lower()))
-        named = [table for (_, one), table in self._found.items() if one == name.lower()]
+        named = [
+            table
+            for one in self.schemas
+            for table in one.tables
+            if not one.is_alias and table.name.lower() == name.lower()
+        ]
         return named[0] if len(named) == 1 else None
 
     def names(self) -> list[str]:
@@ -289,15 +295,17 @@ def own_schema() -> Schema:
 
 
 def session_schemas(session: Session, about: Mapping[str, str]) -> tuple[Schema, ...]:
-    """Return the schemas of the targets of a session."""
-    return tuple(
-        Schema(
-            target.name,
-            about.get(target.name, ""),
-            tuple(_table(session, target.name, view) for view in target.views),
-        )
-        for target in session.targets
-    )
+    """Return the schemas of the targets of a session: each under its own name and its alias."""
+    found = []
+    for target in session.targets:
+        tables = tuple(_table(session, target.name, view) for view in target.views)
+        told = about.get(target.name, "")
+        found.append(Schema(target.name, told, tables))
+        if target.alias:
+            same = tuple(replace(table, schema=target.alias) for table in tables)
+            told = f"The newest version: the tables of {target.name}. {told}"
+            found.append(Schema(target.alias, told, same, is_alias=True))
+    return tuple(sorted(found, key=lambda schema: schema.name))
 
 
 def _table(session: Session, schema: str, view: View) -> Table:

@@ -145,8 +145,11 @@ class _Inspection:
         try:
             with self.path.open("rb") as stream:
                 parser.ParseFile(stream)
-        except expat.ExpatError as error:
-            raise _refusal(self.name, f"is no XML ({error})") from error
+        # Of encodings: ValueError for one of several bytes, LookupError for an unknown one.
+        except (expat.ExpatError, ValueError, LookupError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise _refusal(self.name, f"is no XML that can be read ({error})") from error
         rows = max(self.rows, self.stated_rows)
         most = max(LEAST_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
         if rows * self.width > most:

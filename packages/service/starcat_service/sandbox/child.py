@@ -16,6 +16,10 @@ from typing import IO, Any
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from {module} import {name}; {name}()"
 
 
+MAX_LINE_BYTES = 256 << 20
+"""Size of a line that a child may send; one that sends more is ended."""
+
+
 class Child:
     """A process of this Python that calls a function, which reads stdin and writes stdout.
 
@@ -77,6 +81,9 @@ class Child:
                     if not data:
                         return
                     self._received += data
+                    if len(self._received) > MAX_LINE_BYTES:
+                        self.kill()
+                        return
                     if b"\n" in data:
                         *lines, self._received = self._received.split(b"\n")
                         yield from map(bytes, lines)

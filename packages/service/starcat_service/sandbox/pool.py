@@ -15,6 +15,8 @@ from typing import Generic, ParamSpec, Protocol, TypeVar
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.engine import Allowance, warm_up
 from starcat.query.session import Limits, Session, open_session
+from starcat.storage.atomic import make_folder
+from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
 from starcat_service.settings import Settings
 
@@ -33,6 +35,9 @@ BEGINNING = 2
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query may take for what does not fit into its memory."""
+
+ROW_BYTES = 64 << 20
+"""Size of a row of a file at most."""
 
 GIB_IN_GB = 2**30 / 1e9
 
@@ -196,7 +201,12 @@ class QueryPool:
 
     def __init__(self, settings: Settings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
-        self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
+        rows_bytes = round(settings.rows_mib * 2**20)
+        self._limits = Limits(
+            settings.query_time_s, memory_gb, DISK_GB, max(ROW_BYTES, rows_bytes), rows_bytes
+        )
+        # In the root: its disk is watched, and the folder is emptied at each start.
+        self._scratch = ServicePaths(settings.root).scratch
         self._lanes = Lanes(SHORT_PLACES, settings.queries)
         # What was interrupted is lent again: a process that has not heard in time is gone.
         self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError, Overdue))
@@ -235,7 +245,9 @@ class QueryPool:
 
     @contextmanager
     def _begin(self, key: Key) -> Iterator[Session]:
-        with open_session([text for text, *_ in key], self._limits) as session:
+        make_folder(self._scratch)
+        targets = [text for text, *_ in key]
+        with open_session(targets, self._limits, within=self._scratch) as session:
             warm_up(SPARE)
             yield session
 

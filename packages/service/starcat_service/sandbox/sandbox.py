@@ -12,11 +12,14 @@ import signal
 from collections.abc import Callable, Mapping
 from contextlib import closing, nullcontext
 from contextvars import ContextVar
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from starcat.errors import QueryLimitError, error_of_kind
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, WHOLE_FORMATS
 from starcat_service.problems import Problem
 from starcat_service.sandbox.child import Child
 from starcat_service.sandbox.places import WAIT_S, Places, asker, held, in_thread
@@ -29,6 +32,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _has_place: ContextVar[bool] = ContextVar("has_place", default=False)
+
+
+class _OutOfMemory(Problem):
+    """A task needed more memory than it may take."""
 
 
 class Sandbox:
@@ -59,19 +66,35 @@ class Sandbox:
         with place, self._children.lend(None) as child:
             answer = self._answer(child, {"task": task, "arguments": arguments})
             if answer.get("kind") == "MemoryError":
-                raise Problem(
+                raise _OutOfMemory(
                     413, "it takes more memory than a request may; send less, or a smaller picture"
+                )
+            if answer.get("kind") == "RecursionError":
+                raise Problem(
+                    422, "the file is nested too deep to be read; send it with fewer levels"
                 )
         if "kind" not in answer:
             return answer["found"]
         if answer["errno"] is not None:
             raise OSError(answer["errno"], answer["message"])
-        error = error_of_kind(answer["kind"], answer["message"], key=answer["key"])
+        error = error_of_kind(
+            answer["kind"], answer["message"], key=answer["key"], fields=answer["fields"]
+        )
         raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
 
-    def convert(self, source: Path, target: Path, form: str) -> None:
+    def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:
         """Have an Arrow stream made a file of some format: some need the table in memory."""
-        self.call("convert", {"source": str(source), "target": str(target), "form": form})
+        given = {"source": str(source), "target": str(target), "form": form}
+        try:
+            self.call("convert", {**given, "label": None if label is None else asdict(label)})
+        except _OutOfMemory:
+            others = [name for name in FILE_FORMATS if name not in WHOLE_FORMATS]
+            raise Problem(
+                413,
+                f"the table takes more memory as {FORMATS[form].title} than a request may "
+                f"({self._memory_bytes / GIB:g} GiB); choose {', '.join(others)}, which are "
+                "written row by row, or ask for fewer rows",
+            ) from None
 
     def _begin(self, _: None) -> closing[Child]:
         child = Child(

@@ -6,6 +6,7 @@ run anything.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from starcat.images.solve_files import FileAnswers, FrameAnswer
     from starcat.matcher.matcher import Matcher
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
 MATCHERS = 4
 """Databases that are kept open with the options that they were opened with."""
 
@@ -90,14 +92,16 @@ def _matcher(artifact: str, options: IdentifyOptions) -> Matcher:
     return open_matcher(Path(artifact), options)
 
 
-def convert(source: str, target: str, form: str) -> int:
+def convert(source: str, target: str, form: str, label: dict[str, str] | None = None) -> int:
     """Write a table to a file of another format: some are held in memory as a whole."""
     import pyarrow as pa
 
+    from starcat.exchange.columns import UNLABELLED, Label
     from starcat.exchange.writers import write_batches
 
+    named = UNLABELLED if label is None else Label(**label)
     with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
-        return write_batches(stream, Path(target), form)
+        return write_batches(stream, Path(target), form, named)
 
 
 def flight_image(artifact: str, target: str, method: str, endian: str) -> int:
@@ -148,5 +152,17 @@ def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, An
             "kind": kind,
             "message": str(error)[:4000],
             "key": None if key is None else str(key),
-            "errno": getattr(error, "errno", None),
+            "fields": list(getattr(error, "fields", ())),
+            "errno": _system_error(error),
         }
+
+
+def _system_error(error: BaseException) -> int | None:
+    """Return the number of the system's error; of a full disk also if another error tells of it."""
+    number = getattr(error, "errno", None)
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in FULL:
+            return cause.errno
+        cause = cause.__cause__
+    return number

@@ -26,10 +26,11 @@ from datetime import UTC, datetime
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from starcat_service.problems import Problem, as_json, outage_of
+from starcat_service.problems import Problem, as_json, outage_of, problem_response
 from starcat_service.sandbox.places import asker
 from starcat_service.security.metrics import Metrics
 from starcat_service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, address_of
@@ -248,4 +249,12 @@ class Defects(_HttpMiddleware):
             _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:
                 raise  # the server ends the connection, so that the client sees it is not whole
-            await as_json(error)(scope, receive, send)
+            await _as_the_route_says(error, scope)(scope, receive, send)
+
+
+def _as_the_route_says(error: Exception, scope: Scope) -> Response:
+    """Return a page for the error of a page, a VOTable for that of TAP, else JSON."""
+    try:
+        return problem_response(error, Request(scope))
+    except Exception:  # whatever has failed can fail here again
+        return as_json(error)

@@ -6,6 +6,7 @@ import asyncio
 import math
 import re
 import shutil
+import threading
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -19,7 +20,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import Message, Receive, Scope
 
 from starcat_service.problems import Problem
-from starcat_service.settings import Settings
+from starcat_service.settings import Role, Settings
 
 MOST_HEADERS, MOST_HEADER_BYTES, MOST_TARGET_BYTES = 100, 32_768, 16_384
 
@@ -32,6 +33,10 @@ TEXT_MIB = 1.0
 
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
+
+CHECKED = ("/api/upload",)
+"""Paths that take files of somebody without a token in a header: the body has a session, and the
+handler checks it before it reads the file. Elsewhere such a body is at most `TEXT_MIB`."""
 
 LEAST_FREE_GIB = 0.01
 """Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
@@ -57,17 +62,19 @@ class Buckets:
         self._size = per_minute
         self._clock = clock
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._lock = threading.Lock()
 
     def take(self, key: str) -> float:
         """Take one out of the bucket of a key."""
-        now_s = self._clock()
-        left, then_s = self._left.pop(key, (self._size, now_s))
-        left = min(self._size, left + (now_s - then_s) * self._per_s)
-        wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
-        self._left[key] = (left if wait_s else left - 1.0), now_s
-        if len(self._left) > MOST_BUCKETS:
-            self._left.popitem(last=False)
-        return wait_s
+        with self._lock:  # some handlers are threads
+            now_s = self._clock()
+            left, then_s = self._left.pop(key, (self._size, now_s))
+            left = min(self._size, left + (now_s - then_s) * self._per_s)
+            wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
+            self._left[key] = (left if wait_s else left - 1.0), now_s
+            if len(self._left) > MOST_BUCKETS:
+                self._left.popitem(last=False)
+            return wait_s
 
 
 class Shares:
@@ -153,6 +160,9 @@ class BodyLimits:
         headers = Headers(scope=scope)
         kind = headers.get("content-type", "").strip().lower()
         most_mib = self.settings.upload_mib
+        principal = scope.get("state", {}).get("principal")
+        if getattr(principal, "role", None) == Role.NONE and scope["path"] not in CHECKED:
+            most_mib = min(TEXT_MIB, most_mib)
         most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
         length = headers.get("content-length")
         if length is not None and not (length.isascii() and length.isdigit()):

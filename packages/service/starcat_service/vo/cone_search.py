@@ -12,7 +12,6 @@ from fastapi.responses import Response, StreamingResponse
 from starcat.errors import QueryLimitError, TargetMissing
 from starcat.exchange.columns import Label
 from starcat.exchange.votable_fields import error_document
-from starcat.exchange.writers import result_chunks
 from starcat.store.layout import is_store
 from starcat_service.access import Reader
 from starcat_service.problems import ProblemDetails
@@ -113,10 +112,9 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
         view = star_view(session)
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
-            scratch = service.paths.scratch
-            chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
+            chunks = service.tap.chunks(rows, asked.form, maxrec, label)
             held: SpooledTemporaryFile[bytes]
-            held = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
+            held = SpooledTemporaryFile(HELD_BYTES, dir=str(service.paths.scratch))  # noqa: SIM115
             try:
                 held.writelines(chunks)
             except BaseException:

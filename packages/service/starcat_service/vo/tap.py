@@ -41,7 +41,7 @@ from starcat_service.protocols.documents import (
     tableset,
 )
 from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, Question, question
-from starcat_service.sandbox.places import SHORT_S, Lease, Overdue, lease
+from starcat_service.sandbox.places import SHORT_S, Lease, Overdue, asker, lease
 from starcat_service.service import Service, TheService, service_of
 from starcat_service.transfers import body_type, scratch_folder
 
@@ -316,7 +316,7 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
 
     with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
         files = given.keep(folder) if folder else {}
-        files |= service.query_jobs.answers(asked.uploads, owner)
+        files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")

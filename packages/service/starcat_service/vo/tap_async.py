@@ -24,6 +24,7 @@ from starcat_service.protocols.uws import (
     parameters_document,
     results_document,
 )
+from starcat_service.sandbox.places import asker
 from starcat_service.service import Service, TheService
 from starcat_service.vo.tap import FORM, PREFIX, TheRequest, VOTableRoute, base_url
 from starcat_service.vo.tap_jobs import RESULT
@@ -40,7 +41,7 @@ PHASES = (*ACTIVE, "COMPLETED", "ERROR", "ABORTED", "UNKNOWN", "HELD", "SUSPENDE
 
 def own_job(job_id: str, service: TheService, who: Reader) -> JobFacts:
     """Return the job of a request, which is one of who asks."""
-    return service.query_jobs.job(job_id, who.name)
+    return service.query_jobs.job(job_id, who.name, asker.get())
 
 
 TheJob = Annotated[JobFacts, Depends(own_job)]
@@ -64,7 +65,7 @@ def list_jobs(
     since = None if after is None else _seconds("AFTER", after)
     found = [
         job
-        for job in service.query_jobs.jobs(who.name)
+        for job in service.query_jobs.jobs(who.name, asker.get())
         if (not phases or job.phase in phases) and (since is None or job.created_s > since)
     ]
     return _xml(jobs_document(found[:last], f"{base_url(request)}/async"))

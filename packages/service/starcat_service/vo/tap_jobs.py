@@ -16,6 +16,7 @@ from typing import Any
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing
 from starcat.storage.atomic import make_folder, whole_file
+from starcat_service.access import ANONYMOUS
 from starcat_service.jobs.job import ASKER, QUERY, Attempt, Outcome
 from starcat_service.paths import JOB_ID, ServicePaths, checked
 from starcat_service.problems import Problem, problem_of
@@ -92,14 +93,15 @@ class QueryJobs:
             )
         return self.job(job_id)
 
-    def job(self, job_id: str, owner: str | None = None) -> JobFacts:
-        """Return a job."""
+    def job(self, job_id: str, owner: str | None = None, client: str = "") -> JobFacts:
+        """Return a job; with an owner only if it is a job of that owner at that client."""
         row = self._row(job_id)
-        if owner not in (None, row["owner"]) or row["destroyed_s"] < time.time():
+        is_gone = row["destroyed_s"] < time.time()
+        if is_gone or (owner is not None and not _is_of(row, owner, client)):
             raise _no_job(job_id)
         return _facts(row)
 
-    def jobs(self, owner: str) -> list[JobFacts]:
+    def jobs(self, owner: str, client: str) -> list[JobFacts]:
         """Return all jobs of somebody, the newest first."""
         rows = self._records.rows(
             "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
@@ -108,18 +110,18 @@ class QueryJobs:
             owner,
             time.time(),
         )
-        return [_facts(row) for row in rows]
+        return [_facts(row) for row in rows if _is_of(row, owner, client)]
 
     def folder(self, job_id: str) -> Path:
         """Return the folder with the uploads and the answer of a job."""
         return self._paths.results / checked(job_id, JOB_ID, "job")
 
-    def answers(self, uploads: Sequence[Upload], owner: str) -> dict[str, Path]:
+    def answers(self, uploads: Sequence[Upload], owner: str, client: str) -> dict[str, Path]:
         """Return the answers of other jobs that a question is about, by the ids of these."""
         found = {}
         for one in uploads:
             if one.job_id:
-                phase = self.job(one.job_id, owner).phase
+                phase = self.job(one.job_id, owner, client).phase
                 found[one.job_id] = self.folder(one.job_id) / RESULT
                 if phase != "COMPLETED":
                     raise TargetMissing(f"UPLOAD of {one.table}: the job is {phase}, no answer yet")
@@ -201,7 +203,7 @@ class QueryJobs:
         job, folder = _facts(row), self.folder(job_id)
         asked = question(Parameters(job.parameters), self._tap.limits.rows)
         files = {part: folder / name for part, name in _request(row)["files"].items()}
-        files |= self.answers(asked.uploads, job.owner)
+        files |= self.answers(asked.uploads, job.owner, _request(row).get(ASKER, ""))
         with whole_file(folder / RESULT) as path, path.open("wb") as stream:
             for part in self._tap.answer(asked, files, job.limit_s, check):
                 check()
@@ -228,6 +230,12 @@ class QueryJobs:
 
 def _no_job(job_id: str) -> TargetMissing:
     return TargetMissing(f"no job has the id {job_id}; the list of jobs tells theirs")
+
+
+def _is_of(row: sqlite3.Row, owner: str, client: str) -> bool:
+    """Return whether a job is of somebody; those without a token are known by their address."""
+    is_same = owner != ANONYMOUS or _request(row).get(ASKER, client) == client
+    return bool(row["owner"] == owner) and is_same
 
 
 def _request(row: sqlite3.Row) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, StarcatError
 from starcat.exchange.columns import Label
-from starcat.exchange.formats import Format
+from starcat.exchange.formats import WHOLE_FORMATS, Format
 from starcat.exchange.writers import result_chunks
 from starcat.progress import Progress, no_progress
 from starcat.store.layout import is_store
@@ -93,9 +93,11 @@ class Tap:
 
     def _found(self) -> dict[Path, str]:
         """Return what there is on disk, and what each is."""
+        # Of two databases with one name and version, the older one keeps its schema.
+        databases = sorted(self._library.databases(), key=lambda one: one.built_ns)
         found = {
             database.folder: f"Guide-star database {database.name}, version {database.version}"
-            for database in self._library.databases()
+            for database in databases
         }
         for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and not path.stem.endswith("rejected")
@@ -144,20 +146,23 @@ class Tap:
             translated = translate(asked.query, state.tables)
             with self._query_pool.session(state.targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
-                yield from self._chunks(batches, asked.form, asked.max_rows)
+                yield from self.chunks(batches, asked.form, asked.max_rows, _LABEL)
 
-    def _chunks(
-        self, batches: pa.RecordBatchReader, form: Format, max_rows: int
+    def chunks(
+        self, batches: pa.RecordBatchReader, form: Format, max_rows: int, label: Label
     ) -> Iterator[bytes]:
-        """Yield an answer in a format; FITS, held in memory as a whole, is another process's."""
-        if form.name != "fits":
+        """Yield an answer in a format.
+
+        Formats that need the table in memory as a whole are made by a process of the sandbox.
+        """
+        if form.name not in WHOLE_FORMATS:
             scratch = self._paths.scratch
-            yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
+            yield from result_chunks(batches, form, scratch, label=label, maxrec=max_rows)
             return
         with scratch_folder(self._paths) as folder:
-            rows, result = folder / "rows.arrow", folder / "result.fits"
+            rows, result = folder / "rows.arrow", folder / f"result{form.suffix}"
             write_rows(batches, rows, max_rows)
-            self._sandbox.convert(rows, result, "fits")
+            self._sandbox.convert(rows, result, form.name, label)
             chunks = chunks_of(result.open("rb"))
         yield from chunks
 

@@ -1,0 +1,345 @@
+"""No request names a file of the server; and a server with blocked threads answers, and stops."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import requests
+import tomlkit
+from fastapi.routing import APIRoute
+from served import Served, serve
+from services import SPEC, add_database, client_of
+
+import starcat_service
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.local_files import keys_of_files
+from starcat.specs.reading import local_preset, preset, put_key
+from starcat_service.app import API, OTHERS, RESOURCES
+
+SERVICE = Path(starcat_service.__file__).parent
+READS_FILES = ("read_spec", "local_preset", "with_files_read", "read_response", "read_camera")
+UNKNOWN = "camera.response.no_such_key"
+REFUSED = "names a file"
+CANARY = "wavelength_nm,response\n500,0.0313373\n550,1\n600,0.0313373\n"
+
+KEYS = keys_of_files(BuildSpec)
+
+
+def test_keys_that_look_like_files_are_local_files() -> None:
+    assert {"camera.response.file", "camera.response.optics_file"} <= set(KEYS)
+    pattern = re.compile(r"(file|path|folder|directory)$")
+    properties = {
+        name
+        for section in BuildSpec.model_json_schema()["$defs"].values()
+        for name in section.get("properties", {})
+    }
+    assert {name for name in properties if pattern.search(name)} == {
+        key.rpartition(".")[2] for key in KEYS
+    }
+
+
+def test_the_service_calls_no_function_that_reads_the_files_of_a_spec() -> None:
+    for path in SERVICE.rglob("*.py"):
+        used = [name for name in READS_FILES if re.search(rf"\b{name}\b", path.read_text())]
+        assert not used, f"{path.name} uses {', '.join(used)}"
+
+
+def test_only_the_user_of_the_machine_has_files_read(tmp_path: Path) -> None:
+    canary = tmp_path / "own.csv"
+    canary.write_text(CANARY)
+    changes = {"camera.response.file": str(canary), "camera.response.per": "photon"}
+    assert local_preset("gaia-12deg", changes).camera.response.value[0] == 0.0313373
+    with pytest.raises(ValueError, match=REFUSED):
+        preset("gaia-12deg", changes)
+
+
+def with_key(key: str, value: Any) -> dict[str, Any]:
+    content = tomllib.loads(SPEC)
+    put_key(content, key, value)
+    return content
+
+
+def as_toml(content: dict[str, Any]) -> str:
+    return tomlkit.dumps(content)
+
+
+Shape = tuple[str, dict[str, Any]]
+
+
+def bodies(key: str, value: Any) -> Iterator[Shape]:
+    """Give the arguments of requests that bring a spec with a key, in every form there is."""
+    content, text = with_key(key, value), tomlkit.item(value).as_string()
+    table, _, name = key.rpartition(".")
+    inline = {table: f"{{{name} = {text}}}"}
+    given = {key: str(value)}
+    dotted = f"{SPEC}\n[{table}]\n{name} = {text}\n"
+    arrays = f"{SPEC}\n[[{table}]]\n{name} = {text}\n"
+    of_preset = {"preset": "gaia-12deg"}
+    yield "spec", {"json": {"spec": content}}
+    yield "toml", {"json": {"toml": as_toml(content)}}
+    yield "dotted", {"json": {"toml": dotted}}
+    yield "arrays", {"json": {"toml": arrays}}
+    for changes in (given, inline, {table.partition(".")[0]: inline_of(content, table)}):
+        yield "changes", {"json": {**of_preset, "changes": changes}}
+        yield "changed spec", {"json": {"spec": tomllib.loads(SPEC), "changes": changes}}
+        yield "changed toml", {"json": {"toml": SPEC, "changes": changes}}
+        yield "job changes", {"json": {"kind": "build", **of_preset, "changes": changes}}
+    for spec in (content, as_toml(content), dotted):
+        yield "job", {"json": {"kind": "build", "spec": spec}}
+    yield "camera", {"json": {"name": "mycam", "camera": content["camera"]}}
+    yield "raw", {"json": content}
+    yield ("text", {"content": as_toml(content), "headers": {"Content-Type": "application/toml"}})
+    yield "form", {"data": {"toml": as_toml(content), "toml-before": ""}}
+    yield "same form", {"data": {"toml": as_toml(content), "toml-before": as_toml(content)}}
+    yield "build form", {"data": {"toml": as_toml(content), "toml-before": "", "do": "build"}}
+    yield "suggest", {"data": {"toml": as_toml(content), "toml-before": "", "do": "suggest"}}
+    yield "pin", {"data": {"toml": SPEC, "pinned": f"preset=&{key}={value}"}}
+    yield "field", {"data": {"toml": SPEC, "toml-before": SPEC, key: str(value)}}
+
+
+def inline_of(content: dict[str, Any], table: str) -> str:
+    """Return the outermost table of a spec as an inline table of TOML."""
+    inline = tomlkit.inline_table()
+    inline.update(content[table.partition(".")[0]])
+    return inline.as_string()
+
+
+def queries(key: str, value: Any) -> Iterator[Shape]:
+    for base in ({}, {"preset": "gaia-12deg"}):
+        yield "query", {"params": {**base, key: str(value)}}
+    yield "query text", {"params": {"toml": as_toml(with_key(key, value))}}
+    yield "pinned", {"params": {"pinned": f"preset=&{key}={value}"}}
+
+
+def endpoints() -> Iterator[tuple[str, str]]:
+    """Give method and path of every route of the application."""
+    for prefix, routers in ((API, RESOURCES), ("", OTHERS)):
+        for router in routers:
+            for route in router.routes:
+                assert isinstance(route, APIRoute)
+                path = prefix + re.sub(r"\{[^}]*\}", "f" * 16, route.path)
+                yield from ((method, path) for method in sorted(route.methods - {"HEAD"}))
+
+
+KNOWN = {
+    *(("POST", f"{API}/specs/{name}") for name in ("validate", "estimate", "coverage", "starter")),
+    *(("POST", f"{API}/specs/coverage.svg"), ("POST", f"{API}/jobs")),
+    *(("GET", "/new"), ("POST", "/new"), ("POST", "/new/preview")),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_every_endpoint_that_takes_a_spec_refuses_every_key_that_names_a_file(
+    tmp_path: Path,
+) -> None:
+    canary = tmp_path / "canary.csv"
+    canary.write_text(CANARY)
+    opened: list[str] = []
+    is_watched = True
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        if is_watched and event == "open" and str(arguments[0]).endswith("canary.csv"):
+            opened.append(str(arguments[0]))
+
+    sys.addaudithook(watch)
+    takes: set[tuple[str, str]] = set()
+    with client_of(tmp_path / "root", anonymous="publisher") as client:
+        for method, path in endpoints():
+            shapes = queries if method == "GET" else bodies
+            for number, (name, request) in enumerate(shapes(UNKNOWN, str(canary))):
+                control = client.request(method, path, follow_redirects=False, **request).text
+                if not re.search(r"no_such_key: (unknown key|Extra inputs)", control):
+                    continue
+                takes.add((method, path))
+                for key in KEYS:
+                    for value in (str(canary), "/etc/passwd"):
+                        [*_, (_, again)] = list(shapes(key, value))[: number + 1]
+                        answer = client.request(method, path, follow_redirects=False, **again)
+                        assert REFUSED in answer.text, (method, path, name, key)
+                        assert answer.status_code in (200, 422), (method, path, name, key)
+                        if not path.startswith("/new"):
+                            assert answer.status_code == 422, (method, path, name, key)
+                        assert "0.0313373" not in answer.text
+                        assert "root:x:0" not in answer.text
+    is_watched = False
+    assert takes >= KNOWN, KNOWN - takes
+    assert not opened
+
+
+BLOCKING = """
+import os, runpy
+from starcat_service import server
+make_app = server.make_app
+def with_block(settings):
+    app = make_app(settings)
+    app.add_api_route("/block", lambda: open(os.environ["BLOCKING_PIPE"]).read())
+    return app
+server.make_app = with_block
+runpy.run_module("starcat", run_name="__main__", alter_sys=True)
+"""
+THREADS = 40
+"""Threads for requests in the server: anyio's default."""
+
+
+def seconds_to_end(served: Served) -> float:
+    """Send SIGTERM, and return how long the server took to end with 0."""
+    begun_s = time.monotonic()
+    served.process.send_signal(signal.SIGTERM)
+    assert served.process.wait(20.0) == 0
+    return time.monotonic() - begun_s
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_with_all_threads_blocked_the_server_says_that_it_lives_and_ends_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    monkeypatch.setenv("BLOCKING_PIPE", str(pipe))
+    with serve(tmp_path / "root", tmp_path / "log", BLOCKING) as served:
+
+        def block() -> None:
+            with suppress(requests.RequestException):
+                requests.get(f"{served.address}/block", timeout=60)
+
+        for _ in range(THREADS + 5):
+            threading.Thread(target=block, daemon=True).start()
+        until_s = time.monotonic() + 30.0
+        while threads_of(served) < THREADS and time.monotonic() < until_s:
+            time.sleep(0.1)
+        with pytest.raises(requests.Timeout):
+            requests.get(f"{served.address}/api/v1/specs/presets", timeout=2)
+        assert requests.get(f"{served.address}/healthz", timeout=5).json() == {"status": "alive"}
+        assert seconds_to_end(served) < 10.0
+    assert "the server ended without them" in (tmp_path / "log").read_text()
+
+
+def threads_of(served: Served) -> int:
+    return len(os.listdir(f"/proc/{served.process.pid}/task"))
+
+
+def memory_mib(served: Served, name: str) -> float:
+    """Return VmRSS or VmHWM of the server, MiB."""
+    text = Path(f"/proc/{served.process.pid}/status").read_text()
+    found = re.search(rf"^{name}:\s+(\d+) kB", text, re.MULTILINE)
+    assert found
+    return int(found[1]) / 1024.0
+
+
+SECRET = "WL7-this-is-secret-9QX"
+
+
+def hostile_paths(folder: Path, pid: int) -> list[str]:
+    """Return two hundred names that a server must not open."""
+    secret = folder / "secret.csv"
+    secret.write_text(f"{SECRET},{SECRET}\n" + CANARY.partition("\n")[2])
+    for number in range(10):
+        os.mkfifo(folder / f"pipe-{number}")
+    links = {"zero": "/dev/zero", "secret": secret, "pipe": folder / "pipe-0", "loop": "loop-link"}
+    for name, target in links.items():
+        (folder / f"{name}-link").symlink_to(target)
+    found = [str(secret), str(folder), "", " ", ".", "..", "/", "~root", "\0", f"{secret}\0.csv"]
+    found += [
+        f"/dev/{name}"
+        for name in ["zero", "null", "full", "random", "urandom", "tty", "stdin", "ptmx"]
+    ]
+    found += [str(folder / f"pipe-{number}") for number in range(10)]
+    found += [str(folder / f"{name}-link") for name in links]
+    found += [f"/proc/self/fd/{number}" for number in range(60)]
+    found += [f"/proc/{pid}/fd/{number}" for number in range(40)]
+    found += [
+        f"/proc/self/{name}"
+        for name in [
+            "environ",
+            "maps",
+            "mem",
+            "cmdline",
+            "status",
+            "pagemap",
+            "root/etc/passwd",
+            "cwd",
+            "exe",
+        ]
+    ]
+    found += ["/etc/passwd", "/etc/shadow", "/proc/kmsg", "/proc/kcore", "/sys/kernel/notes"]
+    found += [f"{'../' * depth}etc/passwd" for depth in range(1, 21)]
+    found += [f"/{'x' * 10**power}" for power in range(1, 4)] + ["/x" * 900, "x/" * 900]
+    found += [f"file://{secret}", f"https://127.0.0.1{secret}", f"\\\\host{secret}", "C:\\x"]
+    found += [f"gaia={secret}", f"{secret}?x", f"{secret}#x", f"./{secret}", f"{secret}/", "|id"]
+    rest = 200 - len(found)
+    return found + [f"{'/' * (number + 2)}etc/passwd" for number in range(rest)]
+
+
+def requests_with(path: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Give requests that have a name in every place where one can stand."""
+    for key in KEYS:
+        changes = {"preset": "gaia-12deg", "changes": {key: path or " "}}
+        yield "POST", f"{API}/specs/validate", {"json": changes}
+        yield "POST", f"{API}/specs/estimate", {"json": changes}
+        yield "POST", f"{API}/jobs", {"json": {"kind": "build", **changes}}
+        yield "GET", "/new", {"params": {key: path}}
+    yield "POST", f"{API}/specs/validate", {"json": {"spec": with_key("catalog.source", path)}}
+    yield "POST", f"{API}/jobs", {"json": {"kind": "ingest", "source": path}}
+    yield "POST", f"{API}/jobs", {"json": {"kind": "evaluate", "database": path}}
+    yield "POST", f"{API}/sql", {"json": {"targets": [path], "query": "SELECT 1"}}
+    yield "GET", f"{API}/databases/{requests.utils.quote(path, safe='')}", {}
+    yield "GET", f"{API}/specs/presets/{requests.utils.quote(path, safe='')}", {}
+    yield "GET", "/new", {"params": {"preset": path}}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_two_hundred_hostile_names_open_nothing_block_nothing_and_take_no_memory(
+    tmp_path: Path, small_artifact: Path, record_property: Callable[[str, object], None]
+) -> None:
+    root = tmp_path / "root"
+    add_database(root, small_artifact)
+    (tmp_path / "hostile").mkdir()
+    with serve(root, tmp_path / "log", anonymous="publisher", workers=0) as served:
+        names = hostile_paths(tmp_path / "hostile", served.process.pid)
+        assert len(names) == 200
+        with requests.Session() as first:
+            first.post(f"{served.address}{API}/specs/estimate", json={"preset": "gaia-12deg"})
+        before_mib = memory_mib(served, "VmRSS")
+
+        def send(path: str) -> int:
+            count = 0
+            with requests.Session() as session:
+                for method, target, arguments in requests_with(path):
+                    answer = session.request(
+                        method, served.address + target, timeout=30, **arguments
+                    )
+                    count += 1
+                    assert SECRET not in answer.text
+                    assert "root:x:0" not in answer.text
+                    assert "0.0313373" not in answer.text
+                    assert answer.status_code < 500, (target, path[:80], answer.text[:300])
+            return count
+
+        with ThreadPoolExecutor(8) as senders:
+            sent = sum(senders.map(send, names))
+        more_mib = memory_mib(served, "VmHWM") - before_mib
+        assert more_mib < 300.0
+        with ThreadPoolExecutor(THREADS) as senders:  # each needs a thread of the server
+            target = f"{served.address}{API}/specs/presets"
+            answers = senders.map(lambda _: requests.get(target, timeout=30), range(THREADS))
+            assert all(answer.status_code == 200 for answer in answers)
+        took_s = seconds_to_end(served)
+        assert took_s < 10.0
+    record_property("requests", sent)
+    record_property("more_mib", round(more_mib))
+    record_property("end_s", round(took_s, 2))

@@ -1,0 +1,195 @@
+"""Arguments of public functions, as plain numbers, columns and paths.
+
+Callers give numbers as lists, numpy arrays, quantities of astropy, masked arrays or columns of
+tables, and databases as paths or as what other functions of starcat return. Every public function
+turns them into float64 arrays and paths here, so that all of them accept and refuse the same.
+Nothing here imports astropy, pandas or pyarrow: their objects are known by their attributes.
+"""
+
+from __future__ import annotations
+
+import operator
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from starcat.arrays import Array
+from starcat.errors import ArgumentTypeError, ConfigError
+
+FLOAT64 = np.dtype(np.float64)
+
+# Units by the ends of parameter names; the longer end comes first, as "_km_s" ends with "_s".
+UNITS = {
+    "_km_s": "km / s", "_km": "km", "_arcsec": "arcsec", "_mas": "mas", "_deg": "deg",
+    "_rad": "rad", "_px": "pix", "_mag": "mag", "magnitudes": "mag", "mag": "mag", "_s": "s",
+}  # fmt: skip
+
+
+class HasFolder(Protocol):
+    """What `starcat.open`, `starcat.build` and `starcat.pull` return: it has the folder."""
+
+    @property
+    def folder(self) -> Path:
+        """Return where the database is."""
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that the name of a parameter states, as astropy writes it.
+
+    Examples
+    --------
+    >>> unit_of("velocity_km_s"), unit_of("position_km"), unit_of("prior")
+    ('km / s', 'km', '')
+    """
+    return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+
+
+def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
+    """Return an argument as an array of real numbers.
+
+    Parameters
+    ----------
+    name : str
+        The parameter. Its end states the unit, such as ``_km``.
+    values : array_like
+        Real numbers. A quantity with a unit is converted to the unit of the parameter. Masked
+        entries, and None in a list, become NaN. Texts, bools and complex numbers are refused.
+    shape : str or tuple of int
+        The shape that the error message states. The shape is not checked here.
+
+    Returns
+    -------
+    ndarray of float64
+
+    Raises
+    ------
+    ConfigError
+        If the values are not real numbers, or their unit cannot be converted.
+    """
+    if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
+        return values
+    mask = getattr(values, "mask", None)  # of a pandas column, a method
+    plain = _in_unit(name, values)
+    try:
+        raw = np.asarray(plain)
+        if raw.dtype.kind == "O":
+            raw = np.array([_number(value) for value in raw.flat]).reshape(raw.shape)
+        if raw.dtype.kind not in "fiu":
+            raise TypeError(f"their type is {_TYPES.get(raw.dtype.kind, raw.dtype)}")
+        numbers = np.asarray(raw, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
+            key=name,
+            value=values,
+            fields=(name,),
+        ) from error
+    if isinstance(mask, np.ndarray | np.bool_) and np.any(mask):
+        numbers = np.where(mask, np.nan, numbers)
+    return numbers
+
+
+_TYPES = {"U": "text", "S": "text", "b": "bool", "c": "complex"}
+
+
+def _number(value: Any) -> float:
+    if value is None:
+        return np.nan
+    if isinstance(value, bool | np.bool_ | str | bytes):
+        raise TypeError(f"{value!r} is {'text' if isinstance(value, str | bytes) else 'a bool'}")
+    return float(value)
+
+
+def _in_unit(name: str, values: Any) -> Any:
+    """Return values without their unit, converted to that of the parameter."""
+    unit = getattr(values, "unit", None)
+    if unit is None:
+        unit = getattr(values, "units", None)  # as other libraries of units have it
+    if unit is None:
+        return values
+    expected = unit_of(name)
+    try:
+        quantity = getattr(values, "quantity", values)  # of a column of a table
+        plain = quantity.to_value(expected)
+    except Exception as error:  # whatever the library of units raises
+        raise ConfigError(
+            f"{name} has the unit {str(unit) or 'dimensionless'!r}; expected "
+            f"{expected or 'numbers without a unit'}",
+            key=name,
+            value=values,
+            fields=(name,),
+        ) from error
+    return getattr(plain, "unmasked", plain)
+
+
+def columns_of(values: Any) -> dict[str, Any] | None:
+    """Return the columns of a table by name, or None if the values are not a table.
+
+    A table is a mapping of columns, a structured array, or a table of astropy, pandas, polars or
+    Arrow.
+    """
+    if isinstance(values, list | tuple):
+        return None
+    names: Any = values if isinstance(values, Mapping) else None
+    if names is None:
+        names = getattr(getattr(values, "dtype", None), "names", None)
+    for attribute in ("colnames", "column_names", "columns"):
+        if names is None:
+            names = getattr(values, attribute, None)
+    return None if names is None else {str(name): values[name] for name in names}
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """Return an argument that has to be a whole number, at least ``least``."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if isinstance(value, bool) or number < least:
+        raise ConfigError(
+            f"{name} is {value!r}; expected a whole number, at least {least}",
+            key=name,
+            value=value,
+            fields=(name,),
+        )
+    return number
+
+
+def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)") -> Path:
+    """Return an argument that has to be a path.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is of another type.
+    """
+    try:
+        return Path(os.fsdecode(os.fspath(value)))
+    except TypeError:
+        raise ArgumentTypeError(
+            f"{name} is of type {type(value).__name__}; expected {expected}",
+            key=name,
+            value=value,
+            fields=(name,),
+        ) from None
+
+
+def paths_of(name: str, value: Any) -> list[Path]:
+    """Return an argument that has to be a path, or paths."""
+    if isinstance(value, str | os.PathLike) or not isinstance(value, Iterable):
+        return [path_of(name, value, "a path, or a sequence of paths")]
+    return [path_of(name, path, "paths") for path in value]
+
+
+def database_path(name: str, value: Any) -> Path:
+    """Return where a database is.
+
+    A caller gives the folder, or what `starcat.open`, `starcat.build` or `starcat.pull` return,
+    or the ``database`` of a matcher: each of them has a ``folder``.
+    """
+    folder = getattr(value, "folder", None)
+    given = value if folder is None else folder
+    return path_of(name, given, "the folder of a database, or what starcat.open returns")

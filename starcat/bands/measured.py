@@ -1,0 +1,162 @@
+"""How large errors of predicted magnitudes are on stars that were measured in both bands.
+
+The tables ``relation_errors.csv`` and ``star_errors.csv`` of the data folder are made by
+``tests/builders/band_errors.py`` from genuine records. Only errors are taken from them: no
+magnitude is fitted to measured stars.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from starcat.arrays import Array, Mask
+from starcat.bands.photometry import variability_error
+from starcat.bands.response import Response, shipped
+from starcat.bands.spectra import data_table
+
+NEAR_IN_WAVELENGTH = 0.15
+"""Measured bands whose mean wavelengths differ from a sensor's by this ratio (one standard
+deviation of a Gaussian weight) say most about its band."""
+
+NOISE_MAG = 0.05
+"""Largest difference of the 95th and the 5th percentile of Hp that constant stars show: it is above
+this for 1 of 1,000 stars of the class C in H52 of Hipparcos."""
+
+COMPANION_SHARE, COMPANION, LISTED, VARIABLE = "companion_share", "companion", "listed", "variable"
+"""States of a star in ``star_errors.csv``."""
+
+
+Bins = dict[tuple[str, str], dict[str, Array]]
+
+
+@cache
+def relation_errors() -> Bins:
+    """Return the table of relations that ships with starcat."""
+    return bins_of(data_table("relation_errors.csv")[1])
+
+
+def bins_of(rows: list[list[str]]) -> Bins:
+    """Return the least colours and the factors of bins by relation, then by band, shape (K, 2)."""
+    found: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
+    for base, colour, target, low, _, factor in rows:
+        bands = found.setdefault((base, colour), {})
+        bands.setdefault(target, []).append([float(low), float(factor)])
+    return {
+        key: {target: np.array(bins) for target, bins in bands.items()}
+        for key, bands in found.items()
+    }
+
+
+def error_factors(base: str, colour: tuple[str, str], target: Response, colour_mag: Array) -> Array:
+    """Return measured over computed errors of a relation.
+
+    The factors were measured in the bands of catalogs. For a band of a sensor the measured bands
+    count by how near their mean wavelength is to the sensor's, and no factor is below 1, as its
+    response is known less well. Without any measurement of the relation the factor is 1.
+
+    Parameters
+    ----------
+    base : str
+        The catalog's band, such as "G".
+    colour : tuple of str
+        Two bands, such as ("BP", "RP").
+    target : Response
+        The band that is predicted.
+    colour_mag : ndarray of float64, shape (N,)
+        Colours, mag. Beyond the measured colours the nearest factor is taken.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        What the computed error of the relation is multiplied by.
+    """
+    bands = relation_errors().get((base, "-".join(colour)), {})
+    if target.name in bands and target is shipped(target.name):
+        return _in_bins(bands[target.name], colour_mag)
+    total, weights = np.zeros(len(colour_mag)), 0.0
+    for name, bins in bands.items():
+        ratio = np.log(shipped(name).mean_nm / target.mean_nm) / NEAR_IN_WAVELENGTH
+        # The floor keeps a weight for bands far from every measured one.
+        weight = float(np.exp(-0.5 * ratio**2)) + 1e-6 / (1.0 + ratio**2)
+        total += weight * _in_bins(bins, colour_mag)
+        weights += weight
+    return np.maximum(total / weights, 1.0) if weights else np.ones(len(colour_mag))
+
+
+def _in_bins(bins: Array, colour_mag: Array) -> Array:
+    """Return the factors of the bins of colours; the outer bins have no end."""
+    low, factor = bins.T
+    return np.asarray(factor[np.searchsorted(low[1:], colour_mag, side="right")])
+
+
+@cache
+def star_errors() -> dict[str, Array]:
+    """Return rows of low and high separation and value, shape (K, 3), by the state of a star."""
+    _, rows = data_table("star_errors.csv")
+    states = dict.fromkeys(row[0] for row in rows)
+    return {
+        state: np.array(
+            [
+                [float(r[1] or 0.0), float(r[2] or np.inf), float(r[4])]
+                for r in rows
+                if r[0] == state
+            ]
+        )
+        for state in states
+    }
+
+
+def companion_light(delta_mag: Array) -> Array:
+    """Return by how much a companion brightens a star if its light counts, mag; NaN if unknown.
+
+    >>> round(float(companion_light(np.array([0.0]))[0]), 3)
+    0.753
+    """
+    return np.asarray(
+        2.5 * np.log10(1.0 + 10.0 ** (-0.4 * np.fmax(delta_mag, 0.0) + 0.0 * delta_mag))
+    )
+
+
+def companion_error(
+    is_double: Mask, is_listed: Mask, separation_arcsec: Array, delta_mag: Array
+) -> Array:
+    """Return the standard error that companions add to magnitudes.
+
+    A catalog gives the light of one star or of both, the more often of one the further the stars
+    are apart. If the difference of the two is known the error is a measured share of the
+    companion's light, else the measured scatter of such stars.
+
+    Parameters
+    ----------
+    is_double, is_listed : ndarray of bool, shape (N,)
+        Whether a star is flagged as a double, and whether any list of doubles has it.
+    separation_arcsec, delta_mag : ndarray of float64, shape (N,)
+        Of the companion; NaN if unknown.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        mag; 0 for single stars.
+    """
+    rows = star_errors()
+    low, _, share = rows[COMPANION_SHARE].T
+    place = np.searchsorted(low, np.nan_to_num(separation_arcsec, nan=np.inf), side="right") - 1
+    with_light = share[np.clip(place, 0, len(low) - 1)] * companion_light(delta_mag)
+    unknown = np.where(is_double, rows[COMPANION][0, 2], rows[LISTED][0, 2])
+    error = np.where(np.isfinite(with_light), with_light, unknown)
+    return np.where(is_double | is_listed, error, 0.0)
+
+
+def variation_error(is_variable: Mask, amplitude_mag: Array) -> Array:
+    """Return the standard error that variability adds; both of shape (N,), the amplitude in mag.
+
+    For a star that is flagged without a known amplitude it is the measured scatter of such stars.
+    Of stars without a flag an amplitude up to `NOISE_MAG` is noise of the photometry.
+    """
+    is_unknown = is_variable & ~np.isfinite(amplitude_mag)
+    usual = star_errors()[VARIABLE][0, 2]
+    error = np.where(is_unknown, usual, variability_error(amplitude_mag))
+    is_noise = ~is_variable & (np.nan_to_num(amplitude_mag) <= NOISE_MAG)
+    return np.where(is_noise, 0.0, error)

@@ -1,0 +1,206 @@
+"""Arguments of public functions: units, masks, tables, types, and what is refused."""
+
+from __future__ import annotations
+
+import inspect
+
+import astropy.units as u
+import numpy as np
+import pyarrow as pa
+import pytest
+from astropy.table import MaskedColumn, QTable, Table
+
+import starcat
+from starcat.arguments import numbers_of
+from starcat.errors import ConfigError, ProductError, StarcatError
+
+TIME = "2026-11-22T10:00:00"
+
+
+@pytest.fixture(scope="module")
+def frame(small_artifact):
+    return starcat.simulate(small_artifact, seed=7)[0]
+
+
+@pytest.fixture(scope="module")
+def matcher(small_artifact):
+    return starcat.Matcher.open(small_artifact)
+
+
+def test_a_unit_is_converted_or_refused(matcher, frame):
+    where = {"position_km": [6778.0, 0.0, 0.0], "velocity_km_s": [0.0, 4.7, 6.0]}
+    expected = starcat.Observer.at(TIME, **where)
+    units = {"position_km": u.m, "velocity_km_s": u.m / u.h}
+    factors = {"position_km": 1e3, "velocity_km_s": 3.6e6}
+    given = {name: np.array(where[name]) * factors[name] * units[name] for name in where}
+    found = starcat.Observer.at(TIME, **given)
+    assert np.allclose(found.position_au, expected.position_au, rtol=1e-15)
+    assert np.allclose(found.velocity_km_s, expected.velocity_km_s, rtol=1e-14)
+    px = frame.centroids_px
+    same = matcher.identify(px * u.pix, magnitudes=frame.mag * u.mag)
+    assert same.star_index.tolist() == matcher.identify(px).star_index.tolist()
+    refused = [
+        lambda: matcher.identify(px * u.deg),
+        lambda: matcher.identify_many([px, px * u.deg]),
+        lambda: matcher.identify([[1.0 * u.deg, 2.0 * u.deg]]),
+        lambda: matcher.identify(px, magnitudes=frame.mag * u.Jy),
+        lambda: matcher.identify(px, sigma_px=np.ones(len(px)) * u.arcsec),
+        lambda: matcher.identify(px, prior=np.ones(4) * u.m, prior_error_deg=1.0),
+        lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.deg),
+        lambda: starcat.Observer.at(TIME, position_km=[1, 2, 3] * u.s),
+        lambda: starcat.simulate(matcher.database, noise_px=0.5 * u.pix),
+        lambda: expected.apparent(np.eye(3), np.ones(3) * u.m),
+    ]
+    for ask in refused:
+        with pytest.raises(ConfigError):
+            ask()
+
+
+def test_masked_entries_are_not_used(matcher, frame):
+    px = np.ma.array(frame.centroids_px, mask=False)
+    px[0] = np.ma.masked
+    mag = MaskedColumn(frame.mag, unit="mag", mask=np.arange(len(frame.mag)) == 1)
+    found = matcher.identify(px, magnitudes=mag)
+    assert found.ok
+    assert found.star_index[0] == -1
+    assert found.dropped == ((0, "not_finite"),)
+    assert matcher.identify_many([px])[0].dropped == ((0, "not_finite"),)
+    assert np.isnan(numbers_of("magnitudes", mag, "(N,)")[1])
+    assert np.isnan(numbers_of("magnitudes", [3.0, None], "(N,)")[1])
+
+
+@pytest.mark.parametrize(
+    "wrong", [[["1", "2"]], np.ones((4, 2), bool), [[True, None]], [[1j, 2.0]]]
+)
+def test_texts_and_bools_are_no_numbers(matcher, wrong):
+    for ask in (matcher.identify, lambda px: matcher.identify_many([np.ones((5, 2)), px])):
+        with pytest.raises(ConfigError, match="centroids_px is no array of real numbers"):
+            ask(wrong)
+
+
+def test_tables_are_read_by_the_names_of_their_columns(matcher, frame):
+    pandas = pytest.importorskip("pandas")
+    x, y = frame.centroids_px.T
+    columns = {"flux": x, "mag": frame.mag, "y_px": y, "x_px": x}
+    tables = [
+        columns,
+        Table(columns),
+        QTable({**columns, "x_px": x * u.pix, "mag": frame.mag * u.mag}),
+        pa.table(columns),
+        pandas.DataFrame(columns),
+        np.rec.fromarrays(list(columns.values()), names=list(columns)),
+    ]
+    expected = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    for table in tables:
+        found = matcher.identify(table)
+        assert found.star_index.tolist() == expected.star_index.tolist()
+        assert found.frame.magnitudes.tolist() == frame.mag.tolist()
+    many = matcher.identify_many(tables)
+    assert [one.star_index.tolist() for one in many] == [expected.star_index.tolist()] * len(tables)
+    for lacking in (Table({"x": x, "y_px": y}), pandas.DataFrame({"x": x, "y": y})):
+        with pytest.raises(ConfigError, match="expected the columns x_px and y_px"):
+            matcher.identify(lacking)
+    with pytest.raises(ConfigError, match="expected a sequence with one array per frame"):
+        matcher.identify_many(tables[4])
+
+
+def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
+    opened = starcat.open(small_artifact)
+    matcher = starcat.Matcher.open(opened)
+    for given in (opened, matcher.database, small_artifact, str(small_artifact)):
+        assert len(starcat.simulate(given, 2)) == 2
+        assert not starcat.verify(given).findings
+        assert starcat.diff(given, opened).is_same
+    assert starcat.export(opened, "csv", tmp_path / "csv", products=["stars"])
+    assert starcat.publish(opened, tmp_path / "registry")
+    with starcat.connect(opened) as connection:
+        assert connection.sql("SELECT count(*) AS n FROM stars").to_table()["n"].tolist() == [
+            len(matcher.database.mag)
+        ]
+    [frame] = starcat.simulate(opened, seed=7)
+    observer = starcat.Observer.at(TIME)
+    asked = opened, frame.centroids_px, matcher.database.camera, observer
+    found = starcat.identify_in_time(matcher.identify, *asked)
+    assert starcat.sky_in_time(found, *asked)
+
+
+class Other:
+    """An object that no function of starcat knows."""
+
+
+WRONG = [
+    lambda db: starcat.Camera(1280, 960),
+    lambda db: starcat.Camera(1280, 960, 100.0, fov_x_deg=3.0),
+    lambda db: starcat.Camera(1280, 960, 100.0, distortion=Other()),
+    lambda db: starcat.Camera(1280, 960, 100.0, principal_point_px=Other()),
+    lambda db: starcat.Matcher.open(Other()),
+    lambda db: starcat.Matcher.open(db, Other()),
+    lambda db: starcat.Matcher.open(db).identify(Other()),
+    lambda db: starcat.Matcher.open(db).identify([[1, 2]], Other()),
+    lambda db: starcat.Matcher.open(db).identify_many(Other()),
+    lambda db: starcat.Matcher.open(db).identify_many(iter([Other()])),
+    lambda db: starcat.Matcher.open(db).identify_many([], threads=0),
+    lambda db: starcat.Matcher.open(db).identify_many([], magnitudes=3.0),
+    lambda db: starcat.Observer.at(Other()),
+    lambda db: starcat.Observer.at(TIME, position_km=Other()),
+    lambda db: starcat.build(Other()),
+    lambda db: starcat.build({}),
+    lambda db: starcat.calibrate(db, Other()),
+    lambda db: starcat.calibrate(db, [Other()]),
+    lambda db: starcat.connect(Other()),
+    lambda db: starcat.diff(db, Other()),
+    lambda db: starcat.export(db, "csv", Other()),
+    lambda db: starcat.export(db, "csv", "x", colour="red"),
+    lambda db: starcat.export(db, Other()),
+    lambda db: starcat.identify_in_time(Other(), Other(), [[1, 2]], None, None),
+    lambda db: starcat.ingest(Other()),
+    lambda db: starcat.ingest("sao", Other()),
+    lambda db: starcat.ingest("sao", epoch_jyear="soon"),
+    lambda db: starcat.init(Other()),
+    lambda db: starcat.learn(db, Other()),
+    lambda db: starcat.open(Other()),
+    lambda db: starcat.preset(Other()),
+    lambda db: starcat.publish(db, Other()),
+    lambda db: starcat.publish(db, "registry", sign=Other()),
+    lambda db: starcat.pull(Other(), "registry"),
+    lambda db: starcat.pull("a@1.0.0", Other()),
+    lambda db: starcat.read_frames(Other()),
+    lambda db: starcat.read_spec(Other()),
+    lambda db: starcat.simulate(db, -1),
+    lambda db: starcat.simulate(db, 1.5),
+    lambda db: starcat.simulate(db, noise_px=-1.0),
+    lambda db: starcat.simulate(db, drop_probability=2.0),
+    lambda db: starcat.simulate(db, false_stars=-1),
+    lambda db: starcat.simulate(db, seed=-1),
+    lambda db: starcat.simulate(Other()),
+    lambda db: starcat.Tracker(Other()),
+    lambda db: starcat.verify(Other()),
+]
+
+
+@pytest.mark.parametrize("ask", WRONG, ids=lambda ask: inspect.getsource(ask).strip()[11:60])
+def test_every_wrong_argument_is_a_starcat_error(ask, small_artifact):
+    with pytest.raises(StarcatError) as refused:
+        ask(small_artifact)
+    assert isinstance(refused.value, ValueError | TypeError)
+
+
+def test_a_database_that_was_changed_is_not_opened(artifact_copy, small_artifact):
+    path = artifact_copy / "database.h5"
+    data = bytearray(path.read_bytes())
+    names = starcat.Matcher.open(small_artifact).database.star_id.tobytes()
+    at = bytes(data).index(names)
+    data[at : at + len(names)] = np.frombuffer(names, np.int64)[::-1].tobytes()
+    path.write_bytes(data)
+    with pytest.raises(ProductError, match="The file was changed after the build"):
+        starcat.Matcher.open(artifact_copy)
+    assert starcat.Matcher.open(artifact_copy, verify=False).database.star_id[0]
+    (artifact_copy / "manifest.json").write_text("{}")
+    with pytest.raises(ProductError, match="does not state the digest"):
+        starcat.Matcher.open(artifact_copy)
+
+
+def test_an_image_of_another_kind_is_named(tmp_path):
+    (tmp_path / "x.bmp").write_bytes(b"BM\xf6\x00\xff\xfe" + bytes(60))
+    with pytest.raises(ConfigError, match=r"is a BMP image, .* \(FITS, PNG, TIFF, JPEG, HEIC\)"):
+        starcat.read_frames(tmp_path / "x.bmp")

@@ -1,0 +1,294 @@
+"""What the confined process of queries sends: every type arrives as it was, and nothing else runs.
+
+The values that DuckDB's Python client gives are frozen here. A process that was taken over may send
+anything: the session refuses it, runs nothing of it and takes no more memory than it allows.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import pickle
+import struct
+import sys
+import tracemalloc
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from uuid import UUID
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from starcat.errors import QueryError
+from starcat.query import arrow_stream, engine, frames
+from starcat.query.engine import AnswerTooLarge, Engine
+from starcat.query.frames import HEAD, MalformedMessage
+from starcat.query.session import Limits, Session, open_session
+
+DAY, UTC = dt.date(2020, 2, 29), dt.UTC
+ZONE = dt.timezone(dt.timedelta(hours=-3, minutes=-30))
+NUMBER = UUID("3f2504e0-4f89-11d3-9a0c-0305e82c3301")
+
+VALUES: dict[str, object] = {
+    "true": True,
+    "-5::TINYINT": -5,
+    "9223372036854775807": 2**63 - 1,
+    "18446744073709551615::UBIGINT": 2**64 - 1,
+    "170141183460469231731687303715884105727::HUGEINT": 2**127 - 1,
+    "340282366920938463463374607431768211455::UHUGEINT": 2**128 - 1,
+    "'123456789012345678901234567890123456789012345'::BIGNUM": "123456789012345678901234567890"
+    "123456789012345",
+    "1.5::FLOAT": 1.5,
+    "-0.0::DOUBLE": -0.0,
+    "'nan'::DOUBLE": float("nan"),
+    "'-inf'::DOUBLE": float("-inf"),
+    "1.10::DECIMAL(9,2)": Decimal("1.10"),
+    "12345678901234567890123456789012345678::DECIMAL(38,0)": Decimal(
+        "12345678901234567890123456789012345678"
+    ),
+    "'é\N{GLOWING STAR}'": "é\N{GLOWING STAR}",
+    "'two' || chr(10) || 'lines' || chr(0)": "two\nlines\0",
+    "'\\x00\\xFF'::BLOB": b"\0\xff",
+    "'101'::BIT": "101",
+    "NULL": None,
+    "DATE '2020-02-29'": DAY,
+    "'infinity'::DATE": dt.date.max,
+    "'290000-01-01'::DATE": "290000-01-01",
+    "TIME '12:34:56.789'": dt.time(12, 34, 56, 789000),
+    "TIME '24:00:00'": "24:00:00",
+    "TIMETZ '12:00:00.5-03:30'": dt.time(12, 0, 0, 500000, tzinfo=ZONE),
+    "TIMESTAMP '2020-01-01 01:02:03.000004'": dt.datetime(2020, 1, 1, 1, 2, 3, 4),
+    "'-infinity'::TIMESTAMP": dt.datetime.min,
+    "'2020-01-01 00:00:01.123456789'::TIMESTAMP_NS": dt.datetime(2020, 1, 1, 0, 0, 1, 123456),
+    "TIMESTAMPTZ '2020-01-01 00:00:00+05'": dt.datetime(2019, 12, 31, 19, tzinfo=UTC),
+    "'infinity'::TIMESTAMPTZ": dt.datetime.max.replace(tzinfo=UTC),
+    "INTERVAL '1 year 2 days 3 microseconds'": dt.timedelta(days=362, microseconds=3),
+    "INTERVAL '-1 day'": dt.timedelta(days=-1),
+    f"'{NUMBER}'::UUID": NUMBER,
+    "'x'::ENUM('x', 'y')": "x",
+    "[[1], NULL, []]": [[1], None, []],
+    "[array_value(1.5::DOUBLE, 2)]": [(1.5, 2.0)],
+    "{'a': 1, 'b': [DATE '2020-02-29', NULL]}": {"a": 1, "b": [DAY, None]},
+    "MAP{DATE '2020-02-29': 2.5}": {DAY: Decimal("2.5")},
+    "MAP{[1, 2]: 'x'}": {"key": [[1, 2]], "value": ["x"]},
+    "MAP([]::INT[], []::INT[])": {},
+    "union_value(k := 'x'::BLOB)": b"x",
+    "(1, 'x')": (1, "x"),
+    "['tuple', 'x']": ["tuple", "x"],
+}
+"""Each type of DuckDB, and its value in Python."""
+
+GIVEN = [
+    (value, value)
+    for value in (
+        None, True, 7, -(2**127), 1.5, "half \N{GLOWING STAR}", b"\0\xff", Decimal("1.50"), DAY,
+        dt.datetime(2020, 1, 1, 2, 3, 4, 5), dt.time(1, 2, 3), dt.time(12, tzinfo=UTC),
+        dt.datetime(2020, 1, 1, tzinfo=UTC), dt.timedelta(1, 2, 3), NUMBER, [1, None], {"a": [DAY]},
+        [], {},
+    )
+] + [
+    (bytearray(b"y"), b"y"),
+    ((1, 2), [1, 2]),
+    ({"key": [1], "value": [2]}, {1: 2}),
+    (np.float64(2.5), 2.5),
+    (np.int64(3), 3),
+    (np.array([1.5]), [1.5]),
+    (np.datetime64("2020-02-29"), DAY),
+]  # fmt: skip
+"""Values of a query's parameters, and what is found when they are asked for."""
+
+
+@pytest.fixture(scope="module")
+def session(small_artifact: Path) -> Iterator[Session]:
+    with open_session([str(small_artifact)]) as opened:
+        yield opened
+
+
+def rows_of(session: Session, text: str, values: dict[str, object] | None = None) -> list[object]:
+    with session.ask(text, values) as answer:
+        return answer.rows(100_000)
+
+
+@pytest.mark.parametrize("text", VALUES)
+def test_every_type_has_its_value_in_python(session, text):
+    """Alone, in one column with null, and as 5,000 rows in several parts."""
+    expected = VALUES[text]
+    for query, count in (
+        (f"SELECT {text} AS v", 1),
+        (f"SELECT {text} AS v UNION ALL SELECT NULL ORDER BY v NULLS LAST", 2),
+        (f"SELECT {text} AS v FROM range(5000)", 5000),
+    ):
+        [first, *rest] = rows_of(session, query)
+        assert repr(first[0]) == repr(expected)
+        assert type(first[0]) is type(expected)
+        assert len(rest) == count - 1
+        assert count != 2 or rest == [(None,)]
+
+
+@pytest.mark.parametrize(("value", "found"), GIVEN, ids=lambda value: repr(value)[:30])
+def test_every_value_of_a_parameter_arrives(session, value, found):
+    [(answer,)] = rows_of(session, "SELECT $v", {"v": value})
+    assert answer == found
+    assert type(answer) is type(found)
+
+
+@pytest.mark.parametrize("value", [{1, 2}, object(), 1j])
+def test_a_value_of_no_type_of_sql_is_refused(session, value):
+    with pytest.raises(QueryError, match="cannot be passed on"):
+        rows_of(session, "SELECT $v", {"v": value})
+
+
+@pytest.mark.parametrize("text", VALUES)
+def test_every_type_arrives_in_batches(session, text):
+    with session.ask(f"SELECT {text} AS v, range AS n FROM range(70000)") as answer:
+        found = pa.Table.from_batches(answer.batches())
+    assert found.num_rows == 70_000
+
+
+def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifact):
+    limits = Limits(message_bytes=1 << 20, rows_bytes=3 << 20)
+    with open_session([str(small_artifact)], limits) as session:
+        process = session._engine._process
+        with pytest.raises(AnswerTooLarge, match="more than 3 MB; ask for fewer rows"):
+            rows_of(session, "SELECT repeat('x', 1000) FROM range(10000)")
+        with pytest.raises(AnswerTooLarge):
+            rows_of(session, "SELECT repeat('x', 2000000)")
+        with pytest.raises(AnswerTooLarge), session.ask("SELECT repeat('x', 2000000)") as answer:
+            list(answer.batches())
+        # Parts of an answer are made so small that each may be sent.
+        assert len(rows_of(session, "SELECT repeat('x', 1000) FROM range(2500)")) == 2500
+        assert session._engine._process is process
+
+
+def arrow(array: pa.Array, **options: object) -> bytes:
+    batch = pa.record_batch([array], names=["v"])
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema, options=pa.ipc.IpcWriteOptions(**options)) as out:
+        out.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+def array_of(kind: pa.DataType, *parts: bytes, count: int = 2) -> pa.Array:
+    return pa.Array.from_buffers(kind, count, [None, *map(pa.py_buffer, parts)])
+
+
+ENDS = struct.Struct("<3i")  # of two texts
+HOSTILE_ROWS = {
+    "not Arrow": (pa.string(), b"\xff" * 100),
+    "compressed": (pa.string(), arrow(pa.array(["x" * 1_000_000]), compression="zstd")),
+    "compressed dictionary": (
+        pa.dictionary(pa.int8(), pa.string()),
+        arrow(pa.array(["x" * 1_000_000]).dictionary_encode(), compression="lz4"),
+    ),
+    "another schema": (pa.string(), arrow(pa.array([1]))),
+    "no UTF-8": (pa.string(), arrow(array_of(pa.string(), ENDS.pack(0, 1, 2), b"\xff\xfe"))),
+    "offsets outside": (pa.string(), arrow(array_of(pa.string(), ENDS.pack(0, 9, 2), b"ab"))),
+    "nulls without end": (pa.null(), arrow(pa.nulls(10_000_000))),
+    "views": (pa.string_view(), arrow(pa.array(["x" * 100], pa.string_view()))),
+    "a dictionary of long texts": (
+        pa.dictionary(pa.int32(), pa.string()),
+        arrow(pa.DictionaryArray.from_arrays(pa.array([0] * 20_000, pa.int32()), ["x" * 100_000])),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE_ROWS)
+def test_rows_of_a_hostile_process_are_refused(name):
+    kind, content = HOSTILE_ROWS[name]
+    with pytest.raises(MalformedMessage, match="cannot be read"):
+        _read(content, pa.schema([("v", kind)]))
+
+
+def _read(content: bytes, schema: pa.Schema) -> None:
+    arrow_stream.batches_of(content, arrow_stream.schema_of(arrow_stream.stream_of(schema)))
+
+
+class Evil:
+    """What runs when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self._path,)
+
+
+def message(kind: str, content: bytes) -> bytes:
+    return HEAD.pack(kind.encode(), len(content)) + content
+
+
+def replies(ran: Path) -> dict[str, bytes]:
+    evil = pickle.dumps(("done", Evil(ran)))
+    return {
+        "a pickle": evil,
+        "a pickle in a message": message("d", evil),
+        "garbage": b"\x80" * 1000,
+        "a length without end": HEAD.pack(b"d", 2**63),
+        "no known kind": message("x", b"1"),
+        "JSON nested without end": message("d", b"[" * 1_000_000),
+        "a number of too many digits": message("d", b"9" * 10_000),
+        "rows of different lengths": message("p", b'[1,[["any",[1]],["any",[1,2]]],[]]'),
+        "rows of no known form": message("p", b'[1,[["code",["os.system"]]],[]]'),
+        "rows with a value of no type": message("p", b'[1,[["any",[["eval","1"]]]],[]]'),
+        "rows that are cut off": message("p", b'[1,[["q",[]]],[80]]\n123'),
+        "rows with nulls elsewhere": message("p", b'[1,[["?",[99]]],[1]]\n\x00'),
+        "progress that is none": message("%", b'"half"'),
+        "rows without end": message("p", b'[1,[["any",["' + b"x" * 900_000 + b'"]]],[]]') * 9,
+        "the end of the process": b"",
+    }
+
+
+@pytest.mark.parametrize("name", replies(Path()))
+def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeypatch):
+    """It answers a question with bytes of its own choice, and its answer is refused."""
+    ran, content = tmp_path / "ran", tmp_path / "content"
+    content.write_bytes(replies(ran)[name])
+    monkeypatch.setattr(
+        engine,
+        "_PROGRAM",
+        f"import sys; sys.stdin.buffer.read(1); out = sys.stdout.buffer; "
+        f"out.write(open({str(content)!r}, 'rb').read()); out.flush()",
+    )
+    monkeypatch.setattr(engine, "_waiting", [])
+    asked = Engine(tmp_path, 0.1, 0.1, message_bytes=1 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(QueryError):
+            asked.ask("rows", "SELECT 1", None, 1, max_bytes=2_000_000)
+        assert tracemalloc.get_traced_memory()[1] < 50_000_000
+    finally:
+        tracemalloc.stop()
+        asked.close()
+    assert not ran.exists()
+    assert not asked.is_running, "a process that sent such bytes is not asked again"
+
+
+def test_a_child_that_keeps_the_pipe_open_keeps_nobody_waiting(tmp_path, monkeypatch):
+    """The process is killed when its time is over; what it started goes on writing."""
+    monkeypatch.setattr(
+        engine,
+        "_PROGRAM",
+        "import os, sys, time\n"
+        "if os.fork() == 0:\n"
+        "    until_s = time.monotonic() + 20\n"
+        "    while time.monotonic() < until_s:\n"
+        f"        os.write(1, {message('%', b'1')!r})\n"
+        "        time.sleep(0.1)\n"
+        "    os._exit(0)\n"
+        "time.sleep(60)",
+    )
+    monkeypatch.setattr(engine, "_waiting", [])
+    asked = Engine(tmp_path, 0.1, 0.1)
+    began_s = engine.time.monotonic()
+    with pytest.raises(QueryError, match=r"stopped after 0\.5 s"):
+        asked.ask("rows", "SELECT 1", None, 1, allowance=engine.Allowance(0.5))
+    assert engine.time.monotonic() - began_s < 10
+    asked.close()
+
+
+def test_no_module_of_the_package_unpickles():
+    root = Path(sys.modules["starcat"].__file__ or "").parent
+    found = [path.name for path in root.rglob("*.py") if "import pickle" in path.read_text()]
+    assert found == []
+    assert frames.MalformedMessage is MalformedMessage
