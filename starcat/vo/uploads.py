@@ -77,7 +77,7 @@ def _parsed(path: Path, name: str) -> Any:
             # Except this one: astropy would put the largest integer in place of the value.
             warnings.simplefilter("error", W51)
             with path.open("rb") as stream:
-                table = parse_single_table(stream, verify="ignore")
+                table = parse_single_table(stream, verify="warn")
     except W51 as error:
         found = re.search(r"Value '(.{1,60}).*' is out of range for a (\S+)", str(error))
         what = f"{found[1]}, which a {found[2]} integer cannot hold" if found else str(error)
