@@ -168,7 +168,10 @@ def _not_a_database(path: Path, why: str) -> SourceError:
 
 def _cedar_solve(path: Path | None) -> NamedTables:
     if path is None:
-        raise ConfigError("--from-peer cedar-solve needs the file, such as default_database.npz")
+        raise ConfigError(
+            "from_peer cedar-solve needs the file, such as default_database.npz",
+            fields=("from_peer",),
+        )
     return in_memory(path.stem, {"stars": cedar_solve_stars(path)})
 
 

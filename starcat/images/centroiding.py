@@ -212,11 +212,13 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
             return extract(image, least * _RAISE**attempt, noise, levels.mask, kernel)
         except Exception as error:  # sep raises nothing more special when a buffer is full
             _log.info("at %.3g sigma: %s", threshold * _RAISE**attempt, error)
+    further = f"threshold={np.ceil(threshold * _RAISE**_TRIES):.0f}"
     raise ConfigError(
         f"the image has too much in it to tell stars from the sky: even at "
         f"{threshold * _RAISE ** (_TRIES - 1):.1f} times the noise too many pixels stand out; "
-        "check that it is a star image, state how wide a star is (--psf-sigma-px 1.5) or raise "
-        f"the threshold further (--threshold {np.ceil(threshold * _RAISE**_TRIES):.0f})"
+        "check that it is a star image, state how wide a star is (psf_sigma_px=1.5) or raise "
+        f"the threshold further ({further})",
+        fields=("psf_sigma_px=1.5", further),
     )
 
 

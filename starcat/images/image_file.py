@@ -95,7 +95,7 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
                 values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
     if upside_down if flip is None else flip:
@@ -161,7 +161,8 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
                 return number
     raise ConfigError(
         f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
-        "choose one plane of a cube with --plane"
+        "choose one plane of a cube, such as plane=0",
+        fields=("plane=0",),
     )
 
 
@@ -354,11 +355,14 @@ def _check_size(image: NDArray[Any], other: NDArray[Any], what: str) -> None:
 def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
     """Check, before anything is done, that a WCS can be written."""
     if path.suffix.lower() not in _WCS_SUFFIXES:
-        raise ConfigError(f"--wcs {path}: a FITS file has a name that ends with .fits")
+        raise ConfigError(
+            f"wcs {path}: a FITS file has a name that ends with .fits", fields=("wcs",)
+        )
     if not is_picture:
         raise ConfigError(
-            f"--wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
-            "picture; give the picture, or use MatchResult.wcs() in Python"
+            f"wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
+            "picture; give the picture, or use MatchResult.wcs() in Python",
+            fields=("wcs",),
         )
 
 

@@ -242,7 +242,8 @@ class FileAnswers:
         if shape is not None and shape != (camera.height_px, camera.width_px):
             raise ConfigError(
                 f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
-                f"{camera.height_px}; describe the camera that took it with --camera"
+                f"{camera.height_px}; describe the camera that took it (camera)",
+                fields=("camera",),
             )
 
     @property
@@ -268,7 +269,8 @@ class FileAnswers:
         way = self._way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
-                "--track does not tell planets from stars; leave out --time, or --track"
+                "track=True does not tell planets from stars; leave out time, or track=True",
+                fields=("track=True", "time"),
             )
 
         def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
@@ -297,7 +299,8 @@ class FileAnswers:
             return partial(self.matcher.identify, fov_deg=options.fov_deg)
         if options.fov_deg is not None:
             raise ConfigError(
-                "--fov is for frames of an unknown camera; leave out --track and --prior-q"
+                "fov_deg is for frames of an unknown camera; leave out track=True and prior_q",
+                fields=("fov_deg", "track=True", "prior_q"),
             )
         if tracker is not None:
             return tracker.attempt
@@ -424,7 +427,9 @@ def measure(
             without_hot_pixels=without_hot_pixels,
         )
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
+        raise ConfigError(
+            f"{path}: {error}", key=error.key, value=error.value, fields=error.fields
+        ) from error
     frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
     return MeasuredFile([frame], image, image.shape, spots)
 
@@ -456,8 +461,9 @@ def _camera_of_size(
         height, width = measured.shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
-                f"the image has {width} x {height} px, --size says {size_px[0]} x {size_px[1]}; "
-                "leave --size out",
+                f"the image has {width} x {height} px, size_px says {size_px[0]} x {size_px[1]}; "
+                "leave size_px out",
                 key="size",
+                fields=("size_px",),
             )
     return Camera(width, height, fov_x_deg=known.fov_x_deg)

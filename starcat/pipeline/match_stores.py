@@ -98,7 +98,9 @@ def match_stores(
     """Find the counterparts of the stars of one catalog in another; neither need fit in memory."""
     if output.is_dir():
         raise OutputError(
-            f"{output}: cannot be written (Is a directory); choose another --output", path=output
+            f"{output}: cannot be written (Is a directory); choose another output",
+            path=output,
+            fields=("output",),
         )
     with whole_folder(output.absolute()) as scratch:
         stores = [_as_store(path, scratch / name) for path, name in ((a, "a"), (b, "b"))]

@@ -44,7 +44,7 @@ from starcat.service.pages.rendering import (
     size_text,
 )
 from starcat.service.pages.response import FILE, MOST_BYTES, PER, keys_of_file
-from starcat.service.pages.wording import in_page_words, page_problem
+from starcat.service.pages.wording import page_problem
 from starcat.service.problems import Problem, ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.settings import Role
@@ -229,7 +229,7 @@ def _shown(
         if key is None:
             refusals.append(text)
         else:
-            errors.setdefault(key, in_page_words(text))
+            errors.setdefault(key, text)
     is_refused = seen is not None and bool(refusals or seen.verdict.will_fail)
     is_busy = problem is not None and problem.status == 503
     return {

@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.service.access import principal_of
-from starcat.service.pages.wording import in_page_words
+from starcat.service.pages.wording import advice_in_page_words, problem_in_page_words
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.service.service import Service
 from starcat.version import __version__
@@ -131,7 +131,8 @@ def _environment() -> Environment:
         "duration": duration_text,
         "time": time_text,
         "moment": moment_text,
-        "plain": in_page_words,
+        "detail": problem_in_page_words,
+        "advice": advice_in_page_words,
     }
     environment.globals |= {
         "static": static_address,
