@@ -234,7 +234,9 @@ class FileAnswers:
             "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
         }
         chosen = self.options.model_copy(update=changes)
-        again = measure(self.path, chosen, self.local, without_hot_pixels=True)
+        again = measure(
+            self.path, chosen, self.local, without_hot_pixels=True, image=self.measured.image
+        )
         return again.frames, again.spots
 
     def _check_size(self) -> None:
@@ -404,8 +406,9 @@ def measure(
     local: LocalInputs | None = None,
     *,
     without_hot_pixels: bool = False,
+    image: NDArray[Any] | None = None,
 ) -> MeasuredFile:
-    """Read centroids, or find them in an image."""
+    """Read centroids, or find them in an image, which is read too unless it is given."""
     chosen = options or IdentifyOptions()
     if path == STDIN:
         # Its frames are only ever gone through.
@@ -414,7 +417,8 @@ def measure(
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
 
-    image = _read_picture(path, chosen, local or LocalInputs())
+    if image is None:
+        image = _read_picture(path, chosen, local or LocalInputs())
     try:
         spots = find_spots(
             image,
