@@ -390,7 +390,11 @@ def answers_of(
     """Return the answers to a file that is measured."""
     camera = local.camera or matcher.database.camera
     if options.camera is not None:
-        camera = parse_camera(options.camera, Path(CAMERA_NAME))
+        # A text without a size is of a camera whose images are as large as this one.
+        size_px = (camera.width_px, camera.height_px)
+        if measured.shape is not None:
+            size_px = (measured.shape[1], measured.shape[0])
+        camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
     if options.time is not None and local.observer is None:
