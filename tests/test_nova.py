@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -159,6 +160,61 @@ def test_where_tokens_are_needed_the_key_is_one(small_artifact, tmp_path, frame)
         session = sent(client, "/api/login", {"apikey": token}).json()["session"]
         answer = sent(client, "/api/upload", {"session": session}, file=picture)
         assert answer.json()["status"] == "success"
+
+
+@pytest.fixture(scope="module")
+def wide_artifact(tmp_path_factory):
+    """A database of another field than the small one."""
+    spec = starter_spec("wide", CameraSpec(width_px=640, height_px=480, fov_x_deg=60.0)).spec
+    content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
+    built = build(type(spec).model_validate(content), {}, tmp_path_factory.mktemp("wide"))
+    return built.folder
+
+
+WIDE = "fedcba9876543210"
+
+
+@pytest.fixture
+def both(small_artifact, wide_artifact, tmp_path):
+    """The folder of a service with both databases, the wide one the newer."""
+    old = add_database(tmp_path, small_artifact)
+    add_database(tmp_path, wide_artifact, WIDE)
+    os.utime(old, (1e9, 1e9))
+    return tmp_path
+
+
+@pytest.mark.parametrize("first", [None, "wide-1.0.0"])
+def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
+    """Of a picture without a scale the newest database makes nothing, and the other one solves it;
+    a scale says which one to try. The setting names the first one, and not the only one."""
+    camera = open_database(small_artifact).camera
+    file = ("a.fits", picture_of(frame, camera))
+    field = camera.fov_x_deg
+    scales = (
+        {},
+        {"scale_units": "degwidth", "scale_lower": 0.9 * field, "scale_upper": 1.1 * field},
+        {"scale_units": "arcminwidth", "scale_est": 60 * field, "scale_err": 10},
+    )
+    with client_of(both, plate_solver=first) as client:
+        for scale in scales:
+            number = sent(client, "/api/upload", scale, file=file).json()["subid"]
+            info = client.get(f"/api/jobs/{number}/info").json()
+            assert (info["status"], info["database"]) == ("success", small_artifact.name)
+            log = client.get(f"/joblog/{number}").text
+            assert ("wide-1.0.0: " in log) == (not scale or first is not None)
+
+
+def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact):
+    camera = open_database(small_artifact).camera
+    image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
+    buffer = io.BytesIO()
+    fits.PrimaryHDU(image.astype(np.float32)).writeto(buffer)
+    with client_of(both) as client:
+        number = sent(client, "/api/upload", {}, file=("a.fits", buffer.getvalue())).json()["subid"]
+        for path in (f"/api/jobs/{number}", f"/api/jobs/{number}/info"):
+            reason = client.get(path).json()["errormessage"]
+            assert f"{small_artifact.name}: " in reason
+            assert "wide-1.0.0: " in reason
 
 
 @pytest.mark.slow

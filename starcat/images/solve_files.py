@@ -234,7 +234,9 @@ class FileAnswers:
             "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
         }
         chosen = self.options.model_copy(update=changes)
-        again = measure(self.path, chosen, self.local, without_hot_pixels=True)
+        again = measure(
+            self.path, chosen, self.local, without_hot_pixels=True, image=self.measured.image
+        )
         return again.frames, again.spots
 
     def _check_size(self) -> None:
@@ -391,7 +393,11 @@ def answers_of(
     """Return the answers to a file that is measured."""
     camera = local.camera or matcher.database.camera
     if options.camera is not None:
-        camera = parse_camera(options.camera, Path(CAMERA_NAME))
+        # A text without a size is of a camera whose images are as large as this one.
+        size_px = (camera.width_px, camera.height_px)
+        if measured.shape is not None:
+            size_px = (measured.shape[1], measured.shape[0])
+        camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
     if options.time is not None and local.observer is None:
@@ -407,8 +413,9 @@ def measure(
     local: LocalInputs | None = None,
     *,
     without_hot_pixels: bool = False,
+    image: NDArray[Any] | None = None,
 ) -> MeasuredFile:
-    """Read centroids, or find them in an image."""
+    """Read centroids, or find them in an image, which is read too unless it is given."""
     chosen = options or IdentifyOptions()
     if path == STDIN:
         # Its frames are only ever gone through.
@@ -417,7 +424,8 @@ def measure(
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
 
-    image = _read_picture(path, chosen, local or LocalInputs())
+    if image is None:
+        image = _read_picture(path, chosen, local or LocalInputs())
     try:
         spots = find_spots(
             image,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.service.sandbox.child import own_output
+from starcat.service.sandbox.child import own_output, return_free_memory
 from starcat.vo.uploads import upload_facts
 
 if TYPE_CHECKING:
@@ -140,6 +140,8 @@ def serve() -> None:
             answers.flush()
         except BrokenPipeError:
             return
+        # What one request has left must not be missing in the next.
+        return_free_memory()
 
 
 def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, Any]:
