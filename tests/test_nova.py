@@ -19,9 +19,10 @@ sys.path.insert(0, str(Path(__file__).parent / "builders"))
 from artifact_copies import copied
 from rendered import picture_of
 from served import serve
-from services import add_database, client_of, token_of
+from services import DATABASE, add_database, client_of, token_of
 
 from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
 from starcat.pipeline.starter import starter_spec
@@ -215,6 +216,37 @@ def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact)
             reason = client.get(path).json()["errormessage"]
             assert f"{small_artifact.name}: " in reason
             assert "wide-1.0.0: " in reason
+
+
+def test_the_page_chooses_a_database_too(both, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    name, content = "a.fits", picture_of(frame, camera)
+    with client_of(both, anonymous="reader") as client:
+        for form in ({}, {"camera.fov_x_deg": f"{camera.fov_x_deg}"}):
+            form["camera.flip"] = "on"
+            page = client.post("/identify", data=form, files={"file": (name, content)}).text
+            assert f"<dd>{small_artifact.name}, method" in page
+            assert "not identified" not in page
+        # With the wrong database the page says how to find the right one.
+        page = client.post(
+            "/identify", data={"database": WIDE}, files={"file": (name, content)}
+        ).text
+        assert "If you are not sure of the field of view" in page or "px, the camera" in page
+        assert "more steps" not in page
+
+
+def test_the_size_of_a_picture_is_taken_from_the_file(both, small_artifact):
+    """A picture of another size than the database's camera, of which only the field is stated."""
+    known = open_database(small_artifact)
+    own = known.camera
+    other = Camera(own.width_px, own.height_px * 3 // 4, own.focal_length_px)
+    frames = simulate_frames(known.directions, other, 10, Noise(noise_px=0.05), 5, known.mag)
+    content = picture_of(max(frames, key=lambda one: len(one.mag)), other)
+    form = {"database": DATABASE, "camera.flip": "on"}
+    form["camera.fov_x_deg"] = f"{other.fov_x_deg}"
+    with client_of(both, anonymous="reader") as client:
+        page = client.post("/identify", data=form, files={"file": ("a.fits", content)}).text
+    assert f"<dd>{small_artifact.name}, method" in page
 
 
 @pytest.mark.slow

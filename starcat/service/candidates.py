@@ -27,6 +27,9 @@ MAX_TOTAL_S = 60.0
 MAX_SEARCH_S = 20.0
 """Seconds that the search for one frame in one of several databases may take."""
 
+MAX_FLAT_DEG = 180.0
+"""Fields of a camera without distortion are narrower."""
+
 PASSED_ON = (401, 413, 429, 503, 507)
 """Statuses of problems that another database does not solve."""
 
@@ -48,6 +51,20 @@ def fits(database: Database, fields_deg: FieldsDeg) -> bool:
         narrowest * (1.0 - FOV_ERROR) <= fields_deg[1]
         and widest * (1.0 + FOV_ERROR) >= fields_deg[0]
     )
+
+
+def field_line(database: Database, fields_deg: FieldsDeg | None) -> str:
+    """Return a line of a camera file: the field that is nearest to that of a database.
+
+    It is empty if the camera of the database has such a field: then the camera counts, with the
+    distortion of its lens.
+    """
+    camera = database.camera
+    own_deg = nearest_deg = camera.fov_x_deg
+    if fields_deg is not None:
+        nearest_deg = min(max(own_deg, fields_deg[0]), fields_deg[1])
+    is_own = nearest_deg == own_deg and not camera.distortion.is_none
+    return "" if is_own or nearest_deg >= MAX_FLAT_DEG else f"fov_x_deg = {nearest_deg!r}"
 
 
 def candidates(

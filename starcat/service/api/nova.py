@@ -28,7 +28,14 @@ from starcat.errors import StarcatError, TargetMissing
 from starcat.images.identify_options import IdentifyOptions
 from starcat.service.access import Identities, network_of, principal_of
 from starcat.service.api.identify import FrameUpload, identify_upload
-from starcat.service.candidates import MAX_SEARCH_S, FieldsDeg, candidates, spec_of, try_each
+from starcat.service.candidates import (
+    MAX_SEARCH_S,
+    FieldsDeg,
+    candidates,
+    field_line,
+    spec_of,
+    try_each,
+)
 from starcat.service.library import Database
 from starcat.service.problems import Problem, problem_of
 from starcat.service.security.request_limits import address_of
@@ -44,8 +51,6 @@ _SESSION = re.compile(rb'"session"[\s+]*:[\s+]*"([A-Za-z0-9._-]{1,200})"')
 _URLENCODED = "application/x-www-form-urlencoded"
 _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
 """Units of a scale that are of the width of a picture, degrees."""
-
-_MAX_FLAT_DEG = 180.0  # fields of a camera without distortion are narrower
 
 
 @dataclass(frozen=True)
@@ -335,14 +340,10 @@ def _options_for(
     if spec_of(database).products.levels.enabled:
         fov_deg = _fields_of(database, scale_deg)
         return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))
-    camera = database.camera
-    own_deg = camera.fov_x_deg
-    nearest_deg = own_deg
-    if scale_deg is not None:
-        nearest_deg = min(max(own_deg, scale_deg[0]), scale_deg[1])
-    if nearest_deg >= _MAX_FLAT_DEG or (nearest_deg == own_deg and not camera.distortion.is_none):
-        return IdentifyOptions()  # the camera of the database, with the distortion of its lens
-    lines = [f"fov_x_deg = {nearest_deg!r}"]  # a picture says its size itself
+    field = field_line(database, scale_deg)
+    if not field:
+        return IdentifyOptions()
+    lines = [field]  # a picture says its size itself
     if "x" in given and "image_width" in given:
         width, height = _size_of(given) or (0, 0)
         lines += [f"width_px = {width}", f"height_px = {height}"]

@@ -68,6 +68,7 @@ def identify(
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
+        "size_px": [answers.camera.width_px, answers.camera.height_px],
     }
 
 
