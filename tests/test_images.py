@@ -411,7 +411,7 @@ def test_where_too_much_stands_out_it_says_what_to_do():
     with pytest.raises(ConfigError, match="too much in it") as caught:
         detect(levels, 1.0, 5.0)
     assert "buffer" not in str(caught.value)
-    for option in ("--psf-sigma-px", "--threshold"):
+    for option in ("psf_sigma_px", "threshold="):
         assert option in str(caught.value)
 
 
