@@ -240,5 +240,10 @@ def _receive(answer: requests.Response, path: Path) -> str:
 
 def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
     words, key = str(told.get("detail", "no words")), told.get("key")
-    error = error_of_kind(str(told.get("kind", "")), words, key=None if key is None else str(key))
+    error = error_of_kind(
+        str(told.get("kind", "")),
+        words,
+        key=None if key is None else str(key),
+        fields=tuple(map(str, told.get("fields") or ())),
+    )
     return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)

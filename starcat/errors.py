@@ -85,9 +85,29 @@ def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
     >>> worded(error, lambda field: "--" + field.replace("_", "-"))
     'allow more with --time-limit-s'
     """
-    text = str(error)
-    for field_name in error.fields:
-        text = re.sub(rf"(?<![\w-]){re.escape(field_name)}(?!\w)", name_of(field_name), text)
+    return words_of(str(error), error.fields, name_of)
+
+
+def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) -> str:
+    """Return a message in which parameters have the names that ``name_of`` gives them.
+
+    Some parameters are called as things are: ``output``, ``camera``. Of such a word the one that
+    begins the message is the parameter, or else the last one. Parts of paths, and what stands in
+    quotes, are never a parameter.
+
+    Examples
+    --------
+    >>> words_of("output/output/a is there; choose another output", ["output"], "--{}".format)
+    'output/output/a is there; choose another --output'
+    """
+    for name in fields:
+        there = rf"(?<![\w/\\.'\"-]){re.escape(name)}(?![\w/\\'\"-]|\.\w)"
+        found = list(re.finditer(there, text))
+        if name.isalpha():
+            begins = re.match(rf"{name}(?= is |:)", text)
+            found = [begins] if begins else found[-1:]
+        for one in reversed(found):
+            text = text[: one.start()] + name_of(name) + text[one.end() :]
     return text
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
@@ -48,13 +49,20 @@ class Failure:
         return json.dumps({"error": asdict(self)}, ensure_ascii=False) + "\n"
 
 
-def failure_of(error: Exception, doing: str) -> Failure:
-    """Return what is to be said of an exception."""
+def failure_of(
+    error: Exception, doing: str, name_of: Callable[[str], str] | None = None
+) -> Failure:
+    """Return what is to be said of an exception.
+
+    ``doing`` is the command that ended. ``name_of`` gives the names that the reader knows the
+    parameters by; without it they are options of that command (`option_of`).
+    """
+    name_of = name_of or partial(option_of, command=doing)
     if isinstance(error, Abort) and isinstance(error.__cause__, Exception):
         error = error.__cause__  # an EOFError of a library, which typer takes for Ctrl-D
     kind = type(error).__name__
     if isinstance(error, StarcatError):
-        message = shown(worded(error, option_of), MAX_MESSAGE)
+        message = shown(worded(error, name_of), MAX_MESSAGE)
         return Failure(error.exit_code, kind, message, hint_in(message))
     if isinstance(error, TyperException):
         return Failure(
@@ -76,15 +84,41 @@ def failure_of(error: Exception, doing: str) -> Failure:
     return Failure(DEFECT, kind, f"{what}; {hint}", hint)
 
 
-def option_of(field: str) -> str:
+OPTIONS = {
+    "fov_deg": "fov",
+    "form": "to",
+    "inputs": "input",
+    "memory_bytes": "memory",
+    "size_px": "size",
+    "values": "set",
+}
+"""Options that are spelled differently from the parameter."""
+
+_PARAMETER = re.compile(r'(\w+)(?:\["(.+)"\]|=(.+))?')
+
+
+def option_of(field: str, command: str = "") -> str:
     """Return the option of the command line for a parameter of a function.
 
     Examples
     --------
-    >>> option_of("time_limit_s")
-    '--time-limit-s'
+    >>> option_of("time_limit_s"), option_of("replace=True"), option_of("threshold=8")
+    ('--time-limit-s', '--replace', '--threshold 8')
+    >>> option_of('inputs["sao"]'), option_of('inputs["sao"]', "starcat sql")
+    ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
-    return f"--{field.replace('_', '-')}"
+    if " = " in field:  # a key of a file, which one command has an option for
+        option = "--" + field.replace(" = ", " ").replace('"', "")
+        return option if command == "starcat bands" else field
+    found = _PARAMETER.fullmatch(field)
+    name, item, value = found.groups() if found else (field, None, None)
+    option = f"--{OPTIONS.get(name, name.replace('_', '-'))}"
+    if item is not None and name == "inputs":
+        # An input of a query is what the query is about, and stands before it.
+        return f"'starcat sql {item}=PATH'" if command == "starcat sql" else f"{option} {item}=PATH"
+    if item is not None:
+        return f"{option} {item}=VALUE"
+    return option if value in (None, "True") else f"{option} {value}"
 
 
 def _is_outsider(name: str | None) -> bool:

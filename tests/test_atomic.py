@@ -77,7 +77,7 @@ def test_two_writers_of_one_process_do_not_share_a_file(tmp_path):
 
 def test_a_file_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(OutputError, match="choose another --output"):
+    with pytest.raises(OutputError, match="choose another output"):
         whole_file(tmp_path / "file" / "table.csv").__enter__()
     with pytest.raises(OutputError, match=r"table.csv: cannot be written \(Not a directory\)$"):
         write_file(tmp_path / "file" / "table.csv", b"")

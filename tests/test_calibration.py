@@ -336,7 +336,7 @@ def test_what_is_known_of_a_camera_must_not_contradict_itself():
         starting_camera(own, camera=other, size_px=SIZE)
     with pytest.raises(ConfigError, match="the images have 640 x 480 px, the camera 1280 x 960"):
         starting_camera(own, camera=other, image_size_px=(640, 480))
-    with pytest.raises(ConfigError, match="say the field across their width with --fov"):
+    with pytest.raises(ConfigError, match="say the field across their width with fov_deg"):
         starting_camera(own, size_px=SIZE)
     for fov_deg in ((20.0, 5.0), (0.0, 5.0), (5.0, 180.0), (float("nan"), 5.0)):
         with pytest.raises(ConfigError, match="expected the smaller one first"):

@@ -176,7 +176,7 @@ def test_poles_and_the_meridian(tmp_path):
 
 def test_more_stars_in_one_place_than_a_partition_holds(tmp_path):
     table = star_table([10.0] * 3, [5.0] * 3)
-    with pytest.raises(ConfigError, match=r"3 stars are in one place.*--max-partition-rows"):
+    with pytest.raises(ConfigError, match=r"3 stars are in one place.*max_partition_rows"):
         write_hats(table, tmp_path / "sky", "sky", 2)
     assert not (tmp_path / "sky").exists()
 

@@ -76,7 +76,7 @@ def test_a_patch_is_for_one_image_and_says_when_it_is_damaged():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"), [({"method": "pyramid"}, "--method pyramid"), ({}, "--endian big")]
+    ("changes", "words"), [({"method": "pyramid"}, "method=pyramid"), ({}, "endian=big")]
 )
 def test_images_of_other_kinds_have_no_patch(changes, words):
     contents = sky(20, 1, n_features=0)

@@ -316,7 +316,7 @@ class TestNames:
         assert data_source("mine").epoch_jyear == 2000.0
 
     def test_an_unknown_name_says_how_a_table_becomes_a_source(self):
-        with pytest.raises(ConfigError, match=r"--source MAP\.toml"):
+        with pytest.raises(ConfigError, match=r"source=MAP\.toml"):
             data_source("mine")
 
 

@@ -63,8 +63,8 @@ VALUES: dict[str, object] = {
     "'2020-01-01 00:00:01.123456789'::TIMESTAMP_NS": dt.datetime(2020, 1, 1, 0, 0, 1, 123456),
     "TIMESTAMPTZ '2020-01-01 00:00:00+05'": dt.datetime(2019, 12, 31, 19, tzinfo=UTC),
     "'infinity'::TIMESTAMPTZ": dt.datetime.max.replace(tzinfo=UTC),
-    "INTERVAL '1 year 2 days 3 microseconds'": dt.timedelta(days=362, microseconds=3),
-    "INTERVAL '-1 day'": dt.timedelta(days=-1),
+    "INTERVAL '1 year 2 days 3 microseconds'": "1 year 2 days 00:00:00.000003",
+    "INTERVAL '-1 day'": "-1 day",
     f"'{NUMBER}'::UUID": NUMBER,
     "'x'::ENUM('x', 'y')": "x",
     "[[1], NULL, []]": [[1], None, []],
@@ -84,11 +84,12 @@ GIVEN = [
     for value in (
         None, True, 7, -(2**127), 1.5, "half \N{GLOWING STAR}", b"\0\xff", Decimal("1.50"), DAY,
         dt.datetime(2020, 1, 1, 2, 3, 4, 5), dt.time(1, 2, 3), dt.time(12, tzinfo=UTC),
-        dt.datetime(2020, 1, 1, tzinfo=UTC), dt.timedelta(1, 2, 3), NUMBER, [1, None], {"a": [DAY]},
+        dt.datetime(2020, 1, 1, tzinfo=UTC), NUMBER, [1, None], {"a": [DAY]},
         [], {},
     )
 ] + [
     (bytearray(b"y"), b"y"),
+    (dt.timedelta(1, 2, 3), "1 day 00:00:02.000003"),
     ((1, 2), [1, 2]),
     ({"key": [1], "value": [2]}, {1: 2}),
     (np.float64(2.5), 2.5),

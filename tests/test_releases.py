@@ -387,7 +387,7 @@ def test_locked_works_from_another_folder_and_another_registry(registry, tmp_pat
 
 def test_without_a_registry_the_pinned_one_is_asked(registry, artifact_version):
     lock = Path("starcat.lock")
-    with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*--registry"):
+    with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*registry"):
         pull_wanted("small", None, Path("out"), lock)
     pull("small", registry)
     publish_artifact(artifact_version("1.0.1"), "registry")
@@ -426,7 +426,7 @@ def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry):
 
 def test_a_lock_file_below_a_file(registry):
     Path("file").write_text("")
-    with pytest.raises(OutputError, match="choose another file with --lock"):
+    with pytest.raises(OutputError, match="choose another file with lock"):
         pull_wanted("small", "registry", Path("out"), Path("file/starcat.lock"))
 
 

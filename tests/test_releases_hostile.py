@@ -179,12 +179,12 @@ def test_what_is_there_already_needs_no_room(registry, monkeypatch):
 
 
 def test_the_user_says_how_much(registry):
-    with pytest.raises(OutputError, match=r"bytes; --max-bytes allows 1,000\. Allow more if you"):
+    with pytest.raises(OutputError, match=r"bytes; max_bytes allows 1,000\. Allow more if you"):
         pull(registry, 1000)
     assert not list(Path("out").rglob("*.parquet"))
     size = sum(path.stat().st_size for path in registry.glob("blobs/sha256/*/*"))
     assert pull(registry, size).is_dir()
-    with pytest.raises(OutputError, match="--max-bytes allows"):
+    with pytest.raises(OutputError, match="max_bytes allows"):
         pull_pinned(None, None, Path("other"), Path("starcat.lock"), max_bytes=1000)
 
 

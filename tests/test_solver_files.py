@@ -240,7 +240,7 @@ def _astap_stars(path: Path) -> list[tuple[float, float, float]]:
 
 def test_a_field_too_wide_for_astap_is_refused(sky, tmp_path, monkeypatch):
     monkeypatch.setattr(astap, "WIDEST_DEG", 5.0)
-    with pytest.raises(ConfigError, match="choose another --to"):
+    with pytest.raises(ConfigError, match="choose another form"):
         astap.write_astap(sky, tmp_path / "db")
 
 

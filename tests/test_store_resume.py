@@ -150,7 +150,7 @@ def test_an_unfinished_run_is_not_overwritten(damaged, tmp_path):
     store = tmp_path / "store"
     with pytest.raises(SourceError):
         make(copies, store)
-    with pytest.raises(OutputError, match=r"unfinished run.*--resume"):
+    with pytest.raises(OutputError, match=r"unfinished run.*resume=True"):
         make(copies, store)
     with pytest.raises(ConfigError, match="max_partition_rows 3000, this one 2000"):
         make(copies, store, resume=True, max_partition_rows=2_000)
@@ -168,13 +168,15 @@ def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
 
 
 def test_too_little_memory_says_what_it_takes(parts, tmp_path):
-    with pytest.raises(ConfigError, match=r"--memory 512 MiB is too little for 2 workers"):
+    with pytest.raises(
+        ConfigError, match=r"memory_bytes 512 MiB is too little for 2 worker processes"
+    ):
         make(parts, tmp_path / "store", memory_bytes=512 << 20, max_partition_rows=500_000)
 
 
 def test_a_cluster_that_is_not_there_is_told(parts, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
-    with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers"):
+    with pytest.raises(ConfigError, match=r"scheduler tcp://127.0.0.1:9: no scheduler answers"):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
 
 

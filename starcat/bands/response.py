@@ -188,8 +188,9 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
     if said not in ("photon", "energy"):
         raise ConfigError(
             f'response {name}: it does not say what it is relative to; set per = "photon" '
-            '(quantum efficiency) or "energy" (A/W)',
+            '(quantum efficiency) or per = "energy" (A/W)',
             key="per",
+            fields=('per = "photon"', 'per = "energy"'),
         )
     columns = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return checked_response(
@@ -209,7 +210,7 @@ def read_response(path: Path, per: str | None) -> Response:
         text = read_regular_file(path, MOST_BYTES).decode("utf-8")
     except FileMissing:
         raise FileMissing(
-            f"{path}: no such response; 'starcat bands' lists those that ship with starcat"
+            f"{path}: no such response; these ship with starcat: {', '.join(shipped_names())}"
         ) from None
     except SourceError as error:
         raise ConfigError(f"{error}; expected a CSV file", key="response") from error
@@ -259,8 +260,8 @@ def shipped(name: str) -> Response:
     if name not in known:
         hint = suggest(name, known)
         raise ConfigError(
-            f"unknown response {name!r}; {hint}known ones: {', '.join(known)}. 'starcat bands' "
-            'tells what they are; your own is a CSV: file = "sensor.csv"',
+            f"unknown response {name!r}; {hint}known ones: {', '.join(known)}. A response "
+            'of your own is a CSV file that a spec names: [camera.response] file = "sensor.csv"',
             key="response",
             value=name,
         )

@@ -116,10 +116,10 @@ def calibrate_frames(
     begun = first_answer(matcher, frames, camera, focal_px)
     if begun is None:
         asked = identify_part(matcher, frames, camera)
-        raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov", "flip"))
+        raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov_deg", "flip"))
     identified, fit = settled(matcher, frames, *begun, progress)
     if fit is None or len(identified.found) < MIN_FRAMES:
-        raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov", "flip"))
+        raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov_deg", "flip"))
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit)
 
@@ -187,14 +187,14 @@ def _too_few(
         return (
             f"{count} of {len(frames)} frames are identified, but no camera with a field of "
             f"{across} across the width fits them; give a range of fields that holds the true "
-            "one (fov)"
+            "one (fov_deg)"
         )
     missing = f" Not identified: {named}." if failed else ""
     return (
         f"{count} of {len(frames)} frames are identified with fields of {across} across the "
         f"width; a calibration needs {MIN_FRAMES}.{missing} Give more frames, a wider range of "
-        "fields (fov), the other value of flip, or a database that was built for about this field "
-        "and these stars"
+        "fields (fov_deg), the other value of flip, or a database that was built for about this "
+        "field and these stars"
     )
 
 

@@ -89,8 +89,9 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     found = {name: time for name, time in times.items() if time is not None}
     if not found:
         raise ConfigError(
-            "no frame says when it was taken (EXIF DateTimeOriginal, FITS DATE-OBS); give --times "
-            "with a CSV file of the columns frame and time"
+            "no frame says when it was taken (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
+            "with a CSV file of the columns frame and time",
+            fields=("times",),
         )
     return found
 

@@ -119,7 +119,8 @@ def starting_camera(
             raise ConfigError(
                 f"the frames have {wanted[0]} x {wanted[1]} px, the camera of the database "
                 f"{known.width_px} x {known.height_px}; say the field across their width with "
-                "--fov, such as 5:20, or give a camera file"
+                "fov_deg, such as 5:20, or give a camera file",
+                fields=("fov_deg",),
             )
         focal = known.focal_length_px
         return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))

@@ -284,9 +284,10 @@ def data_source(name: str) -> DataSource:
     hint = suggest(name, source_names())
     raise ConfigError(
         f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}. A table of "
-        f"your own becomes one by a map: --source MAP.toml, or the map in ${SOURCES_VARIABLE}",
+        f"your own becomes one by a map: source=MAP.toml, or the map in ${SOURCES_VARIABLE}",
         key="source",
         value=name,
+        fields=("source=MAP.toml",),
     )
 
 

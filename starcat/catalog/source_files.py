@@ -249,11 +249,13 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
             return [folder]
     if source_name == "gaia":
         return [embedded_sky()]
+    item = f'inputs["{source_name}"]'
     raise SourceMissing(
-        f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with --input "
-        f"{source_name}=PATH, set ${CATALOGS_VARIABLE} to the folder that has "
+        f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with "
+        f"{item}, set ${CATALOGS_VARIABLE} to the folder that has "
         f"{source.files[0].file_names[-1]}[.gz]" + _served(source),
         source=source_name,
+        fields=(item,),
     )
 
 
@@ -264,7 +266,7 @@ def _served(source: DataSource) -> str:
     remote = source.table.remote
     ways = [] if remote is None else [
         remote.tap and f"run 'starcat fetch {source.name} --limit-mag MAG -o DIR'",
-        remote.hats and f"give its address, --input {source.name}={remote.hats}",
+        remote.hats and f'give its address {remote.hats} with inputs["{source.name}"]',
     ]  # fmt: skip
     return "".join(f", or {way}" for way in ways if way)
 

@@ -130,7 +130,9 @@ class Remote(_Model):
     checked: str = Field(description="when and how the addresses were last tried")
     tap: str = Field("", description="address of a TAP service, which 'starcat fetch' asks")
     table: str = Field("", description="name of the table there, as ADQL writes it")
-    hats: str = Field("", description="address of a HATS catalog of it, for --input")
+    hats: str = Field(
+        "", description="address of a HATS catalog of it, which can be given as an input"
+    )
 
 
 class TableMap(_Model):

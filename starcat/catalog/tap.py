@@ -175,18 +175,20 @@ class _Fetch:
             if asked.limit_mag is not None:
                 if not band.is_column or band.unit != "mag":
                     raise ConfigError(
-                        f"--limit-mag: {asked.map.ordered_bands[0]} of the map is not a column of "
-                        "magnitudes; write the limit into a --query",
+                        f"limit_mag: {asked.map.ordered_bands[0]} of the map is not a column of "
+                        "magnitudes; write the limit into a query",
                         key="limit_mag",
+                        fields=("limit_mag", "query"),
                     )
                 self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag!r}"
         known = opened.columns.get(column)
         if known is None or known.is_text:
             raise ConfigError(
                 f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
-                f"has {', '.join(list(opened.columns)[:40])}. Name one with --strip-by",
+                f"has {', '.join(list(opened.columns)[:40])}. Name one with strip_by",
                 key="strip_by",
                 value=column,
+                fields=("strip_by",),
             )
         query = f"SELECT {self.chosen} FROM {self.table}{self.limit}"
         return Account(service=asked.service, query=query, strip_by=_quoted(column))
@@ -217,7 +219,8 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows lie between declinations "
                 f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time; "
-                "ask for fewer with --limit-mag or --query"
+                "ask for fewer with limit_mag or query",
+                fields=("limit_mag", "query"),
             )
         return self._counted(strip.first_deg, middle) + self._counted(middle, strip.end_deg)
 
@@ -274,8 +277,9 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
                 f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
-                f"table changes. Leave them out with a --query, or remove {self.work} and begin "
-                "anew"
+                f"table changes. Leave them out with a query, or remove {self.work} and begin "
+                "anew",
+                fields=("query",),
             )
 
     def _note(self) -> None:
@@ -323,16 +327,18 @@ def _account_in(folder: Path, wanted: Account) -> Account:
     except (OSError, ValidationError) as error:
         raise OutputError(
             f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME}); choose another "
-            "--output",
+            "output",
             path=folder,
+            fields=("output",),
         ) from error
     if (found.service, found.query, found.strip_by) != (
         wanted.service, wanted.query, wanted.strip_by,
     ):  # fmt: skip
         raise OutputError(
             f"{folder}: holds what another query gave ({found.query!r} of {found.service}); "
-            "choose another --output, or remove it",
+            "choose another output, or remove it",
             path=folder,
+            fields=("output",),
         )
     return found
 

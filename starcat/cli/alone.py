@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import StarcatError
+from starcat.errors import StarcatError, worded
 from starcat.version import __version__, lacking
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
         given = _parser().parse_args(list(arguments) or ["--help"])
         _identify(given.database, given.frames, given.fov_error, as_lines=given.json)
     except StarcatError as error:
-        return _refused(str(error), error.exit_code)
+        return _refused(worded(error, _option_of), error.exit_code)
     except ModuleNotFoundError as error:
         return _refused(lacking("starcat identify", error), USAGE)
     except BrokenPipeError:  # the reader of the output is gone
@@ -109,6 +109,11 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
             dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ],
     }
+
+
+def _option_of(field: str) -> str:
+    """Return the option for a parameter, as `starcat.failures.option_of`, which needs typer."""
+    return f"--{field.partition('=')[0].replace('_', '-')}"
 
 
 def _told(name: str, found: MatchResult) -> str:

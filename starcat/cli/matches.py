@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -12,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
-from starcat.errors import ConfigError, NotIdentifiedError
+from starcat.errors import ConfigError, NotIdentifiedError, words_of
+from starcat.failures import option_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
+from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import Frame
 
@@ -175,11 +176,7 @@ def as_options(text: str) -> str:
     >>> as_options("turn the frame over (flip), or allow a larger error (fov_error)")
     'turn the frame over (--flip), or allow a larger error (--fov-error)'
     """
-    return re.sub(
-        r"(?<=[(, ])(flip|[a-z]+_(?:error|error_deg|share|px|mag))(?=[,)])",
-        lambda found: "--" + found.group().replace("_", "-"),
-        text,
-    )
+    return words_of(text, bracketed(text), option_of)
 
 
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:

@@ -166,7 +166,9 @@ def _check_asked(file_format: str, folder: Path) -> None:
             value=file_format,
         )
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; choose a folder with --output", path=folder)
+        raise OutputError(
+            f"{folder}: is a file; choose a folder with output", path=folder, fields=("output",)
+        )
 
 
 def _write_file(table: pa.Table, folder: Path, label: Label, file_format: str) -> ExportedFile:
@@ -250,11 +252,14 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
             continue
         if not replace:
             raise OutputError(
-                f"{old} already exists and differs; choose another --output, or pass --replace",
+                f"{old} already exists and differs; choose another output, or pass replace=True",
                 path=old,
+                fields=("output", "replace=True"),
             )
         if old.is_dir() != new.is_dir() or (old.is_dir() and not (old / PROPERTIES_NAME).is_file()):
-            raise OutputError(f"{old} is something else; choose another --output", path=old)
+            raise OutputError(
+                f"{old} is something else; choose another output", path=old, fields=("output",)
+            )
     folder.mkdir(parents=True, exist_ok=True)
     for name in entries:
         old, new = folder / name, part / name

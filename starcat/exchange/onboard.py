@@ -98,18 +98,31 @@ def export_image(
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
         raise ConfigError(
-            f"--endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}", key="endian", value=endian
+            f"endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}",
+            key="endian",
+            value=endian,
+            fields=("endian",),
         )
     opened = open_artifact(artifact)
     suffix = ".c" if file_format == "c" else ".img"
     target = output or Path(f"{_name(opened)}{suffix}")
     if file_format == "c" and target.suffix != ".c":
-        raise ConfigError(f"--output {target}: C source has a name that ends with .c", key="output")
+        raise ConfigError(
+            f"output {target}: C source has a name that ends with .c",
+            key="output",
+            fields=("output",),
+        )
     if file_format == "c" and patch_from is not None:
-        raise ConfigError("--patch-from means nothing with --to c; leave it out", key="patch_from")
+        raise ConfigError(
+            "patch_from means nothing with form c; leave it out",
+            key="patch_from",
+            fields=("patch_from", "form"),
+        )
     old = None if patch_from is None else read_image(Path(patch_from))
     if target.is_dir():
-        raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
+        raise OutputError(
+            f"{target}: is a folder; choose a file with output", path=target, fields=("output",)
+        )
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
     room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
@@ -194,11 +207,12 @@ def _check_product(artifact: Artifact, method: str) -> None:
     product, _ = FEATURES[method]
     if product not in artifact.products:
         raise ConfigError(
-            f"{_name(artifact)} has no product {product!r}, which an image for the method {method} "
+            f"{_name(artifact)} has no product {product!r}, which an image for {method!r} "
             f"is made of; set products.{product}.enabled = true in its spec and build it again, or "
-            "choose another --method",
+            "choose another method",
             key="method",
             value=method,
+            fields=("method",),
         )
 
 
@@ -226,8 +240,9 @@ def _write(files: Mapping[Path, bytes], *, replace: bool) -> None:
     for path, data in files.items():
         if path.exists() and not replace and not (path.is_file() and path.read_bytes() == data):
             raise OutputError(
-                f"{path} already exists and differs; choose another --output, or pass --replace",
+                f"{path} already exists and differs; choose another output, or pass replace=True",
                 path=path,
+                fields=("output", "replace=True"),
             )
     for path, data in files.items():
         with whole_file(path) as unfinished:

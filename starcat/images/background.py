@@ -81,28 +81,40 @@ def subtract_background(image: ArrayLike) -> Levels:
             f"dimensions, each of {SMALLEST_PX} px or more"
         )
     with np.errstate(over="ignore"):
-        raw = np.array(values, dtype=np.float32, order="C")
-    mask = ~np.isfinite(raw)
+        raw = np.ascontiguousarray(values, dtype=np.float32)
+    mask = np.isfinite(raw)
+    np.logical_not(mask, out=mask)
     if mask.all():
         raise ConfigError("the image has no finite value; expected grey values")
-    raw[mask] = 0.0
+    if mask.any():
+        raw = np.where(mask, np.float32(0.0), raw)
     return _leveled(raw, mask)
+
+
+def unmasked(values: Grey, mask: Mask) -> Grey:
+    """Return the values of the pixels that are not left out; the array itself if it has no other.
+
+    An image of a large camera fills a good part of the memory that a request may take, so it is
+    copied only if it has to be.
+    """
+    return values[~mask] if mask.any() else values.reshape(-1)
 
 
 def _leveled(raw: Grey, mask: Mask) -> Levels:
     """Return levels with boxes as large as the structure of the background allows."""
-    least = _least_noise(raw[~mask])
+    least = _least_noise(unmasked(raw, mask))
     levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
     excess = _excess(levels)
     if max(excess) < _FLAT_EXCESS:
         # Compression took the noise away and left steps that are no light.
-        noise = np.maximum(levels.noise, _step(raw[~mask]))
+        noise = np.maximum(levels.noise, _step(unmasked(raw, mask)))
         return replace(levels, noise=noise, is_flat=True)
     if max(excess) < _WHITE_EXCESS:
         return levels  # white, within what a few boxes tell
     # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
     smooth = scipy.ndimage.gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
     for box in _BOXES_PX:
+        del levels  # before the next ones take the same memory again
         levels = _in_boxes(raw, smooth, mask, least, box)
         fine, coarse = _excess(levels)
         if coarse < _CLOUD_EXCESS * fine:
@@ -114,12 +126,14 @@ def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -
     height, width = raw.shape
     sep = load_sep()
     background = sep.Background(shown, mask=mask, bw=min(box, width), bh=min(box, height))
-    above = raw - background.back(dtype=np.float32)
+    above = background.back(dtype=np.float32)
+    np.subtract(raw, above, out=above)
     above[mask] = 0.0
     noise = background.rms(dtype=np.float32)
     if shown is not raw:
         noise *= np.float32(np.sqrt(4.0 * np.pi) * 1.0)  # what the smoothing took of white noise
-    return Levels(raw, above, np.maximum(noise, least), mask, box_px=box)
+    np.maximum(noise, least, out=noise)
+    return Levels(raw, above, noise, mask, box_px=box)
 
 
 def _excess(levels: Levels) -> tuple[float, float]:
@@ -212,11 +226,13 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     centre, square = (
         scipy.special.erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5)
     )
-    y, x = np.nonzero(levels.above > _HOT_NOISE * levels.noise)
+    y, x = _bright_pixels(levels)
     around = pixels_around(levels.above, x, y).astype(np.float64)
     pixel = around[:, 1, 1]
     neighbours = around.sum(axis=(1, 2)) - pixel
     hot = neighbours < _HOT_PART * (square / centre - 1.0) * pixel
+    if not hot.any():
+        return levels
     above = levels.above.copy()
     above[y[hot], x[hot]] = neighbours[hot] / 8.0
     return replace(levels, above=above)
@@ -229,17 +245,38 @@ def mask_hot_pixels(levels: Levels) -> Levels:
     costs stars whose light falls on one pixel, so it is for images that have no answer else.
     """
     for _ in range(_HOT_ROUNDS):
-        above = levels.above.copy()
-        y, x = np.nonzero(above > _HOT_NOISE * levels.noise)
-        around = pixels_around(above, x, y).reshape(-1, 9)
+        y, x = _bright_pixels(levels)
+        around = pixels_around(levels.above, x, y).reshape(-1, 9)
         neighbours = np.median(np.delete(around, 4, axis=1), axis=1)
         hot = neighbours < _HOT_MEDIAN_PART * around[:, 4]
-        above[y[hot], x[hot]] = neighbours[hot]
-        levels = _leveled(levels.raw + (above - levels.above), levels.mask)
+        raw, mask = levels.raw.copy(), levels.mask
+        raw[y[hot], x[hot]] += neighbours[hot] - around[hot, 4]
+        del levels  # before the next ones take the same memory again
+        levels = _leveled(raw, mask)
     return levels
 
 
-def pixels_around(image: Grey, x: NDArray[np.int64], y: NDArray[np.int64]) -> Grey:
-    """Return the 3 by 3 pixels around places of an image."""
-    steps = np.arange(3)
-    return np.asarray(np.pad(image, 1)[y[:, None, None] + steps[:, None], x[:, None, None] + steps])
+def _bright_pixels(levels: Levels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns of the pixels that can be hot, found row by row to save memory."""
+    is_bright = np.empty(levels.above.shape, dtype=np.bool_)
+    for above, noise, row in zip(levels.above, levels.noise, is_bright, strict=True):
+        np.greater(above, _HOT_NOISE * noise, out=row)
+    y, x = np.nonzero(is_bright)
+    return y, x
+
+
+def pixels_around(
+    image: Grey, x: NDArray[np.int64], y: NDArray[np.int64], reach_px: int = 1
+) -> Grey:
+    """Return the square of pixels around each place of an image, 3 by 3 by default.
+
+    Pixels outside of the image are 0. The image is not padded for them: that would copy it.
+    """
+    height, width = image.shape
+    steps = np.arange(-reach_px, reach_px + 1)
+    rows, columns = y[:, None] + steps, x[:, None] + steps
+    is_row, is_column = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
+    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    around = np.asarray(image[rows[:, :, None], columns[:, None, :]])
+    around[~(is_row[:, :, None] & is_column[:, None, :])] = 0.0
+    return around

@@ -187,7 +187,7 @@ def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Meas
     try:
         file = measure(path, options, local)
     except ConfigError as error:
-        return ConfigError(str(error), key=error.key)
+        return ConfigError(str(error), key=error.key, fields=error.fields)
     small = None if file.image is None else small_picture(file.image)
     return _Measured(replace(file, image=None), small)
 

@@ -25,6 +25,7 @@ from starcat.images.background import (
     pixels_around,
     repair_hot_pixels,
     subtract_background,
+    unmasked,
 )
 from starcat.images.spot_noise import centroid_sigma_px, electrons_per_step, noise_at
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
@@ -33,8 +34,10 @@ from starcat.products.blends import APERTURE_SIGMA, widths_px
 
 _log = logging.getLogger(__name__)
 
-# Pixels above the threshold that sep is given room for: so many, and this part of the image.
-_ROOM, _ROOM_SHARE = 300_000, 0.3
+# Pixels above the threshold that sep is given room for: so many, and these parts of the image, the
+# second if the first is full. sep takes the memory of all of them, some 40 bytes for each.
+_ROOM, _ROOM_PARTS = 300_000, (0.03, 0.3)
+_ROOM_IS_FULL = "pixel buffer full"  # part of what sep says then
 _MOST_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
 # The threshold is raised by this factor, so many times, where the room does not do.
 _RAISE, _TRIES = 1.5, 4
@@ -81,9 +84,11 @@ def find_spots(
         if value is not None and not 0.0 < value < np.inf:
             text = f"{name} is {value}; expected a positive number"
             raise ConfigError(text, key=name, value=value)
-    levels = subtract_background(image)
+    # No name for what is between them: it is as large as what comes of it.
     if without_hot_pixels:
-        levels = mask_hot_pixels(levels)
+        levels = mask_hot_pixels(subtract_background(image))
+    else:
+        levels = subtract_background(image)
     gain = gain_e_per_adu or electrons_per_step(levels)
     sigma = psf_sigma_px
     if sigma is None:
@@ -153,7 +158,7 @@ def _is_saturated(levels: Levels, found: NDArray[Any]) -> Mask:
     around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
     read_noise = _PLATEAU_NOISE * float(np.median(levels.noise))
     depth = min(read_noise, _PLATEAU_DEPTH * float(levels.above.max()))
-    at_limit = around >= float(levels.raw[~levels.mask].max()) - depth
+    at_limit = around >= float(unmasked(levels.raw, levels.mask).max()) - depth
     return np.asarray(at_limit.sum(axis=(1, 2)) >= _PLATEAU_PIXELS)
 
 
@@ -210,13 +215,17 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     for attempt in range(_TRIES):
         try:
             return extract(image, least * _RAISE**attempt, noise, levels.mask, kernel)
+        except MemoryError:  # says nothing of the image
+            raise
         except Exception as error:  # sep raises nothing more special when a buffer is full
             _log.info("at %.3g sigma: %s", threshold * _RAISE**attempt, error)
+    further = f"threshold={np.ceil(threshold * _RAISE**_TRIES):.0f}"
     raise ConfigError(
         f"the image has too much in it to tell stars from the sky: even at "
         f"{threshold * _RAISE ** (_TRIES - 1):.1f} times the noise too many pixels stand out; "
-        "check that it is a star image, state how wide a star is (--psf-sigma-px 1.5) or raise "
-        f"the threshold further (--threshold {np.ceil(threshold * _RAISE**_TRIES):.0f})"
+        "check that it is a star image, state how wide a star is (psf_sigma_px=1.5) or raise "
+        f"the threshold further ({further})",
+        fields=("psf_sigma_px=1.5", further),
     )
 
 
@@ -234,15 +243,20 @@ def extract(
     """
     sep = load_sep()
     before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
-    sep.set_extract_pixstack(_ROOM + int(_ROOM_SHARE * image.size))
     sep.set_sub_object_limit(_MOST_PARTS)
     try:
-        return np.asarray(
-            sep.extract(
-                image, least, err=noise, mask=mask, minarea=1, clean=False,
-                filter_kernel=kernel, filter_type="conv",
-            )
-        )  # fmt: skip
+        for part in _ROOM_PARTS:
+            sep.set_extract_pixstack(_ROOM + int(part * image.size))
+            try:
+                found = sep.extract(
+                    image, least, err=noise, mask=mask, minarea=1, clean=False,
+                    filter_kernel=kernel, filter_type="conv",
+                )  # fmt: skip
+                break
+            except Exception as error:  # sep raises nothing more special
+                if part == _ROOM_PARTS[-1] or _ROOM_IS_FULL not in str(error):
+                    raise
+        return np.asarray(found)
     finally:
         sep.set_extract_pixstack(before[0])
         sep.set_sub_object_limit(before[1])
@@ -254,6 +268,9 @@ def _filtered(levels: Levels, profile: Array) -> tuple[NDArray[np.float32], NDAr
     image = convolve1d(image, profile, axis=1, mode="nearest")
     box = {"bw": min(levels.box_px, image.shape[1]), "bh": min(levels.box_px, image.shape[0])}
     background = load_sep().Background(image, mask=levels.mask, **box)
-    known = levels.noise * np.float32((profile**2).sum())
-    noise = np.maximum(background.rms(dtype=np.float32), known)
-    return image - background.back(dtype=np.float32), noise
+    noise = background.rms(dtype=np.float32)
+    part = np.float32((profile**2).sum())
+    for row, known in zip(noise, levels.noise, strict=True):
+        np.maximum(row, part * known, out=row)
+    image -= background.back(dtype=np.float32)
+    return image, noise

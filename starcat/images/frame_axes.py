@@ -183,7 +183,7 @@ def _overlaps(box: Array, others: Array) -> bool:
 
 def stretch(image: NDArray[Any]) -> Array:
     """Return an image as it is shown."""
-    values = _brightest(np.where(np.isfinite(image), image, np.nan).astype(np.float64))
+    values = _brightest(image)
     finite = values[np.isfinite(values)]
     if not finite.size:
         return np.zeros(values.shape)
@@ -197,11 +197,18 @@ def stretch(image: NDArray[Any]) -> Array:
     return np.asarray(np.clip(shown / np.arcsinh((top - low) / unit), 0.0, 1.0))
 
 
-def _brightest(values: Array) -> Array:
-    """Return the brightest of each block of pixels, blocks of one pixel if the image is small."""
-    step = max(max(values.shape) // _LONG_SIDE_PX, 1)
-    rows, columns = (-(-length // step) for length in values.shape)
-    padded = np.full((rows * step, columns * step), np.nan)
-    padded[: values.shape[0], : values.shape[1]] = values
-    blocks = padded.reshape(rows, step, columns, step)
-    return np.asarray(np.fmax.reduce(np.fmax.reduce(blocks, axis=3), axis=1))
+def _brightest(image: NDArray[Any]) -> Array:
+    """Return the brightest of each block of pixels, blocks of one pixel if the image is small.
+
+    Values that are not finite do not count; a block without others is NaN. The blocks are made row
+    by row: all of a large image as float64 is more than a request has room for.
+    """
+    height, width = image.shape
+    step = max(max(height, width) // _LONG_SIDE_PX, 1)
+    tops, lefts = range(0, height, step), np.arange(0, width, step)
+    brightest = np.empty((len(tops), len(lefts)))
+    for row, top in enumerate(tops):
+        values = image[top : top + step].astype(np.float64)
+        values[~np.isfinite(values)] = np.nan
+        brightest[row] = np.fmax.reduceat(np.fmax.reduce(values, axis=0), lefts)
+    return brightest

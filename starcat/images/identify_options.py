@@ -56,7 +56,10 @@ class IdentifyOptions(BaseModel):
     plane: int | None = Field(None, ge=0, description="Plane of a FITS cube, from 0.")
     bayer: bool = Field(False, description="The image is a raw colour mosaic.")
     camera: str | None = Field(
-        None, max_length=20_000, description="Text of a camera file; the database's by default."
+        None,
+        max_length=20_000,
+        description="Text of a camera file; the database's by default. Without a size it is of a "
+        "camera whose frames have the size of the image, or of the database's camera.",
     )
     prior_q: tuple[float, float, float, float] | None = Field(
         None, description="Expected attitude; with prior_error_deg."

@@ -95,7 +95,9 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
                 values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+    except MemoryError:  # says nothing about the file
+        raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
     if upside_down if flip is None else flip:
@@ -136,7 +138,7 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
     planes = values.reshape(-1, *values.shape[-2:])
     if plane is not None:
         return planes[plane], bottom_up
-    grey = planes[0] if len(planes) == 1 else np.tensordot(_LUMINANCE, planes, axes=1)
+    grey = planes[0] if len(planes) == 1 else _luminance(planes)
     return grey, bottom_up
 
 
@@ -161,7 +163,8 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
                 return number
     raise ConfigError(
         f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
-        "choose one plane of a cube with --plane"
+        "choose one plane of a cube, such as plane=0",
+        fields=("plane=0",),
     )
 
 
@@ -190,7 +193,8 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
         # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
-        return np.asarray(np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE))
+        # Pillow has the weights of `_LUMINANCE`, and takes a byte a pixel for the result.
+        return np.asarray(picture.convert("RGB").convert("L"))
 
 
 def _grey_of_heic(data: bytes) -> NDArray[Any]:
@@ -201,10 +205,20 @@ def _grey_of_heic(data: bytes) -> NDArray[Any]:
             f"HEIC needs the package pi-heif ({error}); {install_command('images')}, or convert "
             "the picture to PNG"
         ) from error
-    values = np.asarray(open_heif(io.BytesIO(data), convert_hdr_to_8bit=False))
+    # Its memory is freed with the picture, whatever arrays still refer to it.
+    picture = open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
+    values = np.asarray(picture)
     if values.ndim == 2:
-        return values
-    return np.asarray(np.rint(values[..., :3] @ _LUMINANCE))
+        return values.copy()
+    return np.rint(_luminance(np.moveaxis(values, 2, 0)))
+
+
+def _luminance(planes: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the grey values of red, green and blue planes, row by row to save memory."""
+    grey = np.empty(planes.shape[1:], dtype=np.float32)
+    for row, values in enumerate(np.moveaxis(planes[:3], 1, 0)):
+        grey[row] = _LUMINANCE @ values
+    return grey
 
 
 def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
@@ -223,7 +237,7 @@ def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
         return np.asarray(values[..., 0])  # beside it is transparency
     if values.ndim != 3 or values.shape[2] not in (3, 4):
         raise ConfigError(f"an image of shape {values.shape}; expected grey or three colours")
-    return np.asarray(values[..., :3] @ _LUMINANCE)
+    return _luminance(np.moveaxis(values, 2, 0))
 
 
 def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
@@ -354,11 +368,14 @@ def _check_size(image: NDArray[Any], other: NDArray[Any], what: str) -> None:
 def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
     """Check, before anything is done, that a WCS can be written."""
     if path.suffix.lower() not in _WCS_SUFFIXES:
-        raise ConfigError(f"--wcs {path}: a FITS file has a name that ends with .fits")
+        raise ConfigError(
+            f"wcs {path}: a FITS file has a name that ends with .fits", fields=("wcs",)
+        )
     if not is_picture:
         raise ConfigError(
-            f"--wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
-            "picture; give the picture, or use MatchResult.wcs() in Python"
+            f"wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
+            "picture; give the picture, or use MatchResult.wcs() in Python",
+            fields=("wcs",),
         )
 
 

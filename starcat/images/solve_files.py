@@ -234,7 +234,9 @@ class FileAnswers:
             "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
         }
         chosen = self.options.model_copy(update=changes)
-        again = measure(self.path, chosen, self.local, without_hot_pixels=True)
+        again = measure(
+            self.path, chosen, self.local, without_hot_pixels=True, image=self.measured.image
+        )
         return again.frames, again.spots
 
     def _check_size(self) -> None:
@@ -242,7 +244,8 @@ class FileAnswers:
         if shape is not None and shape != (camera.height_px, camera.width_px):
             raise ConfigError(
                 f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
-                f"{camera.height_px}; describe the camera that took it with --camera"
+                f"{camera.height_px}; describe the camera that took it (camera)",
+                fields=("camera",),
             )
 
     @property
@@ -268,7 +271,8 @@ class FileAnswers:
         way = self._way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
-                "--track does not tell planets from stars; leave out --time, or --track"
+                "track=True does not tell planets from stars; leave out time, or track=True",
+                fields=("track=True", "time"),
             )
 
         def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
@@ -297,7 +301,8 @@ class FileAnswers:
             return partial(self.matcher.identify, fov_deg=options.fov_deg)
         if options.fov_deg is not None:
             raise ConfigError(
-                "--fov is for frames of an unknown camera; leave out --track and --prior-q"
+                "fov_deg is for frames of an unknown camera; leave out track=True and prior_q",
+                fields=("fov_deg", "track=True", "prior_q"),
             )
         if tracker is not None:
             return tracker.attempt
@@ -388,7 +393,11 @@ def answers_of(
     """Return the answers to a file that is measured."""
     camera = local.camera or matcher.database.camera
     if options.camera is not None:
-        camera = parse_camera(options.camera, Path(CAMERA_NAME))
+        # A text without a size is of a camera whose images are as large as this one.
+        size_px = (camera.width_px, camera.height_px)
+        if measured.shape is not None:
+            size_px = (measured.shape[1], measured.shape[0])
+        camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
     if options.time is not None and local.observer is None:
@@ -404,8 +413,9 @@ def measure(
     local: LocalInputs | None = None,
     *,
     without_hot_pixels: bool = False,
+    image: NDArray[Any] | None = None,
 ) -> MeasuredFile:
-    """Read centroids, or find them in an image."""
+    """Read centroids, or find them in an image, which is read too unless it is given."""
     chosen = options or IdentifyOptions()
     if path == STDIN:
         # Its frames are only ever gone through.
@@ -414,7 +424,8 @@ def measure(
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
 
-    image = _read_picture(path, chosen, local or LocalInputs())
+    if image is None:
+        image = _read_picture(path, chosen, local or LocalInputs())
     try:
         spots = find_spots(
             image,
@@ -424,7 +435,9 @@ def measure(
             without_hot_pixels=without_hot_pixels,
         )
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
+        raise ConfigError(
+            f"{path}: {error}", key=error.key, value=error.value, fields=error.fields
+        ) from error
     frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
     return MeasuredFile([frame], image, image.shape, spots)
 
@@ -456,8 +469,9 @@ def _camera_of_size(
         height, width = measured.shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
-                f"the image has {width} x {height} px, --size says {size_px[0]} x {size_px[1]}; "
-                "leave --size out",
+                f"the image has {width} x {height} px, size_px says {size_px[0]} x {size_px[1]}; "
+                "leave size_px out",
                 key="size",
+                fields=("size_px",),
             )
     return Camera(width, height, fov_x_deg=known.fov_x_deg)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from starcat.arrays import Array, Pixels
-from starcat.images.background import Levels
+from starcat.images.background import Levels, unmasked
 from starcat.matcher.result import MatchResult
 
 CREDIBLE_CHI_SQUARE = (0.5, 2.0)
@@ -59,8 +59,10 @@ def electrons_per_step(levels: Levels) -> float:
     it is, and the errors of bright stars larger. NaN where the sky was clipped, so that no pixel
     is darker than it by `LEAST_DEPTH` of its noise.
     """
-    sky = float(np.median((levels.raw - levels.above)[~levels.mask]))
-    depth = sky - float(levels.raw[~levels.mask].min())
+    background = unmasked(levels.raw - levels.above, levels.mask)
+    sky = float(np.median(background, overwrite_input=True))
+    del background
+    depth = sky - float(unmasked(levels.raw, levels.mask).min())
     noise = float(np.median(levels.noise))
     if not noise:
         return 1.0

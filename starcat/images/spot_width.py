@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from starcat.arrays import Array, Mask
-from starcat.images.background import Levels
+from starcat.images.background import Levels, pixels_around
 
 SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
 _STEP = 1.15
 _HALF_PX = 16  # a star is looked at this far to each side
 _REACH_SIGMA = 4.0
 _MOST_SPOTS = 150
+_SPOTS_AT_ONCE = 2000  # noise can have tens of thousands, each of which takes 9 kB or more
 # A spot narrower than this is a hot pixel with its neighbour, if there is another explanation.
 _SHARP_PX = 0.45
 _CLEAR_SNR, _SHARP_SNR = 15.0, 12.0
@@ -48,8 +49,14 @@ def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
 
 def is_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
     """Return which spots are too narrow for the light of a star, beyond their noise."""
-    if not len(places):
-        return np.zeros(0, dtype=np.bool_)
+    sharp = np.zeros(len(places), dtype=np.bool_)
+    for first in range(0, len(places), _SPOTS_AT_ONCE):
+        some = slice(first, first + _SPOTS_AT_ONCE)
+        sharp[some] = _are_sharp(levels, places[some], sigma)
+    return sharp
+
+
+def _are_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
     corner = np.floor(places + 0.5).astype(np.int64)
     widths = sigma * np.array([0.5, 1.0])
     windows = np.full((2, len(places)), _REACH_SIGMA * sigma)
@@ -102,10 +109,8 @@ def _between(steps: Array, scores: Array, best: NDArray[np.intp]) -> Array:
 
 def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
     """Return the square around each place; 0 outside of the image."""
-    padded = np.pad(above, _HALF_PX)
-    reach = np.arange(2 * _HALF_PX + 1)
-    rows = corner[:, 1, None, None] + reach[:, None]
-    return np.asarray(padded[rows, corner[:, 0, None, None] + reach], dtype=np.float64)
+    x, y = corner.T
+    return pixels_around(above, x, y, _HALF_PX).astype(np.float64)
 
 
 def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -46,10 +47,27 @@ HINTS: dict[Reason, str] = {
     ),
     "scale": "give the camera its true focal length, or allow a larger error of it (fov_error)",
     "mirrored": "turn the frame over (flip)",
-    "time": "allow more time, give magnitudes, or leave out centroids that are no stars",
-    "steps": ("allow more steps, give magnitudes, or leave out centroids that are no stars"),
+    "time": (
+        "allow more time (time_limit_s), give magnitudes, or leave out centroids that are no stars"
+    ),
+    "steps": (
+        "allow more steps (max_steps), give magnitudes, or leave out centroids that are no stars"
+    ),
 }
-"""What to try, by reason; options have their names in Python."""
+"""What to try, by reason. Parameters of Python and of the service stand in brackets."""
+
+_BRACKETS = re.compile(r"\(([a-z_]+(?:, [a-z_]+)*)\)")
+
+
+def bracketed(hint: str) -> list[str]:
+    """Return the parameters that a hint names.
+
+    Examples
+    --------
+    >>> bracketed(HINTS["chance"])
+    ['noise_px', 'noise_mag']
+    """
+    return [name for names in _BRACKETS.findall(hint) for name in names.split(", ")]
 
 
 @dataclass(frozen=True)
@@ -119,6 +137,11 @@ class Refusal:
             f"describe the camera with {self.camera.focal_length_px:.1f} px "
             f"({self.camera.fov_x_deg:.2f} deg across), or allow a larger error (fov_error)"
         )
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Parameters that the hint names."""
+        return tuple(bracketed(self.hint))
 
     def __repr__(self) -> str:
         return f"<Refusal {self.reason}: {self.message}>"

@@ -45,13 +45,14 @@ Rows = NDArray[np.int64]
 
 def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
     """Return the patch that makes one image of another."""
-    for what in ("method", "byte_order"):
+    for what, name in (("method", "method"), ("byte_order", "endian")):
         before, after = getattr(old, what), getattr(new, what)
         if before != after:
             raise ConfigError(
-                f"--patch-from: the old image is {before}, the new one {after}; export with "
-                f"--{'endian' if what == 'byte_order' else what} {before}",
+                f"patch_from: the old image is {before}, the new one {after}; export with "
+                f"{name}={before}",
                 key="patch_from",
+                fields=("patch_from", f"{name}={before}"),
             )
     source = _found(new.star_id, old.star_id)
     runs = _runs_of_rows(source)

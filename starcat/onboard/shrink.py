@@ -67,11 +67,12 @@ def shrink(
             return Shrunk(fewer, len(contents.star_id), len(whole.features), most)
     smallest = min(sizes)
     raise OnboardSizeError(
-        f"{contents.name}: {limit:,} bytes are too few for an onboard image for the method "
-        f"{contents.method}; the smallest that is of use has {smallest:,} bytes. Raise "
-        "--max-bytes, choose another --method, or build a database with fewer stars",
+        f"{contents.name}: {limit:,} bytes are too few for an onboard image for "
+        f"{contents.method!r}; the smallest that is of use has {smallest:,} bytes. Raise "
+        "max_bytes, choose another method, or build a database with fewer stars",
         max_bytes=int(limit),
         smallest_bytes=smallest,
+        fields=("max_bytes", "method"),
     )
 
 

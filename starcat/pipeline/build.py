@@ -123,7 +123,7 @@ def build(
         try:
             check_rates(made.rates, spec, made.coverage.gap)
         except BuildError as error:
-            raise BuildError(str(error), built=made) from None
+            raise BuildError(str(error), built=made, fields=error.fields) from None
         outcome = move_into_place(partial, final, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
@@ -219,11 +219,13 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
     """Check that the spec uses every source that an input is given for."""
     for name in inputs:
         if name not in spec.sources:
+            item = f'inputs["{name}"]'
             raise ConfigError(
-                f"--input {name}=...: {spec.name} does not read {name} but "
+                f"{item}: {spec.name} does not read {name} but "
                 f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
                 key="input",
                 value=name,
+                fields=(item,),
             )
 
 

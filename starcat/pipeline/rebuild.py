@@ -92,8 +92,9 @@ def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
             if digest != sha256:
                 raise ChecksumMismatch(
                     f"{path}: sha256 {digest}; {old.folder.name} was made from {file} with "
-                    f"{sha256}. Name that file with --input {name}=PATH",
+                    f'{sha256}. Name that file with inputs["{name}"]',
                     source=name,
+                    fields=(f'inputs["{name}"]',),
                     path=path,
                 )
     return found
@@ -110,8 +111,9 @@ def _check_remote(old: Artifact, manifest: dict[str, Any], inputs: Inputs) -> No
                 raise ChecksumMismatch(
                     f"{name}: {file['name']} has changed: what was read of it has sha256 "
                     f"{file['sha256']}, which {old.folder.name} was not made from. Name what it "
-                    f"was made from with --input {name}=ADDRESS",
+                    f'was made from with inputs["{name}"]',
                     source=name,
+                    fields=(f'inputs["{name}"]',),
                 )
 
 

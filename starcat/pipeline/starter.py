@@ -165,7 +165,11 @@ def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int
 def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
     """Write a first spec as a TOML file in which every key is explained."""
     if path.exists() and not replace:
-        raise OutputError(f"{path} is there already; choose another name or --replace", path=path)
+        raise OutputError(
+            f"{path} is there already; choose another name or pass replace=True",
+            path=path,
+            fields=("replace=True",),
+        )
     with whole_file(path) as partial:
         partial.write_text(spec_toml(starter.spec), encoding="utf-8")
 
@@ -207,7 +211,7 @@ def _spec(
     }
     if widest_fov_x_deg is not None:
         content |= _for_a_range(field, widest_fov_x_deg, content["boresights"]["count"])
-    return spec_from_dict(content, "--fov-range")
+    return spec_from_dict(content, "the range of fields")
 
 
 def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) -> dict[str, Any]:

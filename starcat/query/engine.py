@@ -265,7 +265,8 @@ class Engine:
             raise QueryLimitError(
                 f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
                 f"{self._opening.disk_gb:g} GB of disk; ask for less, or allow more with "
-                "--memory-limit-gb"
+                "memory_limit_gb",
+                fields=("memory_limit_gb",),
             )
         if self._is_late:
             raise _late(allowance)
@@ -382,7 +383,8 @@ class Engine:
         if name == "SIGKILL":
             return QueryLimitError(
                 "the process of the query was killed from outside, as a system does that runs out "
-                "of memory; ask for less, or allow less with --memory-limit-gb"
+                "of memory; ask for less, or allow less with memory_limit_gb",
+                fields=("memory_limit_gb",),
             )
         last = f": {lines[-1][:200]}" if lines else ""
         return WorkerEnded(
@@ -393,7 +395,8 @@ class Engine:
 
 def _late(allowance: Allowance) -> QueryLimitError:
     return QueryLimitError(
-        f"stopped after {allowance.total_s:g} s; ask for less, or allow more with --time-limit-s"
+        f"stopped after {allowance.total_s:g} s; ask for less, or allow more with time_limit_s",
+        fields=("time_limit_s",),
     )
 
 

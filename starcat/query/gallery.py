@@ -58,7 +58,7 @@ class NamedQuery:
             if name not in values:
                 known = ", ".join(values) or "none"
                 raise QueryError(f"{self.name} has no value {name!r}; it has: {known}")
-            values[name] = _as(type(values[name]), text, f"--set {name}={text}")
+            values[name] = _as(type(values[name]), text, f'values["{name}"]')
         return values
 
 
@@ -68,7 +68,7 @@ def _as(kind: type[Literal], text: str, where: str) -> Literal:
         return text
     if not (_WHOLE if kind is int else _NUMBER).fullmatch(text):
         wanted = {int: "a whole number", float: "a number"}[kind]
-        raise QueryError(f"{where}: {text!r} is not {wanted}")
+        raise QueryError(f"{where}: {text!r} is not {wanted}", fields=(where,))
     return kind(text)
 
 
@@ -90,7 +90,7 @@ def named_query(name: str) -> NamedQuery:
     known = gallery()
     if name not in known:
         hint = suggest(name, known)
-        raise QueryError(f"no query named {name!r}; {hint}'starcat sql --list' shows all")
+        raise QueryError(f"no query named {name!r}; {hint}known queries: {', '.join(known)}")
     return known[name]
 
 

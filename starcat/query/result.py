@@ -302,8 +302,18 @@ def cell_text(value: Any) -> str:
     return str(value)
 
 
+def _json_decimal(value: Decimal) -> Any:
+    """Return a decimal as a number, or as text if a double does not hold all of its digits."""
+    if not value.is_finite():
+        return None
+    if value.as_tuple().exponent == 0:
+        return json_value(int(value))
+    number = float(value)
+    return number if Decimal(repr(number)) == value else str(value)
+
+
 def json_value(value: Any) -> Any:
-    """Return a value as JSON has it: whole numbers that readers may round, and times, as texts.
+    """Return a value as JSON has it: numbers that readers may round, and times, as texts.
 
     Examples
     --------
@@ -314,8 +324,10 @@ def json_value(value: Any) -> Any:
         return value
     if isinstance(value, int):
         return value if abs(value) <= LARGEST_WHOLE else str(value)
-    if isinstance(value, float | Decimal):
-        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Decimal):
+        return _json_decimal(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [json_value(item) for item in value]
     if isinstance(value, dict):

@@ -103,7 +103,10 @@ class Session:
         given = values or {}
         for name in statement.parameters:
             if name not in given:
-                raise QueryError(f"the query has ${name}: give its value with --set {name}=VALUE")
+                raise QueryError(
+                    f'the query has ${name}: give its value with values["{name}"]',
+                    fields=(f'values["{name}"]',),
+                )
         used = {name: given[name] for name in statement.parameters} or None
         runs = statement.text
         if statement.is_description:

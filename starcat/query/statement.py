@@ -23,6 +23,10 @@ POINTED_CHARACTERS = 200  # how much of a line with an error is shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 """Nodes of DuckDB's syntax tree that read; COPY_QUERY_NODE and the like write."""
 
+PIVOTING = ("PIVOT", "FROM", "WITH")
+ALLOWED = ("SELECT", "VALUES", "(")
+"""First words of queries that DuckDB can parse, unless there is a pivot without values in them."""
+
 TABLE_FUNCTIONS = {
     "range",
     "generate_series",
@@ -179,12 +183,13 @@ def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
 
 def _refusal(text: str) -> str:
     """Return why a statement that is no SELECT is refused."""
-    word = _words(text)[0][1][:24].upper()
-    if word in ("PIVOT", "FROM", "WITH"):
+    words = [word for _, word in _words(text)]
+    word = words[0][:24].upper()
+    if word in PIVOTING or (word in ALLOWED and "pivot" in words):
         return f"{word}: give the values of a pivot, as in PIVOT t ON band IN ('V', 'G') USING ..."
     return (
         f"{word} is refused: a query only reads. SELECT, FROM, WITH, VALUES, DESCRIBE, SHOW, "
-        "SUMMARIZE and EXPLAIN are allowed; -o writes the answer to a file"
+        "SUMMARIZE and EXPLAIN are allowed"
     )
 
 
@@ -216,7 +221,7 @@ def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:
     kind = str(part.get("type"))
     if kind.endswith("_NODE") and kind not in READING_NODES:
         word = kind.removesuffix("_NODE").removesuffix("_QUERY")
-        raise QueryError(f"{word} is refused: a query only reads; -o writes the answer to a file")
+        raise QueryError(f"{word} is refused: a query only reads; leave it out")
     called = str(part.get("function_name") or "").lower()
     if called in REFUSED_FUNCTIONS:
         raise QueryError(f"{called}() is refused: {REFUSED_FUNCTIONS[called]}; leave it out")
@@ -230,5 +235,6 @@ def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:
         if name not in TABLE_FUNCTIONS | macros:
             raise QueryError(
                 f"{name}() is refused: a query reads the named targets only. Name a file before "
-                "the query to read it; 'starcat sql --macros' lists what may stand after FROM"
+                "the query to read it; after FROM may stand tables, and the functions "
+                f"{', '.join(sorted(TABLE_FUNCTIONS | macros))}"
             )

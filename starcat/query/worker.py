@@ -58,6 +58,8 @@ BESIDE_BYTES = 512 << 20  # what Python, Arrow and the stacks of threads may tak
 SCHEMA_KEY = "starcat.schema"
 
 _ZONED = re.compile(r"TIMESTAMP\w* WITH TIME ZONE")
+_ODD = re.compile(rf"{_ZONED.pattern}|\bINTERVAL\b")
+"""Types of which the Python client of DuckDB makes other values, or none."""
 
 
 def serve() -> None:
@@ -184,8 +186,8 @@ class Worker:
         running = self._connection.execute(text, values)
         columns = [(str(column[0]), str(column[1])) for column in running.description]
         zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
-        if zoned:
-            running = self._connection.execute(_without_zones(text, columns), values)
+        if any(_ODD.search(kind) for _, kind in columns):
+            running = self._connection.execute(_without_odd_types(text, columns), values)
         size, types = 0, [kind for _, kind in columns]
         for part in _parts(running, count):
             for content in self._contents(_in_utc(part, zoned) if zoned else part, types):
@@ -290,17 +292,18 @@ def _parts(running: Any, count: int) -> Iterator[list[tuple[Any, ...]]]:
         left = left - asked if len(part) == asked else 0
 
 
-def _without_zones(text: str, columns: list[tuple[str, str]]) -> str:
-    """Return a query whose times with a zone are times in UTC, or text where they are in lists.
+def _without_odd_types(text: str, columns: list[tuple[str, str]]) -> str:
+    """Return a query whose times with a zone are times in UTC, or text if they are in lists.
 
-    DuckDB makes them with a package that starcat does not need otherwise.
+    DuckDB makes them with a package that starcat does not need otherwise. Intervals are text too:
+    DuckDB makes a timedelta of them, which has no months, so that a year would have 360 days.
     """
     chosen = []
     for k, (name, kind) in enumerate(columns, start=1):
         if _ZONED.fullmatch(kind):
             value = f"#{k} AT TIME ZONE 'UTC'"
         else:
-            value = f"CAST(#{k} AS VARCHAR)" if _ZONED.search(kind) else f"#{k}"
+            value = f"CAST(#{k} AS VARCHAR)" if _ODD.search(kind) else f"#{k}"
         chosen.append(f"{value} AS {quoted_name(name)}")
     return f"SELECT {', '.join(chosen)} FROM ({text})"
 

@@ -71,7 +71,7 @@ def prepare(path: Path) -> None:
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    return writing(path, "choose another file with --lock")
+    return writing(path, "choose another file with lock", ("lock",))
 
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
@@ -112,16 +112,18 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
     if name not in pins:
         there = ", ".join(sorted(pins)) or "nothing"
         raise ConfigError(
-            f"{path} pins {there}, not {name}; pull it once without --locked",
+            f"{path} pins {there}, not {name}; pull it once without locked=True",
             key="locked",
             value=name,
+            fields=("locked=True",),
         )
     if version not in (None, pins[name].version):
         raise ConfigError(
-            f"{path} pins {name} {pins[name].version}, not {version}; leave --locked out to pin "
+            f"{path} pins {name} {pins[name].version}, not {version}; leave locked=True out to pin "
             "another version",
             key="locked",
             value=version,
+            fields=("locked=True",),
         )
     return pins[name]
 
@@ -158,8 +160,9 @@ def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
     if pin is None:
         raise ConfigError(
             f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "
-            "an address with --registry",
+            "an address with registry",
             key="registry",
+            fields=("registry",),
         )
     return pinned_registry(lock, pin)
 

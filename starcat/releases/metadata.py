@@ -56,9 +56,10 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
         return signing_with(paths, threshold)
     if threshold is not None:
         raise ConfigError(
-            "--threshold is the number of signatures, and nothing is signed without --sign KEY",
+            "threshold is the number of signatures, and nothing is signed without a key (sign)",
             key="threshold",
             value=threshold,
+            fields=("threshold", "sign"),
         )
     return None
 
@@ -198,8 +199,9 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
             raise ConfigError(
                 f"{registry}: signatures of the role {role} that are needed: {needed}, by the keys "
                 f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}. Give "
-                "--sign for each key",
+                "sign for each key",
                 key="sign",
+                fields=("sign",),
             )
 
 

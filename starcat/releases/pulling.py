@@ -65,7 +65,11 @@ def pull_release(
     if _is_there(final, release) and not _place_for(final, release).exists():
         return Pulled(release, registry.address, final, "unchanged")
     with (
-        writing(output, "what has arrived is kept: pull again to go on, or into another --output"),
+        writing(
+            output,
+            "what has arrived is kept: pull again to go on, or into another output",
+            ("output",),
+        ),
         _workplace(final, release) as place,
     ):
         if _is_there(final, release):  # another pull was faster, or killed after the last step
@@ -84,8 +88,9 @@ def _is_there(final: Path, release: Release) -> bool:
     if not manifest.is_file() or file_sha256(manifest) != release.manifest.sha256:
         raise OutputError(
             f"{final} already exists and is not {release.title} of the registry; move it away, or "
-            "choose another --output",
+            "choose another output",
             path=final,
+            fields=("output",),
         )
     findings = verify_artifact(final).findings
     if findings:
@@ -166,17 +171,19 @@ def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> N
     """Refuse a release that is larger than it may be, or than the disk has room for."""
     if max_bytes is not None and total > max_bytes:
         raise _TooLarge(
-            f"{where}: {total:,} bytes; --max-bytes allows {max_bytes:,}. Allow more if you trust "
+            f"{where}: {total:,} bytes; max_bytes allows {max_bytes:,}. Allow more if you trust "
             "the registry",
             path=place.parent,
+            fields=("max_bytes",),
         )
     there = sum(path.stat().st_size for path in _files_in(place))
     free = shutil.disk_usage(place).free
     if total - there > free:
         raise _TooLarge(
             f"{where}: {total - there:,} bytes are still to come, and {place.parent} has room for "
-            f"{free:,}; make room, or choose another --output",
+            f"{free:,}; make room, or choose another output",
             path=place.parent,
+            fields=("output",),
         )
 
 

@@ -70,17 +70,19 @@ def check_can_sign(registry: Path, signing: Signing | None) -> None:
         return
     if signing is None:
         raise ConfigError(
-            f"{registry}: is signed, and who pulls with --trust would be refused what is not; "
-            "publish with --sign KEY",
+            f"{registry}: is signed, and who pulls with a trusted key would be refused what is "
+            "not; publish with a key (sign)",
             key="sign",
+            fields=("sign",),
         )
     tree = load_tree(registry)
     if signing.threshold not in (None, tree.root.signed.roles["targets"].threshold):
         raise ConfigError(
-            f"--threshold {signing.threshold}: {registry} is signed already; 'starcat keys roles' "
+            f"threshold {signing.threshold}: {registry} is signed already; 'starcat keys roles' "
             "changes what it needs",
             key="threshold",
             value=signing.threshold,
+            fields=("threshold",),
         )
     check_keys(tree, signing, PUBLISHING)
 

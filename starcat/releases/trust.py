@@ -80,9 +80,10 @@ def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
         return known.read_bytes()
     if not trust.is_file():
         raise FileMissing(
-            f"{trust}: no such file; --trust takes a public key, NAME.pub, or the root.json of the "
-            "registry, from somebody you trust",
+            f"{trust}: no such file; trust=FILE takes a public key, NAME.pub, or the root.json of "
+            "the registry, from somebody you trust",
             key="trust",
+            fields=("trust=FILE",),
             value=str(trust),
         )
     if not is_public_key(trust):
@@ -112,9 +113,10 @@ def _check_root(data: bytes, trust: Path) -> None:
     except exceptions.RepositoryError as error:
         raise ConfigError(
             f"{trust}: neither a public key nor a root that its keys have signed ({error}); "
-            "--trust takes NAME.pub, or metadata/root.json of the registry, from somebody you "
+            "trust=FILE takes NAME.pub, or metadata/root.json of the registry, from somebody you "
             "trust",
             key="trust",
+            fields=("trust=FILE",),
             value=str(trust),
         ) from error
 

@@ -38,10 +38,15 @@ def read_camera(path: Path) -> Camera:
     )
 
 
-def parse_camera(text: str, path: Path) -> Camera:
-    """Return the camera of a TOML text; messages call it ``path``."""
+def parse_camera(text: str, path: Path, size_px: tuple[int, int] | None = None) -> Camera:
+    """Return the camera of a TOML text; messages call it ``path``.
+
+    ``size_px`` is the width and height of a camera of which the text states neither.
+    """
     content = content_of_toml(text, str(path))
     if "camera" not in content:
+        if size_px is not None and not any(key in content for key in SIZES):
+            content |= dict(zip(SIZES, size_px, strict=True))
         return _camera(content, path, "")
     for key in KEYS:
         if key in content:

@@ -44,7 +44,9 @@ def whole_file(path: Path) -> Iterator[Path]:
             yield partial
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)}); choose another --output", path=path
+            f"{path}: cannot be written ({reason(error)}); choose another output",
+            path=path,
+            fields=("output",),
         ) from error
 
 
@@ -102,8 +104,9 @@ def whole_folder(final: Path) -> Iterator[Path]:
         except OSError as error:
             raise OutputError(
                 f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
-                "with --output",
+                "with output",
                 path=final.parent,
+                fields=("output",),
             ) from error
         try:
             made.chmod(0o755)
@@ -128,15 +131,18 @@ def _remove_abandoned(final: Path) -> None:
 
 
 @contextmanager
-def writing(folder: Path, advice: str) -> Iterator[None]:
-    """Turn a refusal of the operating system into the error that says so."""
+def writing(folder: Path, advice: str, fields: tuple[str, ...] = ()) -> Iterator[None]:
+    """Turn a refusal of the operating system into the error that says so.
+
+    The advice is the end of the message; ``fields`` are the parameters that it names.
+    """
     try:
         yield
     except OSError as error:
         if error.errno not in _WRITING_FAILED:
             raise
         raise OutputError(
-            f"{folder}: writing failed ({reason(error)}); {advice}", path=folder
+            f"{folder}: writing failed ({reason(error)}); {advice}", path=folder, fields=fields
         ) from error
 
 
@@ -153,8 +159,9 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
     if not replace:
         raise OutputError(
             f"{final} already exists and differs; raise the version in the spec, choose another "
-            "--output, or pass --replace",
+            "output, or pass replace=True",
             path=final,
+            fields=("output", "replace=True"),
         )
     aside = partial.with_name(f"{partial.name}.old.partial")
     try:

@@ -77,10 +77,11 @@ def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
         client = client_class(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(
-            f"--scheduler {scheduler}: no scheduler answers ({error}); start one with 'dask "
+            f"scheduler {scheduler}: no scheduler answers ({error}); start one with 'dask "
             "scheduler' and workers with 'dask worker', or leave it out to use this machine",
             key="scheduler",
             value=scheduler,
+            fields=("scheduler",),
         ) from error
     with client:
         yield client
@@ -91,10 +92,11 @@ def _check_versions(client: Client) -> None:
     for worker, there in client.run(versions).items():
         if there != here:
             raise ConfigError(
-                f"--scheduler: the worker {worker} has {_told(there)}, this process has "
+                f"scheduler: the worker {worker} has {_told(there)}, this process has "
                 f"{_told(here)}; install the same on both, as the bytes of a store depend on it",
                 key="scheduler",
                 value=worker,
+                fields=("scheduler",),
             )
 
 
@@ -128,8 +130,9 @@ def run_tasks(
                 report(number, results[number])
     except KilledWorker as error:
         raise BuildError(
-            f"workers died again and again ({error}); give each more memory, with fewer --workers "
-            "or a smaller --max-partition-rows, then go on with --resume"
+            f"worker processes died again and again ({error}); give each more memory, "
+            "with fewer workers or a smaller max_partition_rows, then go on with resume=True",
+            fields=("workers", "max_partition_rows", "resume=True"),
         ) from error
     finally:
         client.cancel(futures, force=True)

@@ -105,7 +105,9 @@ def ingest_to_store(
     rows_of_a_run(options)
     if output.exists() and not (options.replace or options.resume):
         raise OutputError(
-            f"{output} already exists; choose another --output, or pass --replace", path=output
+            f"{output} already exists; choose another output, or pass replace=True",
+            path=output,
+            fields=("output", "replace=True"),
         )
     plan = StorePlan.of(output, reading, options)
     plan.resume.begin(_all_options(plan, files), resume=options.resume)

@@ -22,7 +22,7 @@ from starcat.storage.atomic import writing
 from starcat.storage.digests import json_bytes
 
 OPTIONS_NAME = "options.json"
-RESUME_ADVICE = "what is done is kept: make room, then go on with --resume"
+RESUME_ADVICE = "what is done is kept: make room, then go on with resume=True"
 _DONE = "done"
 
 
@@ -55,14 +55,15 @@ class ResumePlan:
         path = self / OPTIONS_NAME
         if path.is_file() and not resume:
             raise OutputError(
-                f"{self.folder}: an unfinished run is there; go on with it by --resume, or remove "
-                "the folder to start anew",
+                f"{self.folder}: an unfinished run is there; go on with it by resume=True, or "
+                "remove the folder to start anew",
                 path=self.folder,
+                fields=("resume=True",),
             )
         if path.is_file():
             self._check_options(json.loads(path.read_text(encoding="utf-8")), options)
             return
-        with writing(self.folder.parent, "choose another --output"):
+        with writing(self.folder.parent, "choose another output", ("output",)):
             shutil.rmtree(self.folder, ignore_errors=True)
             (self / _DONE).mkdir(parents=True)
             path.write_bytes(json_bytes(dict(options)))

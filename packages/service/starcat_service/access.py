@@ -35,7 +35,7 @@ VOSI = ("/tap/availability", "/tap/capabilities")
 
 NOVA = (
     *("/api/login", "/api/upload", "/api/url_upload"),
-    *("/api/submissions/", "/api/jobs/", "/wcs_file/"),
+    *("/api/submissions/", "/api/jobs/", "/wcs_file/", "/joblog/"),
 )
 """Whose clients send no header: a session is in their JSON, a number in their addresses."""
 

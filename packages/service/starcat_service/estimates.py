@@ -8,13 +8,11 @@ ends, its requests are refused and the next one starts another process.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
@@ -31,7 +29,7 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import spec_from_dict
 from starcat_service.catalogs import RETRY_S, WAIT_S, CatalogRead, Catalogs
 from starcat_service.problems import Problem
-from starcat_service.sandbox.child import Child, own_output
+from starcat_service.sandbox.child import Child, own_output, return_free_memory
 
 T = TypeVar("T")
 
@@ -200,7 +198,7 @@ def serve() -> None:
         content = {"number": request["number"], **_answer(catalogs, request)}
         content["read"] = [asdict(one) for one in catalogs.known()]
         if catalogs.known() != before:
-            _return_memory()
+            return_free_memory()
         line = json.dumps(content, default=_plain).encode() + b"\n"
         with writing:
             output.write(line)
@@ -257,13 +255,6 @@ _TASKS: dict[str, Callable[..., Any]] = {
     "starter": _starter,
     "enough_limit": _enough_limit,
 }
-
-
-def _return_memory() -> None:
-    """Return the memory that reading a catalog took and that is free now to the system."""
-    if sys.platform == "linux":
-        with suppress(OSError, AttributeError):  # of another C library than that of GNU
-            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _plain(value: Any) -> Any:

@@ -65,6 +65,7 @@ class ProblemDetails(BaseModel):
     kind: str | None = Field(None, description="Class of the error.")
     hint: str | None = Field(None, description="Part of the detail that tells what to do.")
     key: str | None = Field(None, description="Key of the spec, or parameter, that is wrong.")
+    fields: list[str] | None = Field(None, description="Parameters that the detail names.")
 
 
 class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
@@ -102,16 +103,38 @@ def problem_of(error: Exception) -> ProblemDetails:
     if status == 500:
         detail = "this is a defect of starcat; the log of the server says more"
         return _problem(500, detail, code=DEFECT)
-    failure = failure_of(error, "starcat serve")
-    key = getattr(error, "key", None)
+    failure = failure_of(error, "starcat serve", parameter_of)
+    key, fields = getattr(error, "key", None), getattr(error, "fields", ())
+    message, hint = failure.message, failure.hint
+    if hint and _FOR_OPERATOR.search(hint):
+        advice = "Ask the operator of this service" if hint[0].isupper() else ASK_OPERATOR
+        message, hint = message.removesuffix(hint) + advice, advice
     return _problem(
         status,
-        without_folders(failure.message),
+        without_folders(message),
         code=failure.code,
         kind=failure.kind,
-        hint=None if failure.hint is None else without_folders(failure.hint),
+        hint=None if hint is None else without_folders(hint),
         key=str(key) if key else None,
+        fields=[name for name in fields if parameter_of(name) == name] or None,
     )
+
+
+_FOR_OPERATOR = re.compile(r"'starcat [a-z]|\$STARCAT_")
+"""What only whoever runs the service can do: commands, and variables of the environment."""
+
+ASK_OPERATOR = "ask the operator of this service"
+
+
+def parameter_of(field: str) -> str:
+    """Return the name of a parameter in the service: its own, or that of a setting.
+
+    Examples
+    --------
+    >>> parameter_of("time_limit_s"), parameter_of("memory_limit_gb")
+    ('time_limit_s', 'query_memory_gib')
+    """
+    return {"memory_limit_gb": "query_memory_gib"}.get(field, field)
 
 
 def _problem(status: int, detail: str, **facts: Any) -> ProblemDetails:

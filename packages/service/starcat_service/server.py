@@ -144,14 +144,16 @@ def _only_server(paths: ServicePaths) -> Iterator[None]:
             stack.enter_context(locked(paths.lock, wait=False))
         except BlockingIOError:
             raise ConfigError(
-                f"another server runs with --root {paths.root}; stop it, or choose another root",
+                f"{paths.root}: another server runs there; stop it, or choose another root",
                 key="root",
                 value=str(paths.root),
+                fields=("root",),
             ) from None
         except OSError as error:
             raise OutputError(
-                f"{paths.root}: cannot be used ({reason(error)}); choose another --root",
+                f"{paths.root}: cannot be used ({reason(error)}); choose another root",
                 path=paths.root,
+                fields=("root",),
             ) from error
         yield
 
@@ -245,10 +247,11 @@ def listen(settings: Settings) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except OSError as error:
         raise ConfigError(
-            f"cannot listen at {settings.host}, port {settings.port}: {reason(error)}; choose "
-            "another with --host and --port, or end what uses it",
+            f"cannot listen at {settings.host}:{settings.port}: {reason(error)}; choose "
+            "another with host and port, or end what uses it",
             key="port",
             value=settings.port,
+            fields=("host", "port"),
         ) from error
     return listening
 

@@ -85,8 +85,8 @@ class Settings(BaseModel):
     plate_solver: str | None = Field(
         None,
         max_length=200,
-        description="Database, by id or title, for clients of nova.astrometry.net; by default the "
-        "newest with levels, or else the newest.",
+        description="Database, by id or title, that is tried first for clients of "
+        "nova.astrometry.net; by default the newest one that fits the scale of the picture.",
     )
     signing_key: Path | None = Field(
         None,

@@ -8,20 +8,26 @@ from typing import TYPE_CHECKING
 import pytest
 from browsing import NEEDS_BROWSER, launched, look, opened
 from served import serve
+from services import DATABASE, add_database, token_of
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def browser() -> Iterator[Browser]:
+    with launched() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """A page of a service with nothing in it."""
     folder = tmp_path_factory.mktemp("browser")
     with (
         serve(folder / "service", folder / "log", anonymous="builder") as served,
-        launched() as browser,
         opened(browser, served.address) as page,
     ):
         yield page
@@ -92,3 +98,17 @@ def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
     page.locator("#limit").fill("6")
     page.locator("#flip").uncheck()
     assert page.url.endswith("/identify?sort=mag")
+
+
+def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_artifact):
+    root = tmp_path / "service"
+    add_database(root, picky_artifact)
+    token = token_of(root, "ann")
+    with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
+        page.goto(f"/sign-in?next=/databases/{DATABASE}/report")
+        page.locator("#token").fill(token)
+        page.locator("form button[type=submit]").last.click()
+        page.wait_for_url("**/report")
+        page.locator("a").first.click()
+        page.wait_for_url(f"**/databases/{DATABASE}")
+        assert "ann" in page.locator("header").inner_text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from rendered import picture_of
 from served import serve
-from services import add_database, client_of, token_of
+from services import DATABASE, add_database, client_of, token_of
 
 from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
 from starcat.pipeline.starter import starter_spec
@@ -154,6 +156,92 @@ def test_where_tokens_are_needed_the_key_is_one(small_artifact, tmp_path, frame)
         session = sent(client, "/api/login", {"apikey": token}).json()["session"]
         answer = sent(client, "/api/upload", {"session": session}, file=picture)
         assert answer.json()["status"] == "success"
+
+
+@pytest.fixture(scope="module")
+def wide_artifact(tmp_path_factory):
+    """A database of another field than the small one."""
+    spec = starter_spec("wide", CameraSpec(width_px=640, height_px=480, fov_x_deg=60.0)).spec
+    content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
+    built = build(type(spec).model_validate(content), {}, tmp_path_factory.mktemp("wide"))
+    return built.folder
+
+
+WIDE = "fedcba9876543210"
+
+
+@pytest.fixture
+def both(small_artifact, wide_artifact, tmp_path):
+    """The folder of a service with both databases, the wide one the newer."""
+    old = add_database(tmp_path, small_artifact)
+    add_database(tmp_path, wide_artifact, WIDE)
+    os.utime(old, (1e9, 1e9))
+    return tmp_path
+
+
+@pytest.mark.parametrize("first", [None, "wide-1.0.0"])
+def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
+    """Of a picture without a scale the newest database makes nothing, and the other one solves it;
+    a scale says which one to try. The setting names the first one, and not the only one."""
+    camera = open_database(small_artifact).camera
+    file = ("a.fits", picture_of(frame, camera))
+    field = camera.fov_x_deg
+    scales = (
+        {},
+        {"scale_units": "degwidth", "scale_lower": 0.9 * field, "scale_upper": 1.1 * field},
+        {"scale_units": "arcminwidth", "scale_est": 60 * field, "scale_err": 10},
+    )
+    with client_of(both, plate_solver=first) as client:
+        for scale in scales:
+            number = sent(client, "/api/upload", scale, file=file).json()["subid"]
+            info = client.get(f"/api/jobs/{number}/info").json()
+            assert (info["status"], info["database"]) == ("success", small_artifact.name)
+            log = client.get(f"/joblog/{number}").text
+            assert ("wide-1.0.0: " in log) == (not scale or first is not None)
+
+
+def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact):
+    camera = open_database(small_artifact).camera
+    image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
+    buffer = io.BytesIO()
+    fits.PrimaryHDU(image.astype(np.float32)).writeto(buffer)
+    with client_of(both) as client:
+        number = sent(client, "/api/upload", {}, file=("a.fits", buffer.getvalue())).json()["subid"]
+        for path in (f"/api/jobs/{number}", f"/api/jobs/{number}/info"):
+            reason = client.get(path).json()["errormessage"]
+            assert f"{small_artifact.name}: " in reason
+            assert "wide-1.0.0: " in reason
+
+
+def test_the_page_chooses_a_database_too(both, frame, small_artifact):
+    camera = open_database(small_artifact).camera
+    name, content = "a.fits", picture_of(frame, camera)
+    with client_of(both, anonymous="reader") as client:
+        for form in ({}, {"camera.fov_x_deg": f"{camera.fov_x_deg}"}):
+            form["camera.flip"] = "on"
+            page = client.post("/identify", data=form, files={"file": (name, content)}).text
+            assert f"<dd>{small_artifact.name}, method" in page
+            assert "not identified" not in page
+        # With the wrong database the page says how to find the right one.
+        page = client.post(
+            "/identify", data={"database": WIDE}, files={"file": (name, content)}
+        ).text
+        assert "If you are not sure of the field of view" in page or "px, the camera" in page
+        assert "more steps" not in page
+
+
+def test_the_size_of_a_picture_is_taken_from_the_file(both, small_artifact):
+    """A picture of another size than the database's camera, of which only the field is stated."""
+    known = open_database(small_artifact)
+    own = known.camera
+    other = Camera(own.width_px, own.height_px * 3 // 4, own.focal_length_px)
+    frames = simulate_frames(known.directions, other, 10, Noise(noise_px=0.05), 5, known.mag)
+    content = picture_of(max(frames, key=lambda one: len(one.mag)), other)
+    form = {"database": DATABASE, "camera.flip": "on"}
+    form["camera.fov_x_deg"] = f"{other.fov_x_deg}"
+    with client_of(both, anonymous="reader") as client:
+        page = client.post("/identify", data=form, files={"file": ("a.fits", content)}).text
+    assert f"<dd>{small_artifact.name}, method" in page
 
 
 @pytest.mark.slow

@@ -419,7 +419,7 @@ def test_a_catalog_that_is_not_here_is_told(client, monkeypatch):
     told = re.search(r'id="catalog.source-error">([^<]*)<', page.text)
     assert told is not None
     assert "no file found" in told[1]
-    assert "starcat fetch sao" in told[1]
+    assert "Ask the operator of this service" in told[1]
     assert "--input" not in page.text
 
 

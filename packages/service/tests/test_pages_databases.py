@@ -221,20 +221,40 @@ def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_artifa
     way_back, _, report = after.partition("</p>")
     assert f'href="{PAGE}"' in way_back
     assert before + body + report == (small_artifact / "report" / "index.html").read_text("utf-8")
-    policy = answer.headers["content-security-policy"]
-    assert "sandbox" in policy
-    assert "allow" not in policy
-    assert "default-src 'none'" in policy
-    assert "script-src" not in policy
+    assert answer.headers["content-security-policy"] == (
+        "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox allow-same-origin"
+    )
 
 
 def test_two_versions_are_compared(client):
     words = text_of(client.get(f"{PAGE}/compare?other={LATER}").text)
     assert "version 1.0.0 1.1.0" in words
+    from_the_newer = client.get(f"/databases/{LATER}/compare?other={DATABASE}").text
+    assert "version 1.0.0 1.1.0" in text_of(from_the_newer)
     assert "Stars added (0)" in words
     assert "same" in words.split()
     assert client.get(f"{PAGE}/compare?other={'0' * 16}").status_code == 404
     assert 'value="fedcba9876543210" selected' in client.get(f"{PAGE}/compare").text
+
+
+@pytest.mark.parametrize("address", ["/", "/databases", PAGE, "/identify", "/new", "/jobs"])
+def test_every_id_of_a_page_is_there_once(client, address):
+    ids = re.findall(r'<[a-z][^>]* id="([^"]+)"', client.get(address).text)
+    assert sorted(ids) == sorted(set(ids))
+
+
+def test_intervals_and_decimals_are_shown_with_all_they_have(client):
+    query = (
+        "SELECT INTERVAL '1 year' AS i, [INTERVAL '14 months'] AS l, "
+        f"CAST('{'9' * 38}' AS DECIMAL(38)) AS d, 0.5::DECIMAL(9, 3) AS half"
+    )
+    shown = text_of(asked(client, query).text)
+    for words in ("1 year", "1 year 2 months", "9" * 38, "0.5"):
+        assert words in shown
+    asked_of = {"targets": [DATABASE], "query": query}
+    answer = client.post("/api/v1/sql", json=asked_of).json()
+    assert answer["rows"] == [["1 year", "[1 year 2 months]", "9" * 38, 0.5]]
+    assert answer["columns"][0]["type"] == "INTERVAL"
 
 
 def asked(client: TestClient, query: str, **fields: str | int):
@@ -262,7 +282,7 @@ def test_an_error_has_the_words_of_the_command(client, small_artifact):
             running.rows(1)
         answer = asked(client, query)
         assert answer.status_code == 400
-        words = in_page_words(str(raised.value))  # without its options
+        words = in_page_words(str(raised.value), raised.value.fields)
         assert re.sub(r"\s+", " ", words).strip() in text_of(answer.text)
 
 

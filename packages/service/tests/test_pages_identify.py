@@ -334,3 +334,9 @@ def test_pasted_numbers_arrive_as_they_are(pairs, separator):
         [frame] = read_frames(path)
     assert frame.centroids_px.tolist() == [list(pair) for pair in pairs]
     assert frame.mag is None
+
+
+def test_the_page_names_every_format_that_it_takes(client):
+    page = client.get("/identify").text
+    for name in ("FITS", "PNG", "TIFF", "JPEG", "HEIC", "CSV", "JSON"):
+        assert name in page

@@ -105,6 +105,13 @@ def test_an_address_of_no_design_is_told(client):
     assert "of no design" in answer.text
 
 
+@pytest.mark.parametrize("gap", ["\n\n", "\n"], ids=["empty lines", "none"])
+def test_a_new_key_of_a_table_keeps_the_empty_lines_between_tables(gap):
+    before = re.sub(r"\n+\[", f"{gap}[", SPEC)
+    text = draft_with(draft_of_text(before), {"selection.max_stars_per_field": 7}).text
+    assert text == before.replace("4.5\n", "4.5\nmax_stars_per_field = 7\n")
+
+
 @pytest.mark.slow
 def test_the_page_shows_the_design_of_its_address_and_gives_it_back(client):
     text = client.get("/new?preset=sao-12deg&camera.fov_x_deg=16").text

@@ -16,7 +16,7 @@ from services import SPEC as SMALL
 from starcat.matcher.refusal import HINTS
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_ingest
-from starcat_service.pages.wording import in_page_words
+from starcat_service.pages.wording import advice_in_page_words, in_page_words
 
 SETTINGS = {"anonymous": "publisher", "upload_mib": 1.0}
 PAGE = f"/databases/{DATABASE}"
@@ -124,28 +124,35 @@ def test_a_job_that_failed_speaks_of_no_option(client):
     service = client.app.state.service
     job = submit_ingest(service, "gaia", "me").job
     attempt = Attempt(service.records, begin_next(service.records, ["ingest"]))
-    attempt.log("warning", "a.dat: cut off; go on with --resume")
-    detail = "gaia: a.dat already exists and differs; choose another --output, or pass --replace"
-    attempt.end(Outcome("failed", {"title": "Conflict", "status": 409, "detail": detail}))
+    attempt.log("warning", "a.dat: cut off; go on with resume=True")
+    detail = "gaia: a.dat already exists and differs; choose another output, or pass replace=True"
+    problem = {"title": "Conflict", "status": 409, "detail": detail}
+    attempt.end(Outcome("failed", problem | {"fields": ["output", "replace=True"]}))
     for address in (f"/jobs/{job.id}", "/jobs"):
         words = _visible(client.get(address).text)
         assert "a.dat already exists and differs" in words
         assert OPTION.findall(words) == []
+        assert "choose another" not in words
 
 
 @pytest.mark.parametrize(
-    ("message", "words"),
+    ("message", "fields", "words"),
     [
-        ("a.png: no stars; raise it (--threshold 8)", "a.png: no stars; raise it"),
-        ("it fits a wider field: --fov-error 9%", "it fits a wider field: “Error of the field” 9%"),
-        ("a: exists; choose another --output, or pass --replace", "a: exists"),
-        ("give --x", "give that option"),
-        ("nothing to change", "nothing to change"),
+        ("a.png: no stars; check it, or raise it (threshold=8)", ["threshold=8"],
+         "a.png: no stars; check it"),
+        ("it fits a wider field: fov_error 9%", ["fov_error"],
+         "it fits a wider field: “Error of the field” 9%"),
+        ("output/a: exists; choose another output, or pass replace=True",
+         ["output", "replace=True"], "output/a: exists"),
+        ("the query has $m: give it with values[\"m\"]", ['values["m"]'],
+         "the query has $m: give it with the field “m”"),
+        ("give x_y", ["x_y"], "give x_y"),
+        ("nothing to change", [], "nothing to change"),
     ],
-    ids=["in brackets", "with a value", "advice", "nothing else", "no option"],
-)
-def test_words_of_the_command_line_become_those_of_a_page(message, words):
-    assert in_page_words(message) == words
+    ids=["in brackets", "with a value", "advice", "item", "nothing else", "no parameter"],
+)  # fmt: skip
+def test_parameters_become_labels_of_a_page(message, fields, words):
+    assert in_page_words(message, fields) == words
 
 
 def test_empty_pages_say_what_to_do_first(tmp_path):
@@ -158,7 +165,7 @@ def test_empty_pages_say_what_to_do_first(tmp_path):
 
 
 def test_advice_of_a_refusal_names_fields_of_the_page():
-    said = {reason: in_page_words(hint) for reason, hint in HINTS.items()}
+    said = {reason: advice_in_page_words(hint) for reason, hint in HINTS.items()}
     assert not [text for text in said.values() if re.search(r"_|--|\(flip\)|[;,] *$|,,", text)]
     assert said["scale"].endswith("allow a larger error of it (“Error of the field”)")
     assert said["mirrored"] == "turn the frame over (“y counts up”)"

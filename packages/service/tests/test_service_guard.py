@@ -506,7 +506,7 @@ def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
 def test_a_port_that_is_taken_is_told(tmp_path):
     with listen(Settings(root=tmp_path, port=0)) as listening:
         port = listening.getsockname()[1]
-        with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1, port {port}: .*--port"):
+        with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1:{port}: .*port"):
             listen(Settings(root=tmp_path, port=port))
 
 

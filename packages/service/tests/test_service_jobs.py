@@ -371,7 +371,7 @@ def test_two_servers_do_not_share_a_root(tmp_path):
     settings = Settings(root=tmp_path / "service", port=0)
     with (
         locked(tmp_path / "service" / "server.lock"),
-        pytest.raises(ConfigError, match=r"another server runs with --root .*service"),
+        pytest.raises(ConfigError, match=r"service: another server runs there"),
     ):
         run_server(settings, print)
 

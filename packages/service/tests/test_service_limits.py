@@ -268,7 +268,7 @@ def test_results_are_kept_for_many_threads(monkeypatch):
     """Without a lock, a cache that forgets while other threads read and write raises KeyError."""
     kept, numbers = Solutions(TTLCache(20, 0.002)), itertools.count()
     monkeypatch.setattr("secrets.randbits", lambda _: SlowNumber(next(numbers)))
-    solution = Solution("a.fits", "", {})
+    solution = Solution("a.fits", "", {}, "small-1.0.0")
 
     def work() -> None:
         for _ in range(300):

@@ -373,6 +373,12 @@ HOSTILE = [
     (b'<!DOCTYPE v [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><VOTABLE>&b;</VOTABLE>', 422, "entity"),
     (document(field("int") * 1001, ROWS), 422, "more than 1000"),
     (document(field("int") * 2), 422, "two columns 'a'"),
+    (
+        document(field("int"), ROWS.replace("<TD/>", f"<TD>{'9' * 20}</TD>")),
+        422,
+        f"has the value {'9' * 20}, which a 32-bit integer cannot hold; give its FIELD a wider",
+    ),
+    (document(field("long"), ROWS.replace("<TD/>", f"<TD>-{'9' * 20}</TD>")), 422, "a 64-bit int"),
     (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is no XML"),
     (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
 ]

@@ -78,7 +78,7 @@ _FILE = _object(
     file={
         "type": "string",
         "format": "binary",
-        "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF).",
+        "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF, JPEG, HEIC).",
     },
     options={
         "type": "string",

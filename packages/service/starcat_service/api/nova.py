@@ -26,10 +26,16 @@ from starlette.types import Message
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.images.identify_options import IdentifyOptions
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
 from starcat_service.access import Identities, network_of, principal_of
 from starcat_service.api.identify import FrameUpload, identify_upload
+from starcat_service.candidates import (
+    MAX_SEARCH_S,
+    FieldsDeg,
+    candidates,
+    field_line,
+    spec_of,
+    try_each,
+)
 from starcat_service.library import Database
 from starcat_service.problems import Problem, problem_of
 from starcat_service.security.request_limits import address_of
@@ -54,11 +60,23 @@ class Solution:
     file: str
     wcs: str  # a FITS header; empty where nothing was found
     frame: dict[str, Any]  # as 'starcat identify --json' prints it
+    database: str  # title of the one that has identified the frame, else of the first one
+    tried: tuple[str, ...] = ()  # databases that have not identified it, and why
 
     @property
     def status(self) -> str:
         """Outcome in nova's words."""
         return "success" if self.wcs else "failure"
+
+    @property
+    def reason(self) -> str:
+        """Why there is no solution, in words."""
+        return "not solved with any database; " + "; ".join(self.tried)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What nova does not say: the database, or why there is no solution."""
+        return {"database": self.database} if self.wcs else {"errormessage": self.reason}
 
 
 @dataclass(frozen=True)
@@ -150,8 +168,19 @@ def submission(number: int, request: Request) -> Response:
 
 @router.get("/api/jobs/{number}")
 def job(number: int, request: Request) -> Response:
-    """Return whether a picture was solved."""
-    return JSONResponse({"status": solution_of(request, number).status})
+    """Return whether a picture was solved, and why if it was not."""
+    found = solution_of(request, number)
+    return JSONResponse({"status": found.status, **({} if found.wcs else found.facts)})
+
+
+@router.get("/joblog/{number}")
+def job_log(number: int, request: Request) -> Response:
+    """Return which databases were tried, one per line, as text."""
+    found = solution_of(request, number)
+    lines = [f"{found.file}: {found.status}", *found.tried]
+    if found.wcs:
+        lines.append(f"{found.database}: identified with {found.frame['n_matched']} stars")
+    return Response("\n".join(lines) + "\n", media_type="text/plain; charset=utf-8")
 
 
 @router.get("/api/jobs/{number}/calibration")
@@ -169,6 +198,7 @@ def info(number: int, request: Request) -> Response:
     found = solution_of(request, number)
     told: dict[str, Any] = {
         "status": found.status,
+        **found.facts,
         "original_filename": found.file,
         "objects_in_field": _names(found),
         "machine_tags": _names(found),
@@ -245,13 +275,31 @@ def calibration_of(wcs: str) -> dict[str, float]:
 
 
 def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
-    database = _database(service)
-    fov_deg = _fields_of(database, given)
-    options = IdentifyOptions(fov_deg=fov_deg, size_px=None if fov_deg is None else _size_of(given))
-    found, _ = identify_upload(
-        service, database.id, frames, options, None, for_page=True, either_way=True
-    )
-    return Solution(frames.name, found["more"][0]["wcs"] or "", found["frames"][0])
+    scale_deg = _scale_deg(given)
+
+    def identify(database: Database) -> dict[str, Any]:
+        options = _options_for(database, scale_deg, given)
+        options = options.model_copy(update={"time_limit_s": MAX_SEARCH_S})
+        frames.content.seek(0)
+        found, _ = identify_upload(
+            service, database.id, frames, options, None, for_page=True, either_way=True
+        )
+        return found
+
+    attempts = try_each(_databases(service, scale_deg), identify, _refusal)
+    if attempts.found is None:
+        raise TargetMissing("this service has no database to solve pictures with yet")
+    database, found = attempts.found
+    wcs, frame = found["more"][0]["wcs"] or "", found["frames"][0]
+    return Solution(frames.name, wcs, frame, database.title, tuple(attempts.reasons))
+
+
+def _refusal(found: dict[str, Any]) -> str:
+    return "" if found["more"][0]["wcs"] else _words_of(found["frames"][0])
+
+
+def _words_of(frame: dict[str, Any]) -> str:
+    return str((frame.get("refusal") or {"words": frame["status"]})["words"])
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:
@@ -278,33 +326,35 @@ def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
     return width, height
 
 
-def _database(service: Service) -> Database:
-    """Return the database that pictures are solved with."""
-    if service.settings.plate_solver is not None:
-        return service.library.find(service.settings.plate_solver)
-    every = service.library.databases()
-    if not every:
-        raise TargetMissing("this service has no database to solve pictures with yet")
-    return max(
-        every,
-        key=lambda one: (_spec(one).products.levels.enabled, one.folder.stat().st_mtime_ns, one.id),
-    )
+def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[Database]:
+    """Return the databases that pictures are solved with, in the order in which to try them."""
+    wanted = service.settings.plate_solver
+    first = None if wanted is None else service.library.find(wanted)
+    return candidates(service.library.databases(), scale_deg, first)
 
 
-def _spec(database: Database) -> BuildSpec:
-    return spec_from_dict(database.spec, database.title)
+def _options_for(
+    database: Database, scale_deg: FieldsDeg | None, given: dict[str, Any]
+) -> IdentifyOptions:
+    """Return how a picture of some scale is identified with a database."""
+    if spec_of(database).products.levels.enabled:
+        fov_deg = _fields_of(database, scale_deg)
+        return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))
+    field = field_line(database, scale_deg)
+    if not field:
+        return IdentifyOptions()
+    lines = [field]  # a picture says its size itself
+    if "x" in given and "image_width" in given:
+        width, height = _size_of(given) or (0, 0)
+        lines += [f"width_px = {width}", f"height_px = {height}"]
+    return IdentifyOptions(camera="\n".join(lines))
 
 
-def _fields_of(database: Database, given: dict[str, Any]) -> tuple[float, float] | None:
-    """Return the fields to try: those that were given, as far as the database has them."""
-    spec = _spec(database)
-    if not spec.products.levels.enabled:
-        return None
-    narrow, wide = known = spec.fields_deg
-    unit = _DEG.get(str(given.get("scale_units") or "degwidth"))
-    if unit is not None:
-        low, high = _scale(given)
-        narrow, wide = max(narrow, low * unit), min(wide, high * unit)
+def _fields_of(database: Database, scale_deg: FieldsDeg | None) -> FieldsDeg:
+    """Return the fields to try: those of the scale that the database has."""
+    narrow, wide = known = spec_of(database).fields_deg
+    if scale_deg is not None:
+        narrow, wide = max(narrow, scale_deg[0]), min(wide, scale_deg[1])
     if narrow > wide:
         raise Problem(
             422,
@@ -312,6 +362,18 @@ def _fields_of(database: Database, given: dict[str, Any]) -> tuple[float, float]
             f"{known[0]:.4g} to {known[1]:.4g} deg",
         )
     return narrow, wide
+
+
+def _scale_deg(given: dict[str, Any]) -> FieldsDeg | None:
+    """Return the fields across the width that a request states; None if it states none."""
+    unit = _DEG.get(str(given.get("scale_units") or "degwidth"))
+    width = given.get("image_width")
+    if given.get("scale_units") == "arcsecperpix" and isinstance(width, int):
+        unit = width / 3600.0
+    if unit is None:
+        return None
+    low, high = _scale(given)
+    return None if (low, high) == (0.0, math.inf) else (low * unit, high * unit)
 
 
 def _scale(given: dict[str, Any]) -> tuple[float, float]:
@@ -384,5 +446,4 @@ def _error(status: int, text: str) -> Response:
 
 
 def _unsolved(solution: Solution) -> Response:
-    refusal = solution.frame.get("refusal") or {"words": solution.frame["status"]}
-    return _error(404, f"not solved: {refusal['words']}")
+    return _error(404, solution.reason)

@@ -68,8 +68,7 @@ class GivenSpec(BaseModel):
     changes: dict[Key, Change] = Field(
         {},
         max_length=MOST_CHANGES,
-        description="Values by dotted key, as ``--set`` of 'starcat build' takes them; an empty "
-        "one removes the key.",
+        description="Values by dotted key of the spec; an empty one removes the key.",
     )
 
     @model_validator(mode="after")

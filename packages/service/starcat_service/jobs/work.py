@@ -338,12 +338,12 @@ def _end_with_input() -> None:
 def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
     """Return problem details of an exception; a traceback is the operator's."""
     from starcat.failures import failure_of
-    from starcat_service.problems import ProblemDetails, problem_of, without_folders
+    from starcat_service.problems import ProblemDetails, parameter_of, problem_of, without_folders
 
     if isinstance(error, MemoryError) or NO_THREAD in str(error):
         return dict(out_of_memory(order.memory_bytes).content)
     if isinstance(error, OSError) and not isinstance(error, StarcatError):
-        failure = failure_of(error, "the job")
+        failure = failure_of(error, "the job", parameter_of)
         detail = without_folders(failure.message)
         problem = ProblemDetails(
             title="The system refused", status=500, detail=detail, kind=failure.kind

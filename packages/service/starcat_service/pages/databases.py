@@ -23,6 +23,7 @@ from starcat.report.coverage_map import (
     raster_png,
     sky_map,
 )
+from starcat.specs.product_sections import version_numbers
 from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of
 from starcat_service.jobs.submission import submit_evaluation
@@ -45,8 +46,14 @@ from starcat_service.settings import Role
 router = page_router()
 
 REPORT_PAGE = "report/index.html"
-REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox"
-"""A report has its style and its plots inside, and nothing else; no script of it runs."""
+REPORT_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox allow-same-origin"
+)
+"""A report has its style and its plots inside, and nothing else; no script of it runs.
+
+It keeps the origin of the service: from a page without an origin a browser follows the link back
+without the cookie of the sign-in, which is SameSite=Strict.
+"""
 
 RASTER_WIDTH = 960
 FIELDS_SHOWN = 25  # fields of the tiling on a page
@@ -229,7 +236,9 @@ async def compare(
     difference = None
     if other:
         # In its turn among the queries: it reads whole tables.
-        difference = await service.query_pool.run(difference_of, service, database_id, other)
+        sides = await run_in_threadpool(_older_first, service, database_id, other)
+        ids = [one.id for one in sides]
+        difference = await service.query_pool.run(difference_of, service, *ids)
     return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
 
 
@@ -238,8 +247,8 @@ def _comparison(
 ) -> Response:
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
-    later = service.library.database(other) if other else None
-    code = difference_code(address_of(request, service), database.id, other)
+    earlier, later = _older_first(service, database_id, other) if other else (database, None)
+    code = later and difference_code(address_of(request, service), earlier.id, later.id)
     versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
@@ -247,12 +256,22 @@ def _comparison(
         **_head(service, database, "compare"),
         others=others,
         suggested=other or (versions[-1] if versions else ""),
+        earlier=earlier,
         later=later,
         difference=difference,
-        notebook=Notebook(f"{database.title}-{later.title}", code) if later else None,
+        notebook=Notebook(f"{earlier.title}-{later.title}", code) if later and code else None,
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
     )
+
+
+def _older_first(service: Service, database_id: str, other: str) -> tuple[Database, Database]:
+    """Return two databases as they were chosen, but of two versions of one the older first."""
+    first, second = map(service.library.database, (database_id, other))
+    is_newer = first.name == second.name and (
+        version_numbers(first.version) > version_numbers(second.version)
+    )
+    return (second, first) if is_newer else (first, second)
 
 
 @router.post("/databases/{database_id}/evaluate")

@@ -271,12 +271,29 @@ class _Edit:
             document = tomlkit.parse(before)
             for path, value in self.changes.items():
                 put_key(document, path, value)
-            text = tomlkit.dumps(document)
+            text = _with_empty_lines(tomlkit.dumps(document), before)
             if content_of_toml(text, ORIGIN) == self.content:
                 return text
         except (TOMLKitError, ConfigError, ValueError, TypeError, LookupError, RecursionError):
             pass  # a text whose order cannot be kept, as some with dotted keys
         return tomlkit.dumps(self.content)
+
+
+_HEAD = re.compile(r"(?<=[^\n]\n)(?=(\[+[\w.\"' -]+\]+)[ \t]*(?:#.*)?$)", re.MULTILINE)
+
+
+def _with_empty_lines(text: str, before: str) -> str:
+    """Return a text with an empty line before each table, unless it stood without one.
+
+    tomlkit puts a key that is new in a table behind the empty line at the end of the table.
+    """
+    close = {found[1] for found in _HEAD.finditer(before)}
+    places = [found.start() for found in _HEAD.finditer(text) if found[1] not in close]
+    for place in reversed(places):
+        line = text[text.rfind("\n", 0, place - 1) + 1 : place]
+        if not line.startswith("#"):
+            text = f"{text[:place]}\n{text[place:]}"
+    return text
 
 
 def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:

@@ -34,12 +34,20 @@ from starcat_service.api.identify import (
     checked_options,
     identify_upload,
 )
+from starcat_service.candidates import (
+    MAX_SEARCH_S,
+    FieldsDeg,
+    candidates,
+    field_line,
+    spec_of,
+    try_each,
+)
 from starcat_service.library import Database
 from starcat_service.pages.answers import Shown, ShownFrame, marks_of, shown_frames, unusable_frame
 from starcat_service.pages.notebook import Notebook, identify_code
 from starcat_service.pages.rendering import address_of, page_router, render
 from starcat_service.pages.sky import view_of
-from starcat_service.pages.wording import page_problem
+from starcat_service.pages.wording import advice_in_page_words, page_problem
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
 from starcat_service.transfers import scratch_folder
@@ -61,6 +69,9 @@ FIELDS = (
 """Fields of the form that are texts."""
 
 MOST_FILES = 50  # pictures at once
+
+ANY = "the one that fits the frame"
+"""The choice of a database by the field of view; others are tried if it identifies nothing."""
 
 
 @router.get("/identify")
@@ -93,31 +104,56 @@ async def _answered(
 
 @dataclass(frozen=True)
 class _Asked:
-    database: Database
+    databases: list[Database]  # those to try, in this order
     uploads: list[FrameUpload]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the databases made of a file."""
+
+    database: Database  # the one that has identified a frame, else the first one
+    frames: list[ShownFrame]
+    picture: bytes
+    method: str
     options: IdentifyOptions
     camera: Camera
+    tried: tuple[str, ...]  # databases that have identified nothing, and why
 
 
 def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
-    database = service.library.database(given["database"])
-    uploads = frames_of(form, given, database, service)
-    camera = camera_of(given, database) or database.camera
-    return _Asked(database, uploads, options_of(given, service, database), camera)
+    if given["database"]:
+        databases = [service.library.database(given["database"])]
+    else:
+        databases = candidates(service.library.databases(), _fields_deg(given))
+    if not databases:
+        raise Problem(404, "this service has no database yet; build one first", key="database")
+    return _Asked(databases, frames_of(form, given, databases[0], service))
+
+
+def _fields_deg(given: Mapping[str, str]) -> FieldsDeg | None:
+    """Return the fields of view that a form states, degrees; None if it states none."""
+    ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
+    if ends[0] is not None and ends[1] is not None:
+        return ends[0], ends[1]
+    field_deg = _number(given["camera.fov_x_deg"], "camera.fov_x_deg")
+    if field_deg is None and given["camera_file"].strip():
+        field_deg = parse_camera(given["camera_file"], Path("camera file"), (1, 1)).fov_x_deg
+    return None if field_deg is None else (field_deg, field_deg)
 
 
 async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dict[str, Any]:
     """Return what is shown of all files; others have their turn between them."""
     until_s = time.monotonic() + service.settings.query_time_s
     frames: list[ShownFrame] = []
-    first, method, picture = None, "", b""
+    first, shown, picture = None, None, b""
     for upload in asked.uploads:
         if time.monotonic() > until_s:
             frames.append(unusable_frame(upload.name, "not looked at, the others took the time"))
             continue
         is_wanted = first is None or not first.is_identified
         try:
-            found, drawn, method = await service.sandbox.run(
+            found = await service.sandbox.run(
                 _frames, service, asked, upload, given, draw=is_wanted
             )
         except (StarcatError, Problem) as error:
@@ -125,30 +161,59 @@ async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dic
                 raise
             frames.append(unusable_frame(upload.name, page_problem(error).detail))
             continue
-        if found and (first is None or (is_wanted and found[0].is_identified)):
-            first, picture = found[0], drawn
-        frames += found
-    first = first or frames[0]
+        if found.frames and (first is None or (is_wanted and found.frames[0].is_identified)):
+            first, picture, shown = found.frames[0], found.picture, found
+        frames += found.frames
+    if first is None or shown is None:
+        return {"shown": Shown(asked.databases[0].title, "", frames, frames[0])}
     return {
-        "shown": Shown(asked.database.title, method, frames, first),
+        "shown": Shown(shown.database.title, shown.method, frames, first),
+        "used": shown.database,
+        "tried": shown.tried,
         "picture": _address(picture),
         "errors_arcsec": _errors(first.content),
-        "field_deg": _field_deg(first.content, asked.camera),
-        "view": _view(first, asked.database, asked.camera),
-        "options": _options_told(asked.options),
+        "field_deg": _field_deg(first.content, shown.camera),
+        "view": _view(first, shown.database, shown.camera),
+        "options": _options_told(shown.options),
     }
 
 
 def _frames(
     service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
-) -> tuple[list[ShownFrame], bytes, str]:
-    """Identify the frames of one file; return them, the picture of the first, and the method."""
+) -> _Found:
+    """Identify the frames of one file with one database after the other, until one succeeds."""
     kind: Literal["png"] | None = "png" if draw else None
-    found, drawn = identify_upload(
-        service, asked.database.id, upload, asked.options, kind, for_page=True
-    )
-    epoch_jyear = float(asked.database.manifest["epoch_jyear"])
-    return shown_frames(found, given, epoch_jyear), drawn, str(found["method"])
+    is_chosen = bool(given["database"])
+
+    def identify(database: Database) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
+        options = options_of(given, service, database)
+        if not is_chosen:
+            limit_s = min(options.time_limit_s or MAX_SEARCH_S, MAX_SEARCH_S)
+            options = options.model_copy(update={"time_limit_s": limit_s})
+        upload.content.seek(0)
+        found, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
+        return found, drawn, options
+
+    attempts = try_each(asked.databases, identify, lambda answer: _refusal(answer[0]))
+    if attempts.found is None:
+        raise Problem(422, f"not identified: {attempts.words}")
+    database, (found, drawn, options) = attempts.found
+    camera = database.camera
+    if options.camera is not None:
+        width, height = found["size_px"]
+        camera = parse_camera(options.camera, Path("camera"), (width, height))
+        options = options.model_copy(update={"camera": camera_toml(camera)})
+    frames = shown_frames(found, given, float(database.manifest["epoch_jyear"]))
+    method, tried = str(found["method"]), tuple(map(advice_in_page_words, attempts.reasons))
+    return _Found(database, frames, drawn, method, options, camera, tried)
+
+
+def _refusal(found: dict[str, Any]) -> str:
+    """Return why no frame of a file is identified; empty if one is."""
+    frames = found["frames"]
+    if not frames or any(one["status"] == "identified" for one in frames):
+        return ""
+    return str((frames[0].get("refusal") or {"words": frames[0]["status"]})["words"])
 
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
@@ -191,8 +256,11 @@ async def simulated_frame(
 def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
     databases = service.library.databases()
     problem = answer.get("problem")
-    nothing = dict.fromkeys(("shown", "picture", "problem", "errors_arcsec", "field_deg", "view"))
-    chosen = next((one for one in databases if one.id == given["database"]), None)
+    nothing = dict.fromkeys(
+        ("shown", "picture", "problem", "errors_arcsec", "field_deg", "view", "tried")
+    )
+    chosen: Database | None = answer.pop("used", None)
+    chosen = chosen or next((one for one in databases if one.id == given["database"]), None)
     camera = (chosen or databases[0]).camera if databases else None
     shown: Shown | None = answer.get("shown")
     notebook = None
@@ -204,7 +272,9 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         request,
         "identify.html",
         status=problem.status if problem else 200,
-        databases=[(one.id, one.title) for one in databases],
+        databases=[("", ANY), *((one.id, one.title) for one in databases)],
+        used=chosen.id if chosen else "",
+        any=ANY,
         methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
         given=given,
         placeholders={
@@ -254,41 +324,55 @@ def options_of(given: dict[str, str], service: Service, database: Database) -> I
         raise Problem(
             422, "give both ends of the range of fields, or leave both empty", key=missing
         )
-    camera = camera_of(given, database)
+    camera, fov_deg = camera_text(given, database), None
+    spec = spec_of(database)
+    if ends[0] is not None:
+        fov_deg = ends
+        if not given["database"] and not spec.products.levels.enabled:
+            # One of the fields is tried: the database serves no range.
+            fov_deg, camera = None, camera or field_line(database, _fields_deg(given)) or None
+    elif not given["database"] and not given["seed"] and camera is None:
+        fov_deg = list(spec.fields_deg) if spec.products.levels.enabled else None
     content = {
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
-        "fov_deg": None if ends[0] is None else ends,
+        "fov_deg": fov_deg,
         "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
         "flip": True if given["camera.flip"] else None,
         "time": given["time"].strip() or None,
-        "camera": None if camera is None else camera_toml(camera),
+        "camera": camera,
     }
     return checked_options(content).model_copy(
         update={"time_limit_s": service.settings.query_time_s}
     )
 
 
-def camera_of(given: Mapping[str, str], database: Database) -> Camera | None:
-    """Return the camera that a form describes; None for that of the database.
+def camera_text(given: Mapping[str, str], database: Database) -> str | None:
+    """Return the text of the camera that a form describes; None for that of the database.
 
-    A size that is not given is that of the database, and so is the focal length.
+    The size of a picture is the size of its camera if the form states none; for centroids it is
+    that of the database. A focal length that is not given is that of the database.
     """
+    own = database.camera
     if given["camera_file"].strip():
-        return parse_camera(given["camera_file"], Path("camera file"))
+        parse_camera(given["camera_file"], Path("camera file"), (own.width_px, own.height_px))
+        return given["camera_file"]
     scale = CAMERA[3:] if given["lens"] == "focal" else CAMERA[2:3]
     told = {name: _number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale}
     if all(value is None for value in told.values()):
         return None
-    own = database.camera
     size = {name: value or getattr(own, name) for name, value in told.items() if name in CAMERA[:2]}
+    if all(told[name] is None for name in CAMERA[:2]):
+        size = {}
     lens = {name: value for name in scale if (value := told[name]) is not None}
     values = {**size, **(lens or {"focal_length_px": own.focal_length_px})}
     lines = [f"{name} = {_toml_number(float(value))}" for name, value in values.items()]
+    text = "\n".join(lines)
     try:
-        return parse_camera("\n".join(lines), Path("camera"))
+        parse_camera(text, Path("camera"), (own.width_px, own.height_px))
     except ConfigError as error:
         raise Problem(422, str(error), key=f"camera.{error.key or CAMERA[0]}") from None
+    return text
 
 
 def _toml_number(value: float) -> str:

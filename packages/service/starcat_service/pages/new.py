@@ -46,7 +46,7 @@ from starcat_service.pages.rendering import (
     size_text,
 )
 from starcat_service.pages.response import FILE, MOST_BYTES, PER, keys_of_file
-from starcat_service.pages.wording import in_page_words, page_problem
+from starcat_service.pages.wording import page_problem
 from starcat_service.problems import Problem, ProblemDetails
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
@@ -229,7 +229,7 @@ def _shown(
         if key is None:
             refusals.append(text)
         else:
-            errors.setdefault(key, in_page_words(text))
+            errors.setdefault(key, text)
     is_refused = seen is not None and bool(refusals or seen.verdict.will_fail)
     is_busy = problem is not None and problem.status == 503
     return {

@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 
 from starcat.version import __version__
 from starcat_service.access import principal_of
-from starcat_service.pages.wording import in_page_words
+from starcat_service.pages.wording import advice_in_page_words, problem_in_page_words
 from starcat_service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat_service.service import Service
 
@@ -131,7 +131,8 @@ def _environment() -> Environment:
         "duration": duration_text,
         "time": time_text,
         "moment": moment_text,
-        "plain": in_page_words,
+        "detail": problem_in_page_words,
+        "advice": advice_in_page_words,
     }
     environment.globals |= {
         "static": static_address,

@@ -1,71 +1,78 @@
-"""Messages in the words of a page: what the command line calls by an option has a field here."""
+"""Messages in the words of a page: a parameter has the label of its field, or is not named."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
+from typing import Any
 
+from starcat.errors import words_of
+from starcat.matcher.refusal import bracketed
 from starcat_service.problems import ProblemDetails, problem_of
 
-_PHRASES = (
-    (
-        r"Name it with --input (\w+)=PATH, set \S+ to [^;]*?, or run 'starcat fetch \w+'",
-        r"Whoever runs this service gets it with 'starcat fetch \1'",
-    ),
-    (r"with --camera\b", "under “Another camera”"),
-    (r"with --plane\b", "before it is sent"),
-    (r"give its value with --set \w+=VALUE", "give its value in the field of that name"),
-    (r"'starcat sql --macros' lists", "the list beside the query tells"),
-    (r"'starcat sql --list' shows", "the list beside the query shows"),
-    (r"(?<!\w)-o writes", "“Download all rows” writes"),
-    (r"'starcat crossmatch'", "The command crossmatch"),
-    (r"with --scheduler\b", "by the operator"),
-    (r" \(--[a-z][^)]*\)", ""),
-    (r"\(fov_error\)", "(“Error of the field”)"),
-    (r"\(flip\)", "(“y counts up”)"),
-    (r"a larger error of the prior \([a-z_]+\)", "a larger error of the prior"),
-    (r", state their noise \([a-z_, ]+\) in place of a tolerance", ""),
-    (r", or ask for a smaller share \([a-z_]+\)", ""),
-    (r"--fov-error\b", "“Error of the field”"),
-    (r"--tolerance-px\b", "“Tolerance”"),
-    (r"--flip\b", "“y counts up”"),
-    (r"--method\b", "“Method”"),
-    (r"--camera\b", "“Another camera”"),
-    (r"--fov\b", "the field of view"),
-    (r"--time\b", "the time"),
-    (r"--size\b", "width and height"),
-)
-"""Phrases of the command line, and what they are on a page."""
+LABELS = {
+    "camera": "“Another camera”",
+    "fov_deg": "the field of view",
+    "fov_error": "“Error of the field”",
+    "flip": "“y counts up”",
+    "method": "“Method”",
+    "size_px": "the width and height",
+    "time": "“Time of the frame”",
+    "tolerance_px": "“Tolerance”",
+}
+"""Parameters that have a field on a page, and the label of the field."""
 
-_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
-_ENDS = re.compile(r"(; |\. (?=[A-Z]))")
+_ITEM = re.compile(r'values\["(\w+)"\]')
+_NAMELESS = "\0"
+_CLAUSE = re.compile(r"(; |, (?:or |and )?|\. (?=[A-Z]))(?![^()]*\))")
 
 
-def in_page_words(text: str) -> str:
-    """Return a message without options of the command line; advice that is only one is left out.
+def in_page_words(text: str, fields: Iterable[str] = ()) -> str:
+    """Return a message in which parameters have the labels of a page.
+
+    A clause about a parameter without a field on the pages is left out: its advice cannot be
+    followed there.
 
     Examples
     --------
-    >>> in_page_words("the frame is mirrored; use --flip")
+    >>> in_page_words("the frame is mirrored; use flip", ["flip"])
     'the frame is mirrored; use “y counts up”'
-    >>> in_page_words("a.tar is too large; allow more with --max-bytes")
+    >>> in_page_words("a.tar is too large; allow more with max_bytes", ["max_bytes"])
     'a.tar is too large'
     """
-    for phrase, words in _PHRASES:
-        text = re.sub(phrase, words, text)
-    if not _OPTION.search(text):
-        return text
-    parts = _ENDS.split(text)
+    names = list(fields)
+    marked = words_of(text, names, _label_of)
+    if _NAMELESS not in marked:
+        return marked
+    parts = _CLAUSE.split(marked)
     kept = [
-        (part, end)
-        for part, end in zip(parts[::2], [*parts[1::2], ""], strict=True)
-        if not _OPTION.search(part)
+        (before, part)
+        for before, part in zip(["", *parts[1::2]], parts[::2], strict=True)
+        if _NAMELESS not in part
     ]
     if not kept:
-        return _OPTION.sub("that option", text)
-    return "".join(part + end for part, end in kept).rstrip("; ")
+        return text
+    return kept[0][1] + "".join(before + part for before, part in kept[1:])
+
+
+def _label_of(field: str) -> str:
+    if item := _ITEM.fullmatch(field):
+        return f"the field “{item[1]}”"
+    return LABELS.get(re.split(r"[=\[]", field)[0], _NAMELESS)
+
+
+def advice_in_page_words(text: str) -> str:
+    """Return the advice for a frame that was not identified, with the labels of a page."""
+    return in_page_words(text, bracketed(text))
+
+
+def problem_in_page_words(problem: ProblemDetails | Mapping[str, Any]) -> str:
+    """Return the detail of problem details, or of those that a job has kept."""
+    found = problem.model_dump() if isinstance(problem, ProblemDetails) else problem
+    return in_page_words(str(found.get("detail") or ""), found.get("fields") or ())
 
 
 def page_problem(error: Exception) -> ProblemDetails:
     """Return what a page says of any exception."""
     problem = problem_of(error)
-    return problem.model_copy(update={"detail": in_page_words(problem.detail)})
+    return problem.model_copy(update={"detail": problem_in_page_words(problem), "fields": None})

@@ -6,6 +6,7 @@ or take more memory than the size of the file explains.
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -67,13 +68,22 @@ def _parsed(path: Path, name: str) -> Any:
     import warnings
 
     from astropy.io.votable import parse_single_table
+    from astropy.io.votable.exceptions import W51
 
     try:
         with warnings.catch_warnings():
             # Small faults of other writers are no reason to refuse a table.
             warnings.simplefilter("ignore")
+            # Except this one: astropy would put the largest integer in place of the value.
+            warnings.simplefilter("error", W51)
             with path.open("rb") as stream:
-                table = parse_single_table(stream, verify="ignore")
+                table = parse_single_table(stream, verify="warn")
+    except W51 as error:
+        found = re.search(r"Value '(.{1,60}).*' is out of range for a (\S+)", str(error))
+        what = f"{found[1]}, which a {found[2]} integer cannot hold" if found else str(error)
+        raise _refusal(
+            name, f"has the value {what}", "give its FIELD a wider datatype: long, double or char"
+        ) from error
     except Exception as error:  # whatever astropy makes of somebody's file
         told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise _refusal(name, f"cannot be read as a VOTable ({told})") from error
@@ -187,5 +197,5 @@ def _width(attributes: dict[str, str]) -> int:
     return total
 
 
-def _refusal(name: str, told: str) -> ConfigError:
-    return ConfigError(f"UPLOAD {name}: the table {told}; send a VOTable", key="UPLOAD")
+def _refusal(name: str, told: str, advice: str = "send a VOTable") -> ConfigError:
+    return ConfigError(f"UPLOAD {name}: the table {told}; {advice}", key="UPLOAD")

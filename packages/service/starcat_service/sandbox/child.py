@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import json
 import os
 import selectors
@@ -125,3 +127,15 @@ def own_output() -> IO[bytes]:
     output = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return output
+
+
+def return_free_memory() -> None:
+    """Return, within a child, memory that is not used any more to the system.
+
+    Figures of matplotlib and exceptions refer to themselves in circles, and keep large arrays
+    until the garbage is collected.
+    """
+    gc.collect()
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # of another C library than that of GNU
+            ctypes.CDLL(None).malloc_trim(0)

@@ -67,7 +67,10 @@ class Sandbox:
             answer = self._answer(child, {"task": task, "arguments": arguments})
             if answer.get("kind") == "MemoryError":
                 raise _OutOfMemory(
-                    413, "it takes more memory than a request may; send less, or a smaller picture"
+                    413,
+                    "the request takes more memory than it may "
+                    f"({self._memory_bytes / GIB:g} GiB); send less or a smaller picture, or ask "
+                    "the operator to raise query_memory_gib",
                 )
             if answer.get("kind") == "RecursionError":
                 raise Problem(
@@ -103,6 +106,7 @@ class Sandbox:
             environment={
                 "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
                 "TMPDIR": str(self._scratch),
+                "MALLOC_ARENA_MAX": "2",  # each arena keeps memory that the others cannot use
             },
         )
         child.send({"scratch": str(self._scratch), "memory_bytes": self._memory_bytes})

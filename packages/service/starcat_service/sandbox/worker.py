@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
 from starcat_service.protocols.uploads import upload_facts
-from starcat_service.sandbox.child import own_output
+from starcat_service.sandbox.child import own_output, return_free_memory
 
 if TYPE_CHECKING:
     from starcat.images.identify_options import IdentifyOptions
@@ -68,6 +68,7 @@ def identify(
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
+        "size_px": [answers.camera.width_px, answers.camera.height_px],
     }
 
 
@@ -140,6 +141,8 @@ def serve() -> None:
             answers.flush()
         except BrokenPipeError:
             return
+        # What one request has left must not be missing in the next.
+        return_free_memory()
 
 
 def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, Any]:
