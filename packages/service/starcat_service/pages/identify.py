@@ -272,7 +272,7 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         request,
         "identify.html",
         status=problem.status if problem else 200,
-        databases=[("", ANY), *((one.id, one.title) for one in databases)],
+        databases=[("", ANY), *((one.id, one.title) for one in databases)] if databases else [],
         used=chosen.id if chosen else "",
         any=ANY,
         methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
