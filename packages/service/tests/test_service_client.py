@@ -131,7 +131,7 @@ def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact,
     [
         (["sql", "small-1.0.0", "SELECT nothing FROM stars"], 2, "nothing"),
         (["sql", "unknown", "SELECT 1 FROM stars"], 3, "no database or catalog 'unknown'"),
-        (["sql", "small-1.0.0"], 2, "there is no prompt"),
+        (["sql", "small-1.0.0"], 2, "needs the query on the line"),
         (["sql", "small-1.0.0", "SELECT 1 AS x", "--memory-limit-gb", "1"], 2, "--memory-limit-gb"),
         (["build", "--preset", "gaia-12deg", "--workers", "1"], 2, "--workers"),
         (["identify", "small-1.0.0", "nowhere.csv"], 3, "nowhere.csv"),
