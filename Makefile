@@ -41,16 +41,19 @@ $(READY): $(RUNS) packages/service/pyproject.toml locks/dev.txt
 
 BUILT_WITH := $(BIN)/python -c 'import tomllib; \
 	print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"]))'
+SERVICE_NEEDS := $(BIN)/python -c 'import tomllib; \
+	needs = tomllib.load(open("packages/service/pyproject.toml", "rb"))["project"]["dependencies"]; \
+	print("\n".join(need for need in needs if not need.startswith("starcat")))'
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate \
 	--no-emit-index-url --custom-compile-command 'make lock' --python-version 3.11 pyproject.toml -
 lock: $(READY) ## renew locks/: the newest versions within the bounds, with their hashes
 	$(BUILT_WITH) | $(LOCK) --upgrade --all-extras -o locks/dev.txt
 	$(BUILT_WITH) | $(LOCK) --extra images -c locks/dev.txt -o locks/run.txt
-	$(BUILT_WITH) | $(LOCK) --extra images --extra service -c locks/dev.txt -o locks/service.txt
+	{ $(BUILT_WITH); $(SERVICE_NEEDS); } | $(LOCK) --extra images -c locks/dev.txt -o locks/service.txt
 
 newest: ## test with the newest versions that the bounds allow, in an environment of its own
 	$(PYTHON) -m venv --clear .venv-newest
-	.venv-newest/bin/python -m pip install --quiet --editable '.[dev]'
+	.venv-newest/bin/python -m pip install --quiet --editable '.[dev]' --editable packages/lab --editable packages/service
 	.venv-newest/bin/python -m pytest -q -n 3 --dist loadfile -m 'not slow and not real'
 
 install: $(READY) ## install starcat and its tools into .venv
