@@ -135,7 +135,7 @@ def endpoints() -> Iterator[tuple[str, str]]:
 
 KNOWN = {
     *(("POST", f"{API}/specs/{name}") for name in ("validate", "estimate", "coverage", "starter")),
-    *(("POST", f"{API}/specs/coverage.svg"), ("POST", f"{API}/jobs")),
+    ("POST", f"{API}/jobs"),
     *(("GET", "/new"), ("POST", "/new"), ("POST", "/new/preview")),
 }
 
