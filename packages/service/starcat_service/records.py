@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -140,9 +141,9 @@ class _Opened:
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self.connection = connection
-
-    def __del__(self) -> None:
-        self.connection.close()
+        # The registry of finalizers holds the connection, so that it is closed before it is freed,
+        # also if this object is part of a cycle.
+        weakref.finalize(self, connection.close)
 
 
 class Records:
