@@ -9,8 +9,8 @@ from astropy import units
 from astropy.coordinates import FK5, SkyCoord
 
 from starcat.catalog.archives.sao import icrs_from_fk5
-from starcat.catalog.proper_motion import Motion, propagate
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.stars.proper_motion import Motion, propagate
 
 ARCSEC = np.pi / (180.0 * 3600.0)
 MAS = 1e-3 * ARCSEC

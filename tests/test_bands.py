@@ -32,7 +32,6 @@ from starcat.bands.response import (
 from starcat.bands.spectra import library, parsed_type
 from starcat.bands.synthetic import checked_zero_point, magnitudes
 from starcat.catalog.sensor_band import in_sensor_band, other_of
-from starcat.catalog.stars import table_from_columns
 from starcat.cli.specs import with_sensor
 from starcat.errors import ConfigError, FileMissing
 from starcat.images.render import Optics, star_electrons
@@ -45,6 +44,7 @@ from starcat.specs.camera_file import read_camera
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import read_spec, spec_from_dict
 from starcat.specs.star_sensor import example_toml
+from starcat.stars.star_table import table_from_columns
 from starcat.storage.parquet import read_parquet
 
 CATALOGS = Path(

@@ -7,7 +7,6 @@ import pytest
 
 from starcat.catalog.ingest import ingest
 from starcat.catalog.source_files import locate
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.images.centroiding import find_spots
@@ -16,6 +15,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import CameraSpec
+from starcat.stars.star_table import directions_of, floats_of
 
 RANGE_DEG = (5.0, 30.0)
 SIZE_PX = (1024, 768)

@@ -17,12 +17,12 @@ from genuine_records import PSC, SAO, SUPPL_1, TYC2, TYC_MAIN
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR
 from starcat.catalog.ingest import Ingested, StarTables, ingest
-from starcat.catalog.proper_motion import Motion, propagate_in_space
 from starcat.catalog.source import data_source
-from starcat.catalog.stars import directions_of, floats_of
-from starcat.catalog.verdict import Quality
 from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.stars.proper_motion import Motion, propagate_in_space
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Quality
 from starcat.storage.schema import product_schema
 
 MAS = 1.0 / 3.6e6  # degrees in a milliarcsecond

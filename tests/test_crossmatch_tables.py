@@ -22,9 +22,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
-from starcat.catalog.proper_motion import MAS, Motion, propagate
 from starcat.catalog.selection import select_guide_stars
-from starcat.catalog.stars import with_columns
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
@@ -41,6 +39,8 @@ from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict
+from starcat.stars.proper_motion import MAS, Motion, propagate
+from starcat.stars.star_table import with_columns
 from starcat.storage.parquet import read_parquet, write_parquet
 from starcat.storage.schema import product_schema
 

@@ -22,7 +22,6 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
@@ -30,6 +29,7 @@ from starcat.products.crossmatch import VERDICTS, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.specs.product_sections import Crossmatch
 from starcat.specs.reading import spec_from_dict
+from starcat.stars.star_table import floats_of
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
 

@@ -20,10 +20,8 @@ from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
-from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
-from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
@@ -33,6 +31,8 @@ from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec, Selection
 from starcat.specs.doubtful_stars import Doubles
 from starcat.specs.reading import preset
+from starcat.stars.proper_motion import Motion, propagate
+from starcat.stars.star_table import floats_of, table_from_columns
 
 FILES = {"hipparcos": "hip_main.dat.gz", "wds": "wds_hip.dat.gz"}
 

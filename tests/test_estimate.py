@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
-from starcat.catalog.stars import with_columns
 from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import Inputs, build
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
@@ -26,6 +25,7 @@ from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import NominalField, stars_in_fields
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat.stars.star_table import with_columns
 from starcat.storage.parquet import parquet_bytes, read_parquet, write_parquet
 
 FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}

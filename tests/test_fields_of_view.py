@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from starcat.catalog.ingest import ingest
 from starcat.catalog.source_files import locate
-from starcat.catalog.stars import directions_of
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
@@ -37,6 +36,7 @@ from starcat.products.pairs_and_triangles import find_triangles
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
+from starcat.stars.star_table import directions_of
 
 GIB = 2**30
 

@@ -14,9 +14,9 @@ sys.path.append(str(Path(__file__).parent / "benchmarks"))
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 from starcat.catalog.ingest import Ingested, ingest
-from starcat.catalog.stars import directions_of
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.products.coverage import tiling_gap
+from starcat.stars.star_table import directions_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

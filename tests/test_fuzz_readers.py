@@ -22,9 +22,9 @@ from starcat.catalog.doubles import WDS_COLUMNS, PairTable, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import Column, RecordFile, data_source, source_names
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
 from starcat.errors import StarcatError
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import product_schema
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))

@@ -30,14 +30,14 @@ from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
-from starcat.catalog.stars import floats_of, with_columns
-from starcat.catalog.verdict import Quality
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.motions import JoinedMotions, join_motions, motions_of
 from starcat.pipeline.rebuild import rebuild
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
+from starcat.stars.star_table import floats_of, with_columns
+from starcat.stars.verdict import Quality
 from starcat.storage.digests import file_sha256
 from starcat.store.reading import read_catalog
 

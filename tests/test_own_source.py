@@ -30,7 +30,6 @@ from starcat.catalog.source import (
     star_sources,
 )
 from starcat.catalog.source_files import locate
-from starcat.catalog.stars import floats_of
 from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
 from starcat.errors import ConfigError, SourceError
@@ -39,6 +38,7 @@ from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
 from starcat.resources import resource_folder
 from starcat.specs.reading import preset
+from starcat.stars.star_table import floats_of
 from starcat.store.ingest import ingest_to_store
 from starcat.store.reading import read_catalog
 

@@ -7,14 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.proper_motion import (
-    MAS,
-    Motion,
-    central_error,
-    propagate,
-    propagate_directions,
-)
 from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.stars.proper_motion import MAS, Motion, central_error, propagate, propagate_directions
 
 ARCSEC = np.pi / (180.0 * 3600.0)
 

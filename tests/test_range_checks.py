@@ -14,7 +14,7 @@ import pytest
 from starcat.catalog.ingest import Ingested, ingest, write_star_tables
 from starcat.catalog.parts import RANGES, check_ranges
 from starcat.catalog.source import Column, data_source
-from starcat.catalog.verdict import Verdicts
+from starcat.stars.verdict import Verdicts
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
 from archives import archive_records, file_header, record

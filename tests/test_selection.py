@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected, select_guide_stars
-from starcat.catalog.stars import directions_of, floats_of, table_from_columns
-from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.specs.build_spec import Selection
 from starcat.specs.doubtful_stars import Doubles, Variables
+from starcat.stars.star_table import directions_of, floats_of, table_from_columns
+from starcat.stars.verdict import Quality
 
 ALONE = 10.0  # degrees between stars that have nothing to do with each other
 

@@ -16,11 +16,9 @@ from archives import record
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import ingest
-from starcat.catalog.proper_motion import MAS, Motion, propagate_in_space
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.span import drifts, position_errors, validity, with_span
-from starcat.catalog.stars import directions_of, floats_of, move_to_epoch, table_from_columns
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
@@ -28,6 +26,8 @@ from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
 from starcat.specs.build_spec import Selection
 from starcat.specs.reading import read_spec
+from starcat.stars.proper_motion import MAS, Motion, propagate_in_space
+from starcat.stars.star_table import directions_of, floats_of, move_to_epoch, table_from_columns
 
 SPAN = (2027.0, 2042.0)
 MICROARCSEC = np.radians(1e-6 / 3600.0)

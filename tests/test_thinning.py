@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.attitude import (
     attitude_deviations,
@@ -43,6 +42,7 @@ from starcat.products.thinning import POWER, PRIOR, cell_areas, thin_by_cells, t
 from starcat.simulation.selftest import answers_rightly
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.specs.reading import preset, spec_from_dict
+from starcat.stars.star_table import directions_of, floats_of
 
 SIZE = NominalField(40.0, 30.0)
 RULES = ["voronoi", "information"]

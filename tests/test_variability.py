@@ -14,9 +14,9 @@ import pytest
 from starcat.catalog.ingest import ingest
 from starcat.catalog.joins import Keys
 from starcat.catalog.source import data_source
-from starcat.catalog.stars import floats_of, table_from_columns
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes, read_gcvs
 from starcat.errors import ParseError
+from starcat.stars.star_table import floats_of, table_from_columns
 
 
 def stars_of(catalog: str, count: int, **columns: Any) -> pa.Table:

@@ -16,9 +16,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.reader import Artifact
-from starcat.catalog.stars import directions_of, floats_of
-from starcat.catalog.verdict import Reason
 from starcat.geometry.sphere import separation
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Reason
 
 MOVED_ARCSEC = 1e-3
 """Stars that are further from where they were have moved."""

@@ -15,11 +15,11 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.catalog.proper_motion import MAS, Motion, propagate_directions
-from starcat.catalog.stars import floats_of
 from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
 from starcat.products.crossmatch import VERDICTS, Matches
 from starcat.products.match_figures import MovingStars
+from starcat.stars.proper_motion import MAS, Motion, propagate_directions
+from starcat.stars.star_table import floats_of
 from starcat.storage.schema import product_schema
 
 NEEDED = (

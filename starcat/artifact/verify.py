@@ -29,10 +29,10 @@ from starcat.artifact.checks import (
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
 from starcat.artifact.other_catalogs import COUNTS, joined_problems
 from starcat.artifact.reader import Artifact
-from starcat.catalog.stars import directions_of
-from starcat.catalog.verdict import Reason
 from starcat.errors import ProductError, StarcatError, no_database
 from starcat.specs.epoch import middle_of
+from starcat.stars.star_table import directions_of
+from starcat.stars.verdict import Reason
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.hdf5 import own_group
 

@@ -17,10 +17,10 @@ from starcat.artifact.manifest import manifest_digest
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.calibration.answers import SkyStars, read_answers
 from starcat.calibration.learn import FAMILY, MIN_FRAMES, Distrusted, Lesson, learn
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.specs.build_spec import Observed
 from starcat.specs.keys import toml_value
 from starcat.specs.reading import what_is_wrong
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import write_file
 from starcat.storage.digests import file_sha256
 

@@ -14,14 +14,14 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask, Rows
-from starcat.catalog.stars import directions_of, floats_of, with_columns
-from starcat.catalog.verdict import Quality
 from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
 from starcat.products.blends import Blends, Widths, blends, widths_px
 from starcat.products.match_figures import ARCSEC
 from starcat.specs.build_spec import Selection
+from starcat.stars.star_table import directions_of, floats_of, with_columns
+from starcat.stars.verdict import Quality
 
 MOST_PAIRS = 10_000_000
 """Pairs of a star and a neighbour that are looked at; they take a gigabyte."""

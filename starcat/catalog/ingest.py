@@ -20,10 +20,10 @@ from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions, merged, parse_b
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import FileFacts, SourceFiles
-from starcat.catalog.stars import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
-from starcat.catalog.verdict import Reason, Verdicts, rejected_path
 from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
+from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
+from starcat.stars.verdict import Reason, Verdicts, rejected_path
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 

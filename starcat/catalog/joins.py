@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
 from starcat.catalog.parts import FileReading, read_files
-from starcat.catalog.proper_motion import Motion, propagate_directions
 from starcat.catalog.readers.blocks import Block
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import Records, number_from_text
 from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.source_files import FileFacts, SourceFiles
-from starcat.catalog.stars import floats_of
-from starcat.catalog.verdict import Reason
 from starcat.geometry.sphere import chord_from_separation
 from starcat.progress import Progress, no_progress
+from starcat.stars.proper_motion import Motion, propagate_directions
+from starcat.stars.star_table import floats_of
+from starcat.stars.verdict import Reason
 
 MATCH_ARCSEC = 3.0
 """A place belongs to the nearest star within so much. Places of double and variable stars are good

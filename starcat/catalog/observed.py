@@ -7,9 +7,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.arrays import Mask
-from starcat.catalog.stars import floats_of, with_columns
 from starcat.errors import BuildError
 from starcat.specs.build_spec import Observed
+from starcat.stars.star_table import floats_of, with_columns
 
 SOURCE = "observed"
 """What `mag_source` and `band` say of a magnitude with the colour term of a sensor that flew."""

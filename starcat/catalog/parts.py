@@ -26,10 +26,10 @@ from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
 from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.readers.tables import read_tables
 from starcat.catalog.source_files import FileFacts, InputFile
-from starcat.catalog.stars import Columns, move_to_epoch, split_by_verdict, table_from_columns
-from starcat.catalog.verdict import Reason, Verdicts
 from starcat.errors import ParseError, SourceError
 from starcat.progress import Progress, no_progress
+from starcat.stars.star_table import Columns, move_to_epoch, split_by_verdict, table_from_columns
+from starcat.stars.verdict import Reason, Verdicts
 from starcat.threads import map_in_order
 
 _PARSERS = {"fixed_width": parse_fixed_width, "delimited": parse_delimited, "binary": parse_binary}

@@ -20,19 +20,19 @@ from starcat.catalog.blended import Judged, judge_neighbours
 from starcat.catalog.doubles import is_joined
 from starcat.catalog.observed import is_distrusted
 from starcat.catalog.photometry import combined_magnitude
-from starcat.catalog.stars import (
+from starcat.errors import BuildError
+from starcat.geometry.proximity import pairs_within
+from starcat.geometry.sphere import radec_from_directions
+from starcat.specs.build_spec import Selection
+from starcat.specs.doubtful_stars import Doubles, Variables
+from starcat.stars.star_table import (
     directions_of,
     floats_of,
     sort_rows,
     split_by_verdict,
     with_columns,
 )
-from starcat.catalog.verdict import Quality, Reason, Verdicts
-from starcat.errors import BuildError
-from starcat.geometry.proximity import pairs_within
-from starcat.geometry.sphere import radec_from_directions
-from starcat.specs.build_spec import Selection
-from starcat.specs.doubtful_stars import Doubles, Variables
+from starcat.stars.verdict import Quality, Reason, Verdicts
 from starcat.storage.schema import product_schema
 
 _STEPS = {Reason.beyond_count: "count", Reason.density: "density"}

@@ -21,9 +21,9 @@ from starcat.bands.measured import companion_error, variation_error
 from starcat.bands.photometry import band_error
 from starcat.bands.relation import Prediction, Relation, combined, predict_by_type
 from starcat.bands.response import Response, shipped_names
-from starcat.catalog.stars import floats_of, with_columns
-from starcat.catalog.verdict import Quality
 from starcat.errors import ConfigError
+from starcat.stars.star_table import floats_of, with_columns
+from starcat.stars.verdict import Quality
 
 ALONE = " alone"
 """How the origin of a magnitude ends that is the mean of all stars of the band."""

@@ -24,11 +24,11 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, whole_numbers, with_code
 from starcat.catalog.readers.records import Records
 from starcat.catalog.source_files import FileFacts
-from starcat.catalog.stars import floats_of, with_columns
-from starcat.catalog.verdict import Reason
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import Selection
+from starcat.stars.star_table import floats_of, with_columns
+from starcat.stars.verdict import Reason
 
 GCVS_COLUMNS = ("star_ref", "var_type", "mag_max", "mag_flag", "mag_min")
 

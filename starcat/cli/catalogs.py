@@ -291,7 +291,7 @@ def _print_sources(found: Sequence[dict[str, Any]]) -> None:
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     """Print what became of the records of a catalog."""
-    from starcat.catalog.verdict import rejected_path
+    from starcat.stars.verdict import rejected_path
 
     facts = {
         "source": read.source,
@@ -380,7 +380,7 @@ def print_problems(problems: Sequence[str]) -> None:
 
 def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     """Rows read, kept and rejected by reason: the two sides are equal."""
-    from starcat.catalog.verdict import Reason
+    from starcat.stars.verdict import Reason
 
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
     for name, count in facts["rejected"].items():

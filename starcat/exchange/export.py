@@ -22,11 +22,11 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.stars import floats_of
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
 from starcat.exchange.columns import Label, field_facts
 from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
 from starcat.exchange.writers import write_batches
+from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import whole_folder
 from starcat.storage.parquet import read_parquet
 from starcat.store.metadata import Described, describe_catalog, write_slices

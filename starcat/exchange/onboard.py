@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
@@ -34,6 +33,7 @@ from starcat.onboard.signature import (
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars
 from starcat.specs.reading import spec_from_dict
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
 from starcat.storage.keys import raw_public, read_private, read_public
 

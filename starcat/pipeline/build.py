@@ -24,7 +24,6 @@ from starcat.catalog.observed import with_observed
 from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import validity, with_span
-from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.errors import BuildError, ConfigError
 from starcat.matcher.matcher import Matcher
@@ -57,6 +56,7 @@ from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport, coverage_warnings, write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, sort_rows
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder
 from starcat.storage.schema import product_schema
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from starcat.catalog.observed import with_observed
 from starcat.catalog.span import with_span
-from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, join_notes, read_sources
 from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
 from starcat.pipeline.sensor_band import in_band_of
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, Observed
+from starcat.stars.star_table import floats_of
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and to place it."""

@@ -29,14 +29,14 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
 from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
-from starcat.catalog.stars import sort_rows
-from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.products.crossmatch import VERDICTS, candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
+from starcat.stars.star_table import sort_rows
+from starcat.stars.verdict import Reason
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file

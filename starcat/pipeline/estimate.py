@@ -15,8 +15,6 @@ import pyarrow as pa
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
-from starcat.catalog.stars import floats_of, reject_rows, sort_rows
-from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
@@ -44,6 +42,8 @@ from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
 from starcat.specs.build_spec import BuildSpec, Selection
+from starcat.stars.star_table import floats_of, reject_rows, sort_rows
+from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 
 MOST_FOR_GAPS = 50_000

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
-from starcat.catalog.stars import directions_of, floats_of
-from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
@@ -20,6 +18,8 @@ from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, 
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Reason
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""

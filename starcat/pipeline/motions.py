@@ -23,19 +23,19 @@ from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, unmoved_stars
-from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.stars import (
+from starcat.geometry.sphere import separation
+from starcat.pipeline.counterparts import match_source
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import BuildSpec
+from starcat.stars.proper_motion import Motion, propagate
+from starcat.stars.star_table import (
     add_nearest_neighbours,
     directions_of,
     floats_of,
     move_to_epoch,
     with_columns,
 )
-from starcat.catalog.verdict import Quality
-from starcat.geometry.sphere import separation
-from starcat.pipeline.counterparts import match_source
-from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec
+from starcat.stars.verdict import Quality
 from starcat.storage.schema import product_schema
 
 OF_ENTRY = (

@@ -16,7 +16,6 @@ import pyarrow as pa
 
 from starcat.arrays import Array
 from starcat.artifact.writer import Product
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.index import Index, Ragged
@@ -29,6 +28,7 @@ from starcat.products.neighbours import (
 from starcat.products.pairs_and_triangles import find_pairs, find_triangles
 from starcat.products.star_patterns import grid_patterns, radial_patterns
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import ProductSchema, product_schema
 
 

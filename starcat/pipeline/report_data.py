@@ -20,9 +20,7 @@ from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
 from starcat.catalog.source import map_of
 from starcat.catalog.span import Validity
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.catalog.variability import AmplitudeTable
-from starcat.catalog.verdict import Reason
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
@@ -36,6 +34,8 @@ from starcat.report.report import (
 from starcat.report.sensor_band import band_content
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Reason
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ import pyarrow.compute as pc
 from starcat.artifact.manifest import SourceFacts
 from starcat.bands.response import Response
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
-from starcat.catalog.stars import add_nearest_neighbours
 from starcat.pipeline.counterparts import read_and_match, source_facts
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import add_nearest_neighbours
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source_files import locate
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
 from starcat.pipeline.cost import Cost, base_memory, product_cost, table_bytes, whole_cost
@@ -34,6 +33,7 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_exposure import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
 
 SOURCE, BAND = "gaia", "G"

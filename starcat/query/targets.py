@@ -13,7 +13,7 @@ from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
 from starcat.query.names import distinct, identifier, short_names
-from starcat.specs.product_sections import version_numbers
+from starcat.sections import version_numbers
 from starcat.storage.schema import ProductSchema, SchemaColumn, product_schema
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def _check_file(path: Path) -> None:
 
 def _tables(path: Path, engine: Engine) -> Target:
     """Return a Parquet file, with the rejected rows beside it where there are any."""
-    from starcat.catalog.verdict import rejected_path
+    from starcat.stars.verdict import rejected_path
 
     files = [path, *filter(Path.is_file, [rejected_path(path)])]
     return Target(identifier(path.stem), "", tuple(_table(file, engine) for file in files))

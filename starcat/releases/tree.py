@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
 from starcat.failures import validation_message
-from starcat.specs.product_sections import NAME_PATTERN, VERSION_PATTERN, version_numbers
+from starcat.sections import NAME_PATTERN, VERSION_PATTERN, version_numbers
 from starcat.storage.digests import json_bytes
 
 INDEX_NAME = "index.json"

@@ -11,6 +11,15 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.sections import (
+    NAME_PATTERN,
+    SOURCE_NAME,
+    VERSION_PATTERN,
+    CatalogName,
+    FieldDeg,
+    Mag,
+    Section,
+)
 from starcat.specs.camera_exposure import (
     CameraExposure,
     contradiction,
@@ -22,38 +31,20 @@ from starcat.specs.camera_response import CameraResponse
 from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
 from starcat.specs.neighbour_rule import NeighbourRule
-from starcat.specs.product_sections import (
-    NAME_PATTERN,
-    VERSION_PATTERN,
-    FieldDeg,
-    Mag,
-    Products,
-    Section,
-)
+from starcat.specs.product_sections import Products
 
 MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-LATER_KEYS = (
-    *("selection.neighbours.centroid", "selection.neighbours.box_px"),
-    *("products.levels", "catalog.motions", "selection.neighbours"),
-    "catalog.merged",
-    *("selection.thinning", "selection.observed", "selection.doubles.join"),
-    *("camera.response", "camera.exposure", "selection.max_drift_arcsec"),
-)
-"""Keys that came after 0.1.0. A manifest has them only where they are not the default, so that a
-spec without them makes the bytes that it always made."""
-
-
-SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
-"""Never a path: a spec may come from anybody, and a path of a map would be read."""
 SHA256_PATTERN = r"^[0-9a-f]{64}$"
 Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
 
 class Catalog(Section):
     """Where the stars come from."""
+
+    later_keys = ("merged", "motions")
 
     source: str = Field(
         pattern=SOURCE_NAME,
@@ -66,7 +57,7 @@ class Catalog(Section):
     read_limit_mag: Mag | None = Field(
         None, description="fainter records, and those without magnitude, are counted and left out"
     )
-    merged: tuple[Annotated[str, StringConstraints(pattern=SOURCE_NAME)], ...] = Field(
+    merged: tuple[CatalogName, ...] = Field(
         (),
         strict=False,  # a list in TOML
         max_length=8,
@@ -106,6 +97,8 @@ class Catalog(Section):
 
 class Observed(Section):
     """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
+
+    is_later = True
 
     zero_point_mag: float | None = Field(
         None,
@@ -158,6 +151,8 @@ class Observed(Section):
 
 class Selection(Section):
     """Which stars become guide stars."""
+
+    later_keys = ("max_drift_arcsec", "thinning")
 
     bright_limit_mag: Mag = Field(-30.0, description="brighter stars are rejected")
     faint_limit_mag: Mag = Field(
@@ -436,18 +431,6 @@ class BuildSpec(Section):
         """What the camera's exposure says of a limit that is beyond it."""
         response = self.camera.response.response()
         return exposure_notes(self.camera.exposure, response, self.selection.faint_limit_mag)
-
-    def recorded(self) -> dict[str, Any]:
-        """Return what a database says of its spec."""
-        content = self.model_dump(mode="json")
-        for name in LATER_KEYS:
-            section, _, key = name.rpartition(".")
-            own, told = self, content
-            for part in filter(None, section.split(".")):
-                own, told = getattr(own, part), told[part]
-            if getattr(own, key) == type(own).model_fields[key].default:
-                del told[key]
-        return content
 
     @property
     def span_jyear(self) -> tuple[float, float]:

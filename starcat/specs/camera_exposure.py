@@ -8,8 +8,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from starcat.bands.exposure import Exposure, photons_s_mm2, zero_point_e_s
 from starcat.bands.response import Response
+from starcat.sections import Section
 from starcat.specs.camera_response import CameraResponse
-from starcat.specs.product_sections import Section
 
 USUAL_SIGNAL_TO_NOISE = 5.0
 """Of a star that is found and has a useful centroid; proposed where the spec asks for none."""
@@ -29,6 +29,8 @@ def _size(description: str, example: float, *, most: float = 1e9, default: Any =
 
 class CameraExposure(Section):
     """Light and noise of a frame; with them the limits can be asked for as signal-to-noise."""
+
+    is_later = True
 
     aperture_mm: float | None = _size("diameter of the aperture", 20.0, most=1e5)
     quantum_efficiency: float | None = _size(

@@ -14,8 +14,8 @@ from pydantic import Field, model_validator
 from starcat.bands.response import Response, checked_response, read_response, shipped, shipped_names
 from starcat.bands.synthetic import checked_zero_point
 from starcat.errors import ConfigError
+from starcat.sections import Section
 from starcat.specs.local_files import LocalFile
-from starcat.specs.product_sections import Section
 
 MOST_ROWS = 2000
 """Of a table that travels in a spec."""
@@ -25,6 +25,8 @@ Column = Annotated[tuple[float, ...], Field(max_length=MOST_ROWS, strict=False)]
 
 class CameraResponse(Section):
     """The band that the sensor sees in; magnitudes and limits are in it, else in the catalog's."""
+
+    is_later = True
 
     name: str | None = Field(
         None,

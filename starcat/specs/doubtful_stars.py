@@ -6,11 +6,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from starcat.specs.product_sections import Mag, Section
+from starcat.sections import Mag, Section
 
 
 class Doubles(Section):
     """Stars too close for the sensor to tell apart."""
+
+    later_keys = ("join",)
 
     min_separation_deg: float = Field(
         0.047, ge=0.0, le=10.0, description="stars that are closer are a double"

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from starcat.specs.product_sections import Section
+from starcat.sections import Section
 
 DEFAULT_OFFSET_PX = 0.1
 """Largest shift of a centroid where a spec states none: a fifth of the self-test's noise."""
@@ -15,6 +15,9 @@ DEFAULT_OFFSET_PX = 0.1
 
 class NeighbourRule(Section):
     """Stars whose light others in their window spoil; with psf_sigma_px, in place of doubles."""
+
+    is_later = True
+    later_keys = ("centroid", "box_px")
 
     psf_sigma_px: float | None = Field(
         None,

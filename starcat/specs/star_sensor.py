@@ -12,8 +12,8 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, model_validator
 
 from starcat.bands.exposure import PHOTONS_S_MM2, zero_point_e_s
+from starcat.sections import Mag, Section
 from starcat.specs.keys import toml_value
-from starcat.specs.product_sections import Mag, Section
 from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
 
 Positive = Annotated[float, Field(gt=0.0, le=1e15)]

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.catalog.stars import floats_of
+from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema

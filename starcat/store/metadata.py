@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.parts import IngestOptions
 from starcat.catalog.source import map_of
-from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
+from starcat.stars.verdict import Reason
 from starcat.storage.digests import json_bytes
 from starcat.storage.parquet import votable_metadata
 from starcat.store.cluster import versions

@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.proximity import nearest_chords, separation_from_chord
 from starcat.geometry.sphere import chord_from_separation
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.store.pixels import Pixel
 
 COLUMNS = ("star_id", "x", "y", "z", "mag", "source_file", "source_line")

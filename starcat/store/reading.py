@@ -24,10 +24,10 @@ from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options,
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
 from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, table_parts
-from starcat.catalog.stars import Columns, floats_of, move_to_epoch, table_from_columns
-from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.progress import Progress, no_progress
+from starcat.stars.star_table import Columns, floats_of, move_to_epoch, table_from_columns
+from starcat.stars.verdict import Reason
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
 from starcat.store.layout import (

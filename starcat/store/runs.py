@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.stars import floats_of, nulls
+from starcat.stars.star_table import floats_of, nulls
 from starcat.storage.atomic import placed
 from starcat.storage.schema import product_schema
 from starcat.store.pixels import (

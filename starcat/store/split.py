@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.parts import merged, parse_block, read_files
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.verdict import Reason
+from starcat.stars.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema

@@ -28,9 +28,9 @@ from starcat.catalog.parts import IngestOptions
 from starcat.catalog.readers.tables import open_table
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import InputFile, cache_folder
-from starcat.catalog.verdict import Reason
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError
 from starcat.progress import Progress
+from starcat.stars.verdict import Reason
 from starcat.storage.atomic import placed, writing
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.download import (

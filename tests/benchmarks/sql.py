@@ -21,10 +21,10 @@ from rows import Options, Rows, ended, fresh
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
-from starcat.catalog.stars import directions_of
 from starcat.pipeline.recipes import ProductInputs, make_product, tile_guide_stars
 from starcat.query.session import Session, open_session
 from starcat.specs.reading import preset, spec_from_dict
+from starcat.stars.star_table import directions_of
 from starcat.storage.parquet import write_parquet
 
 MOST_RATIO, MOST_START_S, MOST_CONE_MS = 1.2, 0.5, 60.0

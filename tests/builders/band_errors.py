@@ -33,7 +33,7 @@ from starcat.bands.relation import relation
 from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.sensor_band import in_sensor_band
-from starcat.catalog.stars import directions_of, floats_of, with_columns
+from starcat.stars.star_table import directions_of, floats_of, with_columns
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

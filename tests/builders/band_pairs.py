@@ -23,8 +23,8 @@ from starcat.bands.photometry import band_error
 from starcat.bands.relation import Prediction, predict_by_type, relation
 from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.stars import directions_of, floats_of
-from starcat.catalog.verdict import Quality
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Quality
 from starcat.store.reading import read_catalog
 
 Array = NDArray[np.float64]

@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.table_map import UNITS, Flags, Remote, StarColumns, TableMap
-from starcat.catalog.verdict import Reason
 from starcat.cli.main import app
 from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
+from starcat.stars.verdict import Reason
 from starcat.storage.schema import read_schema
 from starcat_lab.report.files import reproduction_page
 

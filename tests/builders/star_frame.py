@@ -10,7 +10,6 @@ from frames import observe
 from numpy.typing import NDArray
 from star_story import Story, arcsec, link, table
 
-from starcat.catalog.stars import floats_of
 from starcat.geometry.attitude import (
     matrix_from_radec_roll,
     quaternion_from_matrix,
@@ -23,6 +22,7 @@ from starcat.matcher.methods import triangle
 from starcat.matcher.settings import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
 from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
+from starcat.stars.star_table import floats_of
 
 Array = NDArray[np.float64]
 

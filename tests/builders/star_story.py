@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.catalog.stars import directions_of
 from starcat.cli.main import app
 from starcat.pipeline.build import Built, build
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
+from starcat.stars.star_table import directions_of
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,6 @@ from scipy.sparse.csgraph import connected_components
 
 import starcat
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.stars import floats_of
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.proximity import pairs_within
@@ -34,6 +33,7 @@ from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import REACH, TriangleOrder
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import whole_file
 from starcat_lab.bare_methods import ANSWERS
 from starcat_lab.score import Score, score

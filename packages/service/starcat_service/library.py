@@ -12,8 +12,8 @@ from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
 from starcat.geometry.camera import Camera
 from starcat.releases.tree import Blob, files_of
+from starcat.sections import version_numbers
 from starcat.specs.build_spec import CameraSpec
-from starcat.specs.product_sections import version_numbers
 from starcat.storage.digests import file_sha256
 from starcat_service.paths import DATABASE_ID, ServicePaths
 from starcat_service.problems import Problem

@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 
 from starcat.arrays import Array
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, numbered
-from starcat.catalog.verdict import Verdicts
+from starcat.stars.star_table import Columns, numbered
+from starcat.stars.verdict import Verdicts
 
 COLUMNS = {
     "gaia_merged": (

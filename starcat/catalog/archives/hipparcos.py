@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.catalog.proper_motion import central_error
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, known, numbered, text_column, where_known
-from starcat.catalog.verdict import Verdicts
+from starcat.stars.proper_motion import central_error
+from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column, where_known
+from starcat.stars.verdict import Verdicts
 
 ASTROMETRY = (
     "ra_deg", "de_deg", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx", "e_pm_ra", "e_pm_de",

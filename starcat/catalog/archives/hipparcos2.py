@@ -10,8 +10,8 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, known, numbered
-from starcat.catalog.verdict import Quality, Verdicts, quality_flags
+from starcat.stars.star_table import Columns, join_flags, known, numbered
+from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
     "hip2": (

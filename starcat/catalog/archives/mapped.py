@@ -24,10 +24,10 @@ from starcat.catalog.readers.expressions import columns_in, evaluate
 from starcat.catalog.readers.records import Problem, Records, Rows, TableColumn
 from starcat.catalog.readers.tables import BLANKS, OpenTable
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.stars import Columns, known, where_known
 from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
-from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 from starcat.errors import ConfigError, quoted
+from starcat.stars.star_table import Columns, known, where_known
+from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 _WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
 _INT64 = range(-(2**63), 2**63)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, known, numbered, text_column
-from starcat.catalog.verdict import Reason, Verdicts
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
+from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column
+from starcat.stars.verdict import Reason, Verdicts
 
 COLUMNS = {
     "sao": (

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, known, text_column
-from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
+from starcat.stars.star_table import Columns, join_flags, known, text_column
+from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "psc": (

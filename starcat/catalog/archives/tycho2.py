@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import JOHNSON_SLOPE, johnson_v
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import Columns, join_flags, known
-from starcat.catalog.verdict import Quality, Verdicts, quality_flags
+from starcat.stars.star_table import Columns, join_flags, known
+from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
     "tyc2": (

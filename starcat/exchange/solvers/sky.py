@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import Artifact
-from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
+from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.digests import file_sha256
 from starcat.version import __version__
 

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from starcat.catalog.ingest import ingest_options
 from starcat.errors import ProductError, TargetMissing
+from starcat.sections import version_numbers
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.product_sections import version_numbers
 from starcat.specs.reading import spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, end_job, job_in, job_of

@@ -166,7 +166,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
         from starcat.catalog.ingest import write_star_tables
-        from starcat.catalog.verdict import rejected_path
+        from starcat.stars.verdict import rejected_path
         from starcat.store.reading import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)

@@ -23,7 +23,7 @@ from starcat.report.coverage_map import (
     raster_png,
     sky_map,
 )
-from starcat.specs.product_sections import version_numbers
+from starcat.sections import version_numbers
 from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of
 from starcat_service.jobs.submission import submit_evaluation

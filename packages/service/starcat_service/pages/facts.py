@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.catalog.verdict import Reason
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
 from starcat.simulation.selftest import rates_of
+from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 from starcat_service.library import Database
 from starcat_service.service import Service

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.proper_motion import Motion, propagate_in_space
-from starcat.catalog.verdict import Quality, Verdicts
 from starcat.geometry.proximity import nearest_neighbours
 from starcat.geometry.sphere import directions_from_radec
+from starcat.stars.proper_motion import Motion, propagate_in_space
+from starcat.stars.verdict import Quality, Verdicts
 from starcat.storage.schema import product_schema
 
 Values: TypeAlias = NDArray[Any] | pa.Array | str | float | int | bool

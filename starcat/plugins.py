@@ -1,0 +1,37 @@
+"""Plug-ins of starcat: the modules of a folder, in the order that they state themselves."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+from types import ModuleType
+
+
+@cache
+def plugin_modules(package: str) -> tuple[ModuleType, ...]:
+    """Import the modules of a package that define ``POSITION``, and return them in its order.
+
+    A new product or selection rule is therefore one new file: no list names it. ``POSITION`` is a
+    number; the order of products decides the bytes of a manifest, and the order of rules decides
+    which reason a rejected star gets. Modules without ``POSITION`` are not plug-ins.
+
+    Raises
+    ------
+    ValueError
+        If two modules have the same ``POSITION``.
+    """
+    folder = importlib.import_module(package)
+    names = [each.name for each in pkgutil.iter_modules(folder.__path__, f"{package}.")]
+    modules = [importlib.import_module(name) for name in names]
+    by_position: dict[float, ModuleType] = {}
+    for module in modules:
+        if (position := getattr(module, "POSITION", None)) is None:
+            continue
+        if position in by_position:
+            raise ValueError(
+                f"{module.__name__} and {by_position[position].__name__} both have POSITION = "
+                f"{position}; give the new one a number between those of its neighbours"
+            )
+        by_position[position] = module
+    return tuple(by_position[position] for position in sorted(by_position))

@@ -1,0 +1,85 @@
+"""The base of every section of a build spec, and the types of its keys.
+
+Products and selection rules define their own sections with it, and the build spec puts these
+sections together.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
+
+Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
+"""A magnitude that some star may have."""
+
+SMALLEST_DEG = 0.001
+"""Below 4 arcsec an angle of a spec is a slip: of a unit or of the decimal point."""
+
+SmallDeg = Annotated[float, Field(ge=SMALLEST_DEG, le=90.0)]
+"""A radius or the width of a bin, degrees."""
+
+FieldDeg = Annotated[float, Field(ge=0.01, lt=120.0)]
+"""The full angle of a field of view, degrees."""
+
+
+class Section(BaseModel):
+    """A section of a spec: immutable, without unknown keys, with finite numbers only.
+
+    A manifest records a spec. Keys and sections that were added after version 0.1.0 are recorded
+    only if they differ from their defaults, so that an older spec still makes the same bytes.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    is_later: ClassVar[bool] = False
+    """Whether the whole section was added after version 0.1.0; true for every new section."""
+
+    later_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys of this section that were added after version 0.1.0."""
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _no_negative_zero(cls, value: Any) -> Any:
+        """Return 0.0 for -0.0: it passes the check for negative numbers, and must equal 0.0."""
+        return value + 0.0 if isinstance(value, float) else value
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the content of the section that a manifest records."""
+        content = self.model_dump(mode="json")
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            is_later = name in self.later_keys
+            if isinstance(value, Section):
+                content[name] = value.recorded()
+                is_later = is_later or value.is_later
+            if is_later and value == field.default:
+                del content[name]
+        return content
+
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,63}$"
+
+_NUMBER = r"(0|[1-9][0-9]{0,17})"
+VERSION_PATTERN = rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$"
+
+
+def version_numbers(version: str) -> tuple[int, int, int]:
+    """Return what versions are sorted by, as semantic versions go.
+
+    Examples
+    --------
+    >>> version_numbers("1.10.0") > version_numbers("1.9.0")
+    True
+    """
+    major, minor, patch = (int(number) for number in version.split("."))
+    return major, minor, patch
+
+
+PlanarDeg = Annotated[float, Field(ge=0.001, le=80.0)]
+"""A radius in a tangent plane, which has no place for what is 90 deg away."""
+
+SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
+"""The name of a catalog. It is never a path, because anybody may send a spec to a service."""
+
+CatalogName = Annotated[str, StringConstraints(pattern=SOURCE_NAME)]
