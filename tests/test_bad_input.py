@@ -850,6 +850,7 @@ QUERIES: Cases = {
     "Parquet file whose footer names an odd schema": run(
         "sql {folder}/odd.parquet 'FROM odd'", odd_schema
     ),
+    "place with a declination that does not exist": sql("FROM cone(83, -95, 5)"),
     "place in a table that has none": sql("FROM cone(1, 2, 3, of := 'pairs')"),
     "store without a partition under a query": run("sql {folder}/sky 'FROM stars'", sky_store()),
     "store whose partition is cut off, under a query": run(

@@ -48,3 +48,8 @@ CREATE MACRO _is_beside(found, ra, width) AS (
 CREATE MACRO _half_diagonal(fov_x, fov_y) AS degrees(atan(sqrt(
     power(tan(radians(fov_x / 2)), 2) + power(tan(radians(fov_y / 2)), 2)
 )));
+-- A declination, if it exists. Without this check, cone(83, -95, 5) would find no rows and say nothing.
+CREATE MACRO _declination(dec) AS CASE
+    WHEN dec BETWEEN -90 AND 90 THEN dec
+    ELSE error('declination ' || dec || ' deg does not exist: give one from -90 to 90')
+END;

@@ -15,7 +15,7 @@ FROM (
         sind(dec) * sind(_place_dec_deg)
             + cosd(dec) * cosd(_place_dec_deg) * cosd(_place_ra_deg - ra) AS _ahead
     FROM query_table('{places}.' || of)
-    WHERE abs(_place_dec_deg - dec) <= 1e-9 + _half_diagonal(fov_x, fov_y)
+    WHERE abs(_place_dec_deg - _declination(dec)) <= 1e-9 + _half_diagonal(fov_x, fov_y)
         AND {places}._may_be_near(
             _place_ra_deg, _place_file, getvariable('{places}.' || lower(of)),
             ra, dec, _half_diagonal(fov_x, fov_y)
