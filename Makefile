@@ -16,25 +16,27 @@ SERVED := $(VENV)/.served
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-$(RUNS): pyproject.toml packages/lab/pyproject.toml locks/run.txt
+$(RUNS): pyproject.toml packages/lab/pyproject.toml lock.txt
 	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
 	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) --require-hashes --no-deps --requirement locks/run.txt
+	@sed '/^# --- service/,$$d' lock.txt > $(VENV)/run.txt
+	@$(PIP) --require-hashes --no-deps --requirement $(VENV)/run.txt
 	@$(PIP) --no-deps --no-build-isolation --editable . --editable packages/lab
 	@$(COMPILE)
 	@touch $(RUNS)
 
-$(SERVED): $(RUNS) packages/service/pyproject.toml locks/service.txt
+$(SERVED): $(RUNS) packages/service/pyproject.toml lock.txt
 	@echo "installing what the service needs into $(VENV) (30 MB)"
-	@$(PIP) --require-hashes --no-deps --requirement locks/service.txt
+	@sed '/^# --- dev/,$$d' lock.txt > $(VENV)/service.txt
+	@$(PIP) --require-hashes --no-deps --requirement $(VENV)/service.txt
 	@$(PIP) --no-deps --no-build-isolation --editable packages/service
 	@$(COMPILE)
 	@touch $(SERVED)
 
-$(READY): $(RUNS) packages/service/pyproject.toml locks/dev.txt
+$(READY): $(RUNS) packages/service/pyproject.toml lock.txt
 	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
-	@$(PIP) --require-hashes --no-deps --requirement locks/dev.txt
+	@$(PIP) --require-hashes --no-deps --requirement lock.txt
 	@$(PIP) --no-deps --no-build-isolation --editable packages/service
 	@$(COMPILE)
 	@touch $(READY)
@@ -46,10 +48,11 @@ SERVICE_NEEDS := $(BIN)/python -c 'import tomllib; \
 	print("\n".join(need for need in needs if not need.startswith("starcat")))'
 LOCK := $(BIN)/uv pip compile --quiet --universal --generate-hashes --no-annotate \
 	--no-emit-index-url --custom-compile-command 'make lock' --python-version 3.11 pyproject.toml -
-lock: $(READY) ## renew locks/: the newest versions within the bounds, with their hashes
-	$(BUILT_WITH) | $(LOCK) --upgrade --all-extras -o locks/dev.txt
-	$(BUILT_WITH) | $(LOCK) --extra images -c locks/dev.txt -o locks/run.txt
-	{ $(BUILT_WITH); $(SERVICE_NEEDS); } | $(LOCK) --extra images -c locks/dev.txt -o locks/service.txt
+lock: $(READY) ## renew lock.txt: the newest versions within the bounds, with their hashes
+	$(BUILT_WITH) | $(LOCK) --upgrade --all-extras -o $(VENV)/all.txt
+	$(BUILT_WITH) | $(LOCK) --extra images -c $(VENV)/all.txt -o $(VENV)/run.txt
+	{ $(BUILT_WITH); $(SERVICE_NEEDS); } | $(LOCK) --extra images -c $(VENV)/all.txt -o $(VENV)/service.txt
+	$(BIN)/python tests/builders/lock.py $(VENV)/all.txt $(VENV)/run.txt $(VENV)/service.txt > lock.txt
 
 newest: ## test with the newest versions that the bounds allow, in an environment of its own
 	$(PYTHON) -m venv --clear .venv-newest

@@ -295,7 +295,7 @@ def test_newer_versions_are_named_with_the_known_ones(copy):
     seal(copy, lambda manifest: manifest["products"]["pairs"].update(schema="pairs-2.0.0"))
     expect(copy, "pairs.parquet", "pairs", "version 2.0.0 found; this starcat reads: 1.0.0")
     seal(copy, lambda manifest: manifest.update(manifest_version="2.0.0"))
-    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.1.0")
+    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.0.0")
 
 
 def rename(new: str) -> Callable[[dict[str, Any]], object]:

@@ -24,14 +24,7 @@ if TYPE_CHECKING:  # reading a manifest needs none of these
 
 MANIFEST_NAME = "manifest.json"
 MAX_MANIFEST_BYTES = 256 << 20
-MANIFEST_VERSION = "1.1.0"
-MOTIONS_VERSION = "1.2.0"
-PHOTOMETRY_VERSION = "1.3.0"
-DOUBLES_VERSION = "1.4.0"
-MAP_VERSION = "1.5.0"
-"""The versions of manifests with motions, with magnitudes, and with doubles, of another catalog,
-and with the map of a table; all others are `MANIFEST_VERSION`."""
-
+MANIFEST_VERSION = "1.0.0"
 DATABASE_NAME = "database.h5"
 
 SHAPE: dict[Any, Any] = {

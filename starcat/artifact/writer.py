@@ -19,12 +19,8 @@ import pyarrow.compute as pc
 from starcat.artifact.database import open_for_writing, write_product, write_root
 from starcat.artifact.manifest import (
     DATABASE_NAME,
-    DOUBLES_VERSION,
     MANIFEST_NAME,
     MANIFEST_VERSION,
-    MAP_VERSION,
-    MOTIONS_VERSION,
-    PHOTOMETRY_VERSION,
     SourceFacts,
     manifest_digest,
     software_versions,
@@ -83,14 +79,9 @@ def write_manifest(
 ) -> dict[str, Any]:
     """Write the manifest of a folder whose other files are complete."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    roles = {source.role for source in sources}
-    version = MOTIONS_VERSION if "motions" in roles else MANIFEST_VERSION
-    version = PHOTOMETRY_VERSION if "photometry" in roles else version
-    version = DOUBLES_VERSION if "doubles" in roles else version
-    version = MAP_VERSION if any(source.map for source in sources) else version
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": version,
+        "manifest_version": MANIFEST_VERSION,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",
