@@ -58,8 +58,8 @@ def malformed(error: Exception) -> MalformedMessage:
     )
 
 
-def error_content(error: Exception, **more: Any) -> dict[str, Any]:
-    """Return an error as plain values, for `error_of`, with what the asking process needs more."""
+def error_content(error: Exception) -> dict[str, Any]:
+    """Return an error as plain values, for `error_of`."""
     plain = next((kind for kind in PLAIN_ERRORS if isinstance(error, kind)), type(error))
     key = getattr(error, "key", None)
     return {
@@ -68,7 +68,6 @@ def error_content(error: Exception, **more: Any) -> dict[str, Any]:
         "key": None if key is None else str(key),
         "fields": list(getattr(error, "fields", ())),
         "errno": _system_error(error),
-        **more,
     }
 
 

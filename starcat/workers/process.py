@@ -103,9 +103,9 @@ class WorkerProcess:
             self._requests.write(left)
             self._requests.flush()
             return
-        descriptor = self._requests.fileno()
         while left:
             try:
+                descriptor = self._requests.fileno()
                 left = left[os.write(descriptor, left) :]
             except BlockingIOError:
                 waiting = select.poll()
@@ -116,6 +116,8 @@ class WorkerProcess:
                         raise BrokenPipeError from None
                     if wait_s <= 0.0:
                         raise TimeoutError from None
+            except ValueError:  # it was closed
+                raise BrokenPipeError from None
 
     def receive(self, wait_s: float = math.inf) -> tuple[str, bytes | bytearray] | None:
         """Return kind and content of the next message; None if there is none in time.
@@ -167,7 +169,10 @@ class WorkerProcess:
             return None
         if not self._poll.poll(math.ceil(1e3 * wait_s)):
             return None
-        return os.read(self._replies.fileno(), size)
+        try:
+            return os.read(self._replies.fileno(), size)
+        except ValueError:  # it was closed
+            return b""
 
     def _read_parts(self) -> None:
         part = b"-"
