@@ -231,7 +231,9 @@ def replies(ran: Path) -> dict[str, bytes]:
         "JSON nested without end": message("d", b"[" * 1_000_000),
         "a number of too many digits": message("d", b"9" * 10_000),
         "an error that is none": message("e", b"[1]"),
-        "an error of a strange class": message("e", b'{"kind":"eval","message":"1","key":null,"fields":[],"errno":null}'),
+        "an error of a strange class": message(
+            "e", b'{"kind":"eval","message":"1","key":null,"fields":[],"errno":null}'
+        ),
         "rows of different lengths": message("p", b'[1,[["any",[1]],["any",[1,2]]],[]]'),
         "rows of no known form": message("p", b'[1,[["code",["os.system"]]],[]]'),
         "rows with a value of no type": message("p", b'[1,[["any",[["eval","1"]]]],[]]'),

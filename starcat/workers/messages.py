@@ -30,7 +30,8 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 PLAIN_ERRORS: tuple[type[Exception], ...] = (MemoryError, RecursionError)
 """Errors of Python's own that a worker reports; its others are those of `starcat.errors`."""
 
-_JSON = json.JSONEncoder(separators=(",", ":"))
+_JSON = json.JSONEncoder(separators=(",", ":"), default=lambda value: value.tolist())
+"""Numbers and arrays of numpy are numbers and lists."""
 
 
 class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact

@@ -17,6 +17,7 @@ pytest.importorskip("fastapi")
 from fastapi.testclient import TestClient
 from served import serve
 from services import DATABASE, add_database, client_of
+from starcat_service.sandbox.places import Lanes, Overdue, Places, asker, lease
 
 from starcat.errors import QueryLimitError
 from starcat.query.engine import Engine
@@ -24,7 +25,6 @@ from starcat.query.session import open_session
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem
 from starcat_service.sandbox import places
-from starcat_service.sandbox.places import Lanes, Overdue, Places, asker, lease
 from starcat_service.sandbox.pool import QueryPool
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
 from starcat_service.settings import Settings

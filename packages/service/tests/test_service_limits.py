@@ -19,6 +19,7 @@ from astropy.table import Table
 from cachetools import TTLCache
 from fastapi.testclient import TestClient
 from services import DATABASE, LOCAL, add_database, client_of
+from starcat_service.sandbox.child import Child
 
 from starcat.errors import OutputError
 from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
@@ -31,7 +32,6 @@ from starcat_service.estimates import ChildCatalogs
 from starcat_service.problems import Problem
 from starcat_service.removal import remove_old
 from starcat_service.sandbox import child as child_module
-from starcat_service.sandbox.child import Child
 from starcat_service.security.request_limits import Buckets
 from starcat_service.security.tokens import DAY_S
 
