@@ -88,7 +88,7 @@ def test_one_that_was_left_halfway_is_thrown_away(sessions, small_artifact):
 
 def test_only_some_are_kept(sessions, artifact_version):
     processes = []
-    sessions._open._most_idle = 2
+    sessions._open._max_idle = 2
     for number in range(3):
         with sessions.session([artifact_version(f"1.0.{number}")]) as session:
             processes.append(process_of(session))

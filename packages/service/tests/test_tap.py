@@ -20,7 +20,6 @@ from astropy.table import MaskedColumn, Table
 from fastapi.testclient import TestClient
 from httpx2 import Response
 from services import LOCAL, add_database, client_of
-from starcat_service.sandbox.places import asker
 
 from starcat.errors import QueryError
 from starcat.exchange.formats import response_format
@@ -29,6 +28,7 @@ from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER
 from starcat_service.protocols.parameters import Question
+from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service
 from starcat_service.settings import Settings
 from starcat_service.vo.tap import ClientGone, Spool
