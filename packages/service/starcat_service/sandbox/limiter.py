@@ -1,8 +1,8 @@
 """How much runs at the same time, for one client and for all together.
 
-Those who wait are served in turn: a place is for the client who holds fewest, and of those for the
-one who was served longest ago. A client gets another place only where more are free than it holds,
-so that nobody who comes later finds all of them taken by one.
+Those who wait are served in turn: a place is for the client who holds fewest, and who was served
+is behind the others. A client gets another place only where more are free than it holds, so that
+nobody who comes later finds all of them taken by one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from concurrent.futures import TimeoutError as OutOfTime
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
-from typing import ParamSpec, TypeVar
+from typing import TypeVar
 
 from anyio import CapacityLimiter, to_thread
 
@@ -28,7 +28,6 @@ WAIT_S = 30.0
 asker: ContextVar[str] = ContextVar("asker", default="")
 """Who is counted as one client: the name of a token, or the address of somebody without one."""
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -61,15 +60,9 @@ class Limiter:
     def __init__(self, count: int, each: int) -> None:
         self._free, self._each = count, max(1, each)
         self._held: Counter[str] = Counter()
-        self._served: dict[str, int] = {}  # when each client was last given a place, as a number
         self._waiting: list[tuple[str, Future[Place]]] = []
         self._lock = threading.Lock()
         self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # of a request
-
-    def waiting(self, who: str) -> int:
-        """Return how often a client waits."""
-        with self._lock:
-            return sum(one == who for one, _ in self._waiting)
 
     @contextmanager
     def held(self, who: str, patience_s: float) -> Iterator[None]:
@@ -82,9 +75,7 @@ class Limiter:
         with place.used():
             yield
 
-    async def run(
-        self, patience_s: float, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
-    ) -> T:
+    async def run(self, patience_s: float, call: Callable[[], T]) -> T:
         """Call a function in a thread when a place is free; no thread is held meanwhile."""
         who = asker.get()
         wanted = self._wanted(who)
@@ -100,7 +91,7 @@ class Limiter:
         with place.used():
             token = self.place.set(place)
             try:
-                return await in_thread(partial(function, *args, **kwargs))
+                return await in_thread(call)
             finally:
                 self.place.reset(token)
 
@@ -129,21 +120,16 @@ class Limiter:
             self._give()
 
     def _give(self) -> None:
-        self._waiting = [one for one in self._waiting if not one[1].cancelled()]
-        while able := [one for one in self._waiting if self._may_have_another(one[0])]:
-            chosen = min(able, key=lambda one: (self._held[one[0]], self._served.get(one[0], 0)))
-            who, wanted = chosen
-            self._waiting.remove(chosen)
+        waiting = [one for one in self._waiting if not one[1].cancelled()]
+        while able := [one for one in waiting if self._held[one[0]] < min(self._each, self._free)]:
+            who, wanted = chosen = min(able, key=lambda one: self._held[one[0]])
+            waiting.remove(chosen)
+            waiting.sort(key=lambda one: one[0] == who)  # the others come first
             if wanted.set_running_or_notify_cancel():
                 self._free -= 1
                 self._held[who] += 1
-                self._served[who] = max(self._served.values(), default=0) + 1
                 wanted.set_result(Place(partial(self._release, who)))
-        known = {one for one, _ in self._waiting} | set(+self._held)
-        self._served = {one: when for one, when in self._served.items() if one in known}
-
-    def _may_have_another(self, who: str) -> bool:
-        return self._held[who] < min(self._each, self._free)
+        self._waiting, self._held = waiting, +self._held
 
 
 async def in_thread(call: Callable[[], T]) -> T:

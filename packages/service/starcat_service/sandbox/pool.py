@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
@@ -213,7 +214,7 @@ class QueryPool:
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function in a thread, when a place is free for it."""
-        return await self._limiter.run(self._limits.time_s, function, *args, **kwargs)
+        return await self._limiter.run(self._limits.time_s, partial(function, *args, **kwargs))
 
     @contextmanager
     def session(

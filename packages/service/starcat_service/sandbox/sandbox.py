@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -48,7 +49,7 @@ class Sandbox:
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function that has tasks done in a thread, when there is a place for it."""
-        return await self._limiter.run(WAIT_S, function, *args, **kwargs)
+        return await self._limiter.run(WAIT_S, partial(function, *args, **kwargs))
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Have a task of `starcat_service.sandbox.worker.TASKS` done; its error is raised here."""
