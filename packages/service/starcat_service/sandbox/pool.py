@@ -141,25 +141,26 @@ class Pool(Generic[K, ProcessT]):
                         threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
                     self._changed.wait()
             finally:
-                self._wanted[key] -= 1
+                self._wanted -= Counter((key,))
                 if not self._wanted[key]:
-                    del self._wanted[key]
                     self._failed.pop(key, None)
             self._lent.append(found)
             return found
 
     def _begin_one(self, key: K) -> None:
+        made: Lent[K, ProcessT] | BaseException
         try:
             with ExitStack() as closing:
                 made = key, closing.enter_context(self._begin(key)), closing.pop_all()
         except BaseException as error:
-            with self._changed:
-                self._beginning[key] -= 1
-                self._failed.setdefault(key, []).append(error)
-                self._changed.notify_all()
-            return
+            made = error
         with self._changed:
-            self._beginning[key] -= 1
+            self._beginning -= Counter((key,))
+            if isinstance(made, BaseException):
+                if self._wanted[key]:
+                    self._failed.setdefault(key, []).append(made)
+                self._changed.notify_all()
+                return
         self._keep(made, True)
 
     def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
@@ -177,7 +178,7 @@ class Pool(Generic[K, ProcessT]):
         with self._changed:
             if is_reusable:
                 self._idle.append(lent)
-            most = 0 if self._is_closed else self._max_idle + self._wanted[lent[0]]
+            most = self._wanted[lent[0]] + (0 if self._is_closed else self._max_idle)
             while len(self._idle) > most:
                 gone.append(self._idle.pop(0))
             self._changed.notify_all()
