@@ -270,3 +270,7 @@ class QueryLimitError(QueryError):
     """A query that was stopped: it took too long, or more memory than it may."""
 
     exit_code = 1
+
+
+class AnswerTooLarge(QueryLimitError):  # noqa: N818 - the name reads as the fact
+    """The answer of a query is larger than it may be."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.errors import ConfigError
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine
-from starcat.query.frames import MalformedMessage
+from starcat.workers.messages import MalformedMessage
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped, unused-ignore]

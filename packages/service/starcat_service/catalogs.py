@@ -10,7 +10,7 @@ import hashlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -31,6 +31,7 @@ from starcat.storage.digests import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files
 from starcat_service.problems import Problem
+from starcat_service.sandbox.limiter import Limiter, asker
 
 T = TypeVar("T")
 
@@ -89,7 +90,7 @@ class Catalogs:
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
         self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
-        self._slots = threading.Semaphore(AT_ONCE)
+        self._limiter = Limiter(AT_ONCE, AT_ONCE)
         self._lock = threading.RLock()
         self._underway: dict[str, Future[CatalogSnapshot]] = {}
         # One at a time: a catalog takes memory.
@@ -213,12 +214,12 @@ class Catalogs:
 
     @contextmanager
     def _slot(self) -> Iterator[None]:
-        if not self._slots.acquire(timeout=self._wait_s):
-            raise _busy("too many estimates are being made", 1)
-        try:
+        with ExitStack() as held:
+            try:
+                held.enter_context(self._limiter.held(asker.get(), self._wait_s))
+            except Problem:
+                raise _busy("too many estimates are being made", 1) from None
             yield
-        finally:
-            self._slots.release()
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:

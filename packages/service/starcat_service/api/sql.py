@@ -10,9 +10,8 @@ from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.errors import QueryError
+from starcat.errors import AnswerTooLarge, QueryError
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.engine import AnswerTooLarge
 from starcat.query.gallery import gallery, macros, named_query
 from starcat.query.result import ResultTable
 from starcat.query.targets import View

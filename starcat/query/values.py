@@ -1,34 +1,21 @@
-"""Messages between a session and the process that runs its queries, as bytes.
+"""Values of queries as JSON can hold them, and rows of values as the content of a message.
 
-A message is one letter for its kind, the length of its content, and the content: JSON, or an Arrow
-stream. Nothing in it can make the reader run code, and the reader refuses what is longer than it
-allows before it takes memory for it. JSON has no dates, decimals, bytes or tuples. A value of such
-a type is a JSON list with the name of its type first, and so is a list; numbers, texts, truth
-values and null are themselves.
+JSON has no dates, decimals, bytes or tuples. A value of such a type is a JSON list with the name of
+its type first, and so is a list; numbers, texts, truth values and null are themselves.
 """
 
 from __future__ import annotations
 
 import base64
 import datetime as dt
-import json
-import os
-import select
 import struct
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from itertools import chain
-from typing import IO, Any
+from typing import Any
 
-from starcat.errors import QueryError
-
-HEAD = struct.Struct(">cQ")
-"""Kind and length of a message."""
-
-READ_BYTES = 1 << 16
-LOOK_S = 0.5
-"""Seconds after which a reader that waits looks whether the writer is still running."""
+from starcat.workers.messages import MalformedMessage, from_json, json_content, malformed
 
 _PLAIN = {bool, int, float, str, type(None)}
 _BETWEEN = "\n"
@@ -37,102 +24,7 @@ _INTEGERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "UTINYINT", "USMALLINT"
 _CODES = {"DOUBLE": "d", "FLOAT": "d", "BOOLEAN": "?", **dict.fromkeys(_INTEGERS, "q")}
 """How `struct` packs the values of a column, by DuckDB's type."""
 
-_JSON = json.JSONEncoder(separators=(",", ":"))
 _SIZES = {"d": 8, "q": 8, "?": 1}
-
-
-class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact
-    """A process sent bytes that are not a message, or a message that is too long."""
-
-
-def write_message(stream: IO[bytes], kind: str, content: bytes, *, more: bool = False) -> None:
-    """Write a message; if more follow, it may wait for them."""
-    stream.write(HEAD.pack(kind.encode(), len(content)))
-    stream.write(content)
-    if not more:
-        stream.flush()
-
-
-def read_message(stream: IO[bytes]) -> tuple[str, bytes]:
-    """Read a message of a writer that is trusted; EOFError if there is none."""
-    kind, size = HEAD.unpack(_exactly(stream, HEAD.size))
-    return kind.decode(), _exactly(stream, size)
-
-
-def _exactly(stream: IO[bytes], size: int) -> bytes:
-    found = stream.read(size)
-    if len(found) < size:
-        raise EOFError
-    return found
-
-
-class Receiver:
-    """Messages of a process that is not trusted.
-
-    Memory is taken only for bytes that arrived. ``is_over`` says that nothing of the process is on
-    its way any more: another process that it started may keep the pipe open.
-    """
-
-    def __init__(self, stream: IO[bytes], max_bytes: int, is_over: Callable[[], bool]) -> None:
-        self._descriptor = stream.fileno()
-        self._max_bytes = max_bytes
-        self._is_over = is_over
-        self._arrived = bytearray()
-
-    def receive(self) -> tuple[str, bytes | bytearray]:
-        """Return kind and content of the next message; EOFError if there is none."""
-        self._read(self._arrived, HEAD.size, READ_BYTES)
-        kind, size = HEAD.unpack_from(self._arrived)
-        if size > self._max_bytes:
-            raise MalformedMessage(
-                f"the process of the query sent a message of {size:,} bytes, and at most "
-                f"{self._max_bytes:,} are read; it was ended. Ask again"
-            )
-        content = self._arrived[HEAD.size : HEAD.size + size]
-        del self._arrived[: HEAD.size + len(content)]
-        self._read(content, size, size)
-        return kind.decode("latin-1"), content
-
-    def _read(self, found: bytearray, least: int, most: int) -> None:
-        """Read until there are enough bytes, and not more than the most."""
-        while len(found) < least:
-            # On Windows pipes cannot be waited for in this way.
-            if os.name != "posix" or select.select([self._descriptor], [], [], LOOK_S)[0]:
-                part = os.read(self._descriptor, min(READ_BYTES, most - len(found)))
-                if not part:
-                    raise EOFError
-                found += part
-            if len(found) < least and self._is_over():
-                raise EOFError
-
-
-def send_message(stream: IO[bytes], kind: str, content: bytes, is_over: Callable[[], bool]) -> None:
-    """Send a message to a process that is not trusted, and may not read it; OSError if it ended."""
-    if os.name != "posix":
-        write_message(stream, kind, content)
-        return
-    left = memoryview(HEAD.pack(kind.encode(), len(content)) + content)
-    os.set_blocking(stream.fileno(), False)
-    while left:
-        try:
-            left = left[os.write(stream.fileno(), left) :]
-        except BlockingIOError:
-            select.select([], [stream], [], LOOK_S)
-            if is_over():
-                raise BrokenPipeError from None
-
-
-def json_content(found: Any) -> bytes:
-    """Return plain values as the content of a message."""
-    return _JSON.encode(found).encode()
-
-
-def from_json(content: bytes | bytearray) -> Any:
-    """Return the plain values of a message; MalformedMessage if it is not JSON."""
-    try:
-        return json.loads(str(content, "utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise _malformed(error) from error
 
 
 def encoded(value: Any) -> Any:
@@ -162,7 +54,7 @@ def decoded(value: Any) -> Any:
     except MalformedMessage:
         raise
     except Exception as error:  # whatever wrong parts lead to
-        raise _malformed(error) from error
+        raise malformed(error) from error
 
 
 def encoded_rows(rows: Sequence[Sequence[Any]], types: Sequence[str]) -> bytes:
@@ -199,7 +91,7 @@ def decoded_rows(content: bytes | bytearray) -> list[tuple[Any, ...]]:
     except MalformedMessage:
         raise
     except Exception as error:  # whatever wrong parts lead to
-        raise _malformed(error) from error
+        raise malformed(error) from error
 
 
 def _encoded_column(column: Sequence[Any], kind: str, packed: list[bytes]) -> list[Any]:
@@ -235,13 +127,6 @@ def _decoded_column(column: Any, packed: Iterator[memoryview]) -> Sequence[Any]:
         for k in rest[0]:
             values[k] = None
     return values
-
-
-def _malformed(error: Exception) -> MalformedMessage:
-    return MalformedMessage(
-        f"the process of the query sent data that cannot be read ({type(error).__name__}), and was "
-        "ended; ask again"
-    )
 
 
 def _items(values: Iterable[Any]) -> tuple[list[Any]]:
