@@ -390,6 +390,6 @@ def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
     found = []
     for one in service.catalogs.offered():
-        told = one.source.identifier if one.is_here else "its files are not here"
-        found.append((one.source.name, f"{one.source.name} – {told}"))
+        told = data_source(one.name).identifier if one.is_here else "its files are not here"
+        found.append((one.name, f"{one.name} – {told}"))
     return found
