@@ -19,7 +19,7 @@ from starcat.query.targets import View
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import chunks_of, scratch_folder, write_rows
+from starcat_service.transfers import open_attachment, scratch_folder, write_rows
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -126,12 +126,7 @@ def result_file(
         ):
             count, is_cut = write_rows(running.batches(), source, query.max_rows)
         service.sandbox.convert(source, target, form)
-        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
-    headers = {
-        "Content-Length": str(size),
-        "Content-Disposition": f'attachment; filename="{stem}{FORMATS[form].suffix}"',
-    }
-    answer = StreamingResponse(chunks, media_type=FORMATS[form].media_type, headers=headers)
+        answer = open_attachment(target, f"{stem}{FORMATS[form].suffix}", FORMATS[form].media_type)
     return answer, count, is_cut
 
 
@@ -153,7 +148,7 @@ def result_file(
 )
 async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
     """Run an SQL query on databases and catalogs; nothing is ever written."""
-    asked = _checked(service, question)
+    asked = query_of(service, question)
     if question.format == "rows":
         return await service.query_pool.run(_rows, service, asked)
     return await service.query_pool.run(_file, service, asked, question.format)
@@ -184,8 +179,8 @@ async def views(
     return await service.query_pool.run(_views, service, target)
 
 
-def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
-    """Return what is asked, within the limits that the operator set."""
+def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
+    """Return the query of a question, within the limits that the operator set."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
     settings = service.settings
