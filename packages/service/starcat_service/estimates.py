@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from starcat.errors import error_of_kind
+from starcat.errors import BuildError, error_of_kind
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.estimate import Estimate
@@ -40,7 +40,7 @@ TICK_S = 3600.0
 THREADS = 40
 """Requests that the process works on or keeps waiting at the same time, as the server does."""
 
-_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected", "refusals")
+_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected")
 
 
 class ChildCatalogs(Catalogs):
@@ -79,7 +79,7 @@ class ChildCatalogs(Catalogs):
             full_share=found["full_share"],
             filters=tuple((name, stars) for name, stars in found["filters"]),
             rejected=found["rejected"],
-            refusals=tuple(found["refusals"]),
+            refusals=tuple(BuildError(words, key=key) for words, key in found["refusals"]),
             warnings=tuple(found["warnings"]),
         )
 
@@ -229,6 +229,7 @@ def _estimate(catalogs: Catalogs, spec: dict[str, Any]) -> dict[str, Any]:
     found = catalogs.estimate(spec_from_dict(spec, "spec"))
     return {
         **{name: getattr(found, name) for name in (*_SIMPLE, "warnings")},
+        "refusals": [(str(error), error.key) for error in found.refusals],
         "cost": asdict(found.cost),
         "coverage": asdict(found.coverage),
         "counts": found.fields.count,

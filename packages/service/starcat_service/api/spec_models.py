@@ -194,7 +194,7 @@ def estimate_answer(found: Estimate) -> EstimateAnswer:
         memory_bytes=cost.memory_bytes,
         read_seconds=round(found.read_seconds, 2),
         build_seconds=round(found.build_seconds, 2),
-        refusals=list(found.refusals),
+        refusals=list(map(str, found.refusals)),
         warnings=list(found.warnings),
         in_words=cost.in_words,
     )

@@ -117,6 +117,12 @@ class Draft:
                 found.setdefault(key, words)
         return found
 
+    def field_of(self, key: str | None) -> str | None:
+        """Return the field of a key, or the first field of a section; None if there is none."""
+        if not key:
+            return None
+        return next((name for name in self.values if f"{name}.".startswith(f"{key}.")), None)
+
     def _beside(self, error: ConfigError) -> dict[str, str]:
         key = error.key or ""
         named = [name for name in (*self.values, FILE) if name == key]
