@@ -68,7 +68,7 @@ def error_of_kind(
     found = globals().get(kind)
     if not (isinstance(found, type) and issubclass(found, StarcatError)):
         return None
-    if issubclass(found, ConfigError):
+    if issubclass(found, ConfigError | BuildError):
         return found(words, key=key, fields=tuple(fields))
     return None if issubclass(found, OnboardSizeError) else found(words, fields=tuple(fields))
 
@@ -173,6 +173,7 @@ class DownloadError(SourceError):
 class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
+    key: str | None = None  # the key of the spec to change
     built: object = None  # after a self-test: `starcat.pipeline.build.Built`, its folder gone
 
 

@@ -231,13 +231,15 @@ def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = Non
     if limit is None or cost.memory_bytes <= limit:
         return
     largest = max(cost.bytes, key=lambda name: cost.bytes[name], default="")
-    key = f"products.{largest}.enabled = false"
+    key, saves = "selection.max_stars_per_field", f"products.{largest}.enabled = false"
     if largest in ("", "triangles"):
-        key = f"a smaller boresights.brightest than {spec.boresights.brightest}"
+        key = "boresights.brightest"
+        saves = f"a smaller boresights.brightest than {spec.boresights.brightest}"
     raise BuildError(
         f"{spec.name}: the build would take about {cost.memory_bytes / GIB:.1f} GiB of memory, "
-        f"more than {whose}, {limit / GIB:.1f} GiB; {key} saves most, and fewer stars "
-        "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything"
+        f"more than {whose}, {limit / GIB:.1f} GiB; {saves} saves most, and fewer stars "
+        "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything",
+        key=key,
     )
 
 

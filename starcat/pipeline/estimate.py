@@ -115,7 +115,8 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
         raise BuildError(
             f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
             f"{found:,.0f} stars, limit {MOST_FIELD_STARS:,}; use a smaller boresights.count or "
-            "products.levels.stars_per_field, or a larger products.levels.max_ratio"
+            "products.levels.stars_per_field, or a larger products.levels.max_ratio",
+            key="boresights.count",
         )
 
 
@@ -134,7 +135,7 @@ class Estimate:
     full_share: float
     filters: tuple[tuple[str, int], ...]  # the stars that each filter leaves
     rejected: Mapping[str, int]  # all other records, by reason
-    refusals: tuple[str, ...]  # why the build will be refused; empty where it will not
+    refusals: tuple[BuildError, ...]  # why the build will be refused; empty where it will not
     warnings: tuple[str, ...]  # what is worth a second look
 
     @property
@@ -177,7 +178,7 @@ def estimate(
         try:
             check()
         except BuildError as error:
-            refusals.append(str(error))
+            refusals.append(error)
     count = fields.count
     gap = _gap(spec)
     summary = summarise_coverage(field_coverage(fields, spec.boresights.brightest))

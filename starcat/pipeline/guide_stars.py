@@ -132,7 +132,8 @@ def check_tiling(
         raise BuildError(
             f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
-            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
+            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count",
+            key="selection.max_stars_per_field",
         )
 
 
@@ -147,7 +148,8 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
-            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}"
+            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}",
+            key="selection.faint_limit_mag",
         )
 
 
@@ -183,5 +185,6 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
     raise BuildError(
         f"{spec.name}: {len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
         f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}. A fainter "
-        "faint_limit_mag or a wider camera gives more stars a field"
+        "faint_limit_mag or a wider camera gives more stars a field",
+        key="boresights.min_stars_per_field",
     )

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pydantic import Field
 
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
@@ -82,8 +83,8 @@ class LimitRow:
     """What a magnitude limit leaves in the fields of the tiling."""
 
     faint_limit_mag: float
-    guide_stars: int  # stars of the whole sky that pass the selection
-    stars: Spread  # how the stars are spread over the fields
+    guide_stars: Annotated[int, Field(description="Stars of the sky that pass the selection.")]
+    stars: Annotated[Spread, Field(description="How the stars are spread over the fields.")]
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from cachetools import LRUCache
+from pydantic import BaseModel, Field
 
 from starcat.catalog.parts import CATALOGS
-from starcat.catalog.source import DataSource, data_source, star_sources
+from starcat.catalog.source import data_source, star_sources
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
@@ -56,23 +57,34 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CatalogRead:
-    """What is known of a catalog that was read."""
+    """A catalog as it was read for an estimate."""
 
-    source: str
-    band: str
-    epoch_jyear: float  # its stars were moved to this Julian year
-    stars: int  # that can be chosen from
-    brightest_mag: float | None  # of the stars that have a magnitude
-    faintest_mag: float | None
+    source: Annotated[str, Field(exclude=True)]
+    band: Annotated[str, Field(description="Of the magnitudes.", examples=["G"])]
+    epoch_jyear: Annotated[float, Field(description="Julian year that the stars were moved to.")]
+    stars: Annotated[int, Field(description="Stars that can be chosen from.")]
+    brightest_mag: Annotated[float | None, Field(description="Of the stars with a magnitude.")]
+    faintest_mag: Annotated[float | None, Field(description="Of the stars with a magnitude.")]
 
 
-@dataclass(frozen=True)
-class Offered:
+class Offered(BaseModel):
     """A catalog that a spec may name."""
 
-    source: DataSource  # what it is
-    is_here: bool  # whether its files are
-    read: tuple[CatalogRead, ...]  # what is known of it where it was read
+    name: str = Field(description="For ``catalog.source``.", examples=["gaia"])
+    title: str = Field(examples=["The Hipparcos Catalogue, main file"])
+    is_here: bool = Field(description="Whether its files are, so that a build can read it.")
+    bands: tuple[str, ...] = Field(
+        description="For ``catalog.band``, the default first.", examples=[["V", "Hp"]]
+    )
+    epoch_jyear: float | None = Field(
+        None, description="Of the positions in its files, where all have the same."
+    )
+    frame: str = Field(description="Axes of the positions in its files.", examples=["ICRS"])
+    records: int | None = Field(None, description="Records of the whole archive.")
+    citation: str = Field(description="How to cite it.")
+    licence: str = Field(description="Terms that it comes under.")
+    read: tuple[CatalogRead, ...] = Field(description="Figures known from earlier estimates.")
+    hint: str | None = Field(None, description="What to do where it is not here.")
 
 
 class Catalogs:
@@ -101,7 +113,7 @@ class Catalogs:
         known, found = self.known(), []
         for name in (*CATALOGS, *filter(is_here, set(star_sources()) - set(CATALOGS))):
             read = tuple(one for one in known if one.source == name)
-            found.append(Offered(data_source(name), is_here(name), read))
+            found.append(_offered(name, read))
         return sorted(found, key=lambda one: not one.is_here)
 
     def known(self) -> list[CatalogRead]:
@@ -240,6 +252,27 @@ def is_here(name: str) -> bool:
         return bool(locate(name, {}))
     except SourceMissing:
         return False
+
+
+def _offered(name: str, read: tuple[CatalogRead, ...]) -> Offered:
+    source, is_found = data_source(name), is_here(name)
+    hint = (
+        f"the operator can get it with 'starcat fetch {name}', or set $STARCAT_CATALOGS to the "
+        "folder that has its files"
+    )
+    return Offered(
+        name=name,
+        title=source.title,
+        is_here=is_found,
+        bands=source.bands,
+        epoch_jyear=source.epoch_jyear,
+        frame=source.frame,
+        records=source.rows,
+        citation=source.citation,
+        licence=source.licence,
+        read=read,
+        hint=None if is_found else hint,
+    )
 
 
 def _check_size(spec: BuildSpec) -> None:

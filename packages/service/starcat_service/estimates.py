@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.estimate import Estimate
@@ -47,7 +48,7 @@ ANSWER_S = 4 * WAIT_S
 THREADS = 40
 """Requests that the process works on or keeps waiting at the same time, as the server does."""
 
-_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected", "refusals")
+_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected")
 
 
 class ChildCatalogs(Catalogs):
@@ -86,7 +87,7 @@ class ChildCatalogs(Catalogs):
             full_share=found["full_share"],
             filters=tuple((name, stars) for name, stars in found["filters"]),
             rejected=found["rejected"],
-            refusals=tuple(found["refusals"]),
+            refusals=tuple(BuildError(words, key=key) for words, key in found["refusals"]),
             warnings=tuple(found["warnings"]),
         )
 
@@ -223,6 +224,7 @@ def _estimate(catalogs: Catalogs, spec: dict[str, Any]) -> dict[str, Any]:
     found = catalogs.estimate(spec_from_dict(spec, "spec"))
     return {
         **{name: getattr(found, name) for name in (*_SIMPLE, "warnings")},
+        "refusals": [(str(error), error.key) for error in found.refusals],
         "cost": asdict(found.cost),
         "coverage": asdict(found.coverage),
         "counts": found.fields.count,

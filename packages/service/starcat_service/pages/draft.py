@@ -21,8 +21,13 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import all_that_is_wrong, content_of_toml, put_key, spec_from_dict
-from starcat_service.pages.naming import followed, value_at
+from starcat.specs.reading import (
+    all_that_is_wrong,
+    content_of_toml,
+    put_key,
+    spec_from_dict,
+    value_at,
+)
 from starcat_service.pages.response import FILE, NAME, keys_of_another, responses_of
 
 ORIGIN = "spec"  # what messages call the text
@@ -112,6 +117,12 @@ class Draft:
                 found.setdefault(key, words)
         return found
 
+    def field_of(self, key: str | None) -> str | None:
+        """Return the field of a key, or the first field of a section; None if there is none."""
+        if not key:
+            return None
+        return next((name for name in self.values if f"{name}.".startswith(f"{key}.")), None)
+
     def _beside(self, error: ConfigError) -> dict[str, str]:
         key = error.key or ""
         named = [name for name in (*self.values, FILE) if name == key]
@@ -159,16 +170,8 @@ def draft_with(draft: Draft, changes: Mapping[str, Any]) -> Draft:
 
 
 def _edited(draft: Draft, edit: _Edit) -> Draft:
-    """Return a draft as it was edited; its name and description follow unless they are somebody's.
-
-    What starcat has called it tells the catalog, the limit and the camera: it would be wrong.
-    """
-    if not edit.changes:
-        return draft
-    for key, value in followed(edit.content).items():
-        if key not in edit.changes:
-            edit.put(key, value)
-    return _draft(edit.content, edit.text(draft.text))
+    """Return a draft with the changes of an edit."""
+    return _draft(edit.content, edit.text(draft.text)) if edit.changes else draft
 
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:

@@ -16,11 +16,10 @@ from starcat.releases.publishing import recorded
 from starcat.simulation.selftest import rates_of
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
+from starcat_service.api.databases import REPORT
 from starcat_service.library import Database
 from starcat_service.service import Service
 
-REPORT = "report/report.json"
-MANIFEST_DIGEST = "manifest_sha256"  # key of a manifest with the digest of all the others
 NOT_LISTED = (Reason.beyond_read_limit.name,)
 """Reasons whose records are counted and not in the product ``rejected``."""
 
