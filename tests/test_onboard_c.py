@@ -293,7 +293,7 @@ def test_tools_find_nothing(folder, target):
 
 def test_every_requirement_has_its_tests(folder, tmp_path):
     """And every function of the unit test a requirement; the bill of materials has every file."""
-    matrix = [sys.executable, "-B", "evidence/matrix.py", str(tmp_path)]
+    matrix = [sys.executable, "-B", "qualification/evidence/matrix.py", str(tmp_path)]
     said = subprocess.run(matrix, cwd=ONBOARD, capture_output=True, text=True, check=True).stdout
     assert said.rstrip().endswith(" 0 missing")
     test = folder / "tests" / "test_unnamed.c"
@@ -303,7 +303,7 @@ def test_every_requirement_has_its_tests(folder, tmp_path):
     for name in ("with.json", "again.json", "without.json"):
         if name == "without.json":
             test.unlink()
-        bill = [sys.executable, "-B", "evidence/sbom.py", str(tmp_path / name)]
+        bill = [sys.executable, "-B", "qualification/evidence/sbom.py", str(tmp_path / name)]
         subprocess.run(bill, cwd=folder, capture_output=True, check=True)
         bills.append((tmp_path / name).read_bytes())
     assert ran.returncode == 1
@@ -324,11 +324,11 @@ def test_the_evidence_is_complete(folder):
 
 def test_every_loop_has_its_longest_count(folder, tmp_path):
     """``loops.md`` has every loop; one that is added to the source is named."""
-    compare = [sys.executable, "-B", "wcet/loops.py"]
+    compare = [sys.executable, "-B", "qualification/wcet/loops.py"]
     said = subprocess.run(compare, cwd=folder, capture_output=True, text=True, check=True).stdout
     assert re.match(r"loops.md has all \d+ loops of the library", said)
     copy = tmp_path / "onboard"
-    for name in ("src", "wcet"):
+    for name in ("src", "qualification"):
         shutil.copytree(folder / name, copy / name)
     source = copy / "src" / "sky.c"
     text = source.read_text(encoding="utf-8")

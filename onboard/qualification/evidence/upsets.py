@@ -19,7 +19,7 @@ from pathlib import Path
 import pages
 
 HERE = Path(__file__).resolve().parent
-ONBOARD = HERE.parent
+ONBOARD = HERE.parents[1]
 OUTCOMES = ["none", "caught", "right", "wrong", "crash"]
 WORDS = [
     "none: the same answer, in every number",

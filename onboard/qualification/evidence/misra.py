@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pages
 
-ONBOARD = Path(__file__).resolve().parent.parent
+ONBOARD = Path(__file__).resolve().parents[2]
 FLAGS = [
     "--std=c99",
     "--enable=warning,style,performance,portability",

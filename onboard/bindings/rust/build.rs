@@ -56,10 +56,10 @@ fn main() {
     let mut folder = here.join("amalgamation"); // of a packed crate
     if !folder.join("starcat.c").exists() {
         folder = out.join("amalgamation");
-        let script = here.join("../amalgamate.sh");
+        let script = here.join("../../amalgamate.sh");
         println!("cargo:rerun-if-changed={}", script.display());
-        println!("cargo:rerun-if-changed={}", here.join("../src").display());
-        println!("cargo:rerun-if-changed={}", here.join("../include").display());
+        println!("cargo:rerun-if-changed={}", here.join("../../src").display());
+        println!("cargo:rerun-if-changed={}", here.join("../../include").display());
         run(Command::new("sh").arg(script).arg(&folder));
     }
 
@@ -103,7 +103,7 @@ fn main() {
     .unwrap();
 
     // The made-up sky that the tests look at.
-    let sky = here.join("../tests/random_sky.c");
+    let sky = here.join("../../tests/random_sky.c");
     if sky.exists() {
         let made = archive(&out, "sky", &[sky], &flags);
         println!("cargo:rustc-link-arg-tests={}", made.display());

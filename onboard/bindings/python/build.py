@@ -18,7 +18,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ONBOARD = ROOT / "onboard"
 MODULE = "starcat.matcher._onboard"
 DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
@@ -110,13 +110,17 @@ def compile_binding() -> Path:
 
     ffi = FFI()
     # The parser of cffi knows no #include: the few lines of the headers that Python uses.
-    ffi.cdef((ONBOARD / "python" / "binding.h").read_text(encoding="utf-8"))
-    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "python" / "many.c"]
+    ffi.cdef((ONBOARD / "bindings" / "python" / "binding.h").read_text(encoding="utf-8"))
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
     ffi.set_source(
         MODULE,
         '#include "many.h"',
         sources=[str(source) for source in sources],
-        include_dirs=[str(ONBOARD / "include"), str(ONBOARD / "src"), str(ONBOARD / "python")],
+        include_dirs=[
+            str(ONBOARD / "include"),
+            str(ONBOARD / "src"),
+            str(ONBOARD / "bindings" / "python"),
+        ],
         define_macros=list(DEFINED.items()),
         extra_compile_args=[] if sys.platform == "win32" else ["-O3", "-std=gnu99"],
         py_limited_api=True,

@@ -18,7 +18,7 @@ from pathlib import Path
 import pages
 
 HERE = Path(__file__).resolve().parent
-ONBOARD = HERE.parent
+ONBOARD = HERE.parents[1]
 RUNS = [
     ("start", [], ["image.c", "frame.c"]),
     *(("open", [f"-DBLOCKS={n}u"], ["image.c", "frame.c"]) for n in (1, 2, 15, 1022, 1023)),
@@ -43,7 +43,7 @@ SEMANTICS = ["-machdep", "gcc_x86_64", "-warn-special-float", "none"]
 def prove(name: str, defines: list[str], sources: list[str]) -> tuple[list[str], list[str]]:
     """Run Eva; return what it said in all, and what is wrong."""
     flags = " ".join(["-Iinclude", "-Isrc", "-Ievidence/proofs", *defines])
-    files = [f"evidence/proofs/{name}.c", *(f"src/{source}" for source in sources)]
+    files = [f"qualification/evidence/proofs/{name}.c", *(f"src/{source}" for source in sources)]
     command = ["frama-c", f"-cpp-extra-args={flags}", *files, *SEMANTICS, *OPTIONS]
     done = subprocess.run(command, cwd=ONBOARD, capture_output=True, text=True, check=False)
     said = done.stdout + done.stderr

@@ -17,7 +17,7 @@ from pathlib import Path
 import pages
 
 HERE = Path(__file__).resolve().parent
-ONBOARD = HERE.parent
+ONBOARD = HERE.parents[1]
 FUNCTION = re.compile(r"^(?:static )?void ((?:test|check)_\w+)\(", re.MULTILINE)
 
 

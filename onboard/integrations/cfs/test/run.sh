@@ -4,7 +4,7 @@
 #   CFS    archive of cFS; BUILD: folder to build in; HERE: onboard/; PYTHON: for the ICD
 set -eu
 out=$(mkdir -p "$BUILD/cfs" && cd "$BUILD/cfs" && pwd)
-here=$HERE/cfs
+here=$HERE/integrations/cfs
 if [ ! -f "$out/cfs/cfe/CMakeLists.txt" ]; then
   tar xf "$CFS" -C "$out"
 fi

@@ -25,7 +25,7 @@ step size "Code, stack, workspace"
 step sbom "Bill of materials"
 cp MANUAL.md README.md "$out"
 echo
-python3 evidence/index.py "$out"
+python3 qualification/evidence/index.py "$out"
 status=$?
 echo "evidence: $out/index.html"
 exit $status

@@ -5,7 +5,7 @@
 # whose Cortex-M4F has the same addresses in qemu; those of RISC-V are picolibc's.
 set -eu
 out=$BUILD/wcet
-here=wcet
+here=qualification/wcet
 m4f=examples/cortex-m
 mkdir -p "$out"
 $CC $FLAGS -Itests $here/images.c tests/random_sky.c src/*.c -lm -o "$out/images"

@@ -3,7 +3,7 @@
 # that they do not execute; fails if there is one. Called by `make cfs-coverage`; see run.sh.
 set -eu
 out=$(mkdir -p "$BUILD/cfs" && cd "$BUILD/cfs" && pwd)
-here=$HERE/cfs
+here=$HERE/integrations/cfs
 [ -f "$out/cfs/cfe/CMakeLists.txt" ] || tar xf "$CFS" -C "$out"
 cd "$out/cfs"
 rm -rf starcat_unit_defs && cp -r sample_defs starcat_unit_defs

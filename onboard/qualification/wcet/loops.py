@@ -10,8 +10,8 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-HERE = Path(__file__).parent
-SOURCE = HERE.parent / "src"
+HERE = Path(__file__).resolve().parent
+SOURCE = HERE.parents[1] / "src"
 TABLE = HERE / "loops.md"
 FUNCTION = re.compile(r"^[A-Za-z_][^;{}#=]*?\b(\w+)\([^;{}]*\)\s*\{", re.MULTILINE)
 LOOP = re.compile(r"\b(?:for|while) ?\(")

@@ -17,7 +17,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-ONBOARD = Path(__file__).resolve().parent.parent
+ONBOARD = Path(__file__).resolve().parents[2]
 NOT_OURS = {"build", "target", "__pycache__"}
 
 

@@ -15,7 +15,7 @@
  */
 #include "proof.h"
 
-#include "../../src/sky.c"
+#include "../../../src/sky.c"
 
 #define STARS 30u
 #define BANDS 12u

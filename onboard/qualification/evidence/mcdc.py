@@ -18,7 +18,7 @@ from pathlib import Path
 import pages
 
 HERE = Path(__file__).resolve().parent
-ONBOARD = HERE.parent
+ONBOARD = HERE.parents[1]
 LEAST_PERCENT = 98.0
 FLAGS = [
     "-O1",

@@ -95,7 +95,7 @@ def read_headers() -> Headers:
             count = 0 if length is None else constants.get(length) or int(length)
             members.append(Member(kind, member, count, said))
         structures[name] = members
-    library = (FOLDER.parent / "include" / "starcat.h").read_text(encoding="utf-8")
+    library = (FOLDER.parents[1] / "include" / "starcat.h").read_text(encoding="utf-8")
     enumerations = {}
     for body, name in re.findall(r"typedef enum \{(.*?)\} starcat_(\w+);", library, re.DOTALL):
         pairs = re.findall(r"STARCAT_(\w+) = (-?\d+)", body)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pages
 
-ONBOARD = Path(__file__).resolve().parent.parent
+ONBOARD = Path(__file__).resolve().parents[2]
 
 
 def main(folder: Path, compilers: list[str], flags: list[str]) -> int:
