@@ -266,6 +266,17 @@ def test_callers_of_other_configurations_do_not_link(folder):
     assert "3 callers of other configurations do not link, 5 flags do not compile" in said
 
 
+def test_no_file_calls_back_into_one_that_needs_it(folder, tmp_path):
+    assert "none leads back" in make(folder, "cycles", "BUILD=build-cycles")
+    copy = tmp_path / "onboard"
+    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("build*"))
+    with (copy / "src" / "budget.c").open("a", encoding="utf-8") as file:
+        file.write("int back(starcat_call *call) { return starcat_try(call, 0, 1); }\n")
+    ran = subprocess.run(["make", "-s", "cycles"], cwd=copy, capture_output=True, text=True)
+    assert ran.returncode != 0
+    assert "need each other in a circle" in ran.stdout
+
+
 def test_every_deviation_from_misra_is_explained():
     text = (ONBOARD / "tests" / "cppcheck.txt").read_text()
     suppressed = re.findall(r"^misra-c2012-(\S+)|^(\w+):", text, re.MULTILINE)

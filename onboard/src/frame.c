@@ -9,13 +9,6 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-/* The exponent's part of a number's first two bytes: all set where it is infinite or not one. */
-#ifdef STARCAT_SINGLE
-#define EXPONENT 0x7f80u
-#else
-#define EXPONENT 0x7ff0u
-#endif
-
 void starcat_default_options(starcat_options *options) {
   options->tolerance_px = R(2.0);
   options->noise_px = R(0.0);
@@ -23,25 +16,6 @@ void starcat_default_options(starcat_options *options) {
   options->log_chance = LOG_CERTAIN;
   options->fov_error = R(0.0);
   options->max_steps = 4000000u;
-}
-
-/* Whether a number is finite, by its exponent: where what is not a number is compared or subtracted,
- * a processor may trap. */
-static int is_finite(const real *number) {
-  const uint8_t *bytes = (const uint8_t *)(const void *)number;
-  const uint16_t one = 1;
-  const size_t is_little = *(const uint8_t *)(const void *)&one;
-  const uint32_t first = bytes[is_little * (sizeof(real) - 1u)];
-  const uint32_t second = bytes[1u + is_little * (sizeof(real) - 3u)];
-  return ((first << 8 | second) & EXPONENT) != EXPONENT;
-}
-
-int starcat_are_finite(const real *numbers, uint32_t count) {
-  int finite = 1;
-  for (uint32_t n = 0; n < count; n++) {
-    finite &= is_finite(numbers + n);
-  }
-  return finite;
 }
 
 static starcat_status check_options(const starcat_options *o) {
@@ -102,12 +76,12 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
   for (uint32_t i = 0; i < frame->count; i++) {
     const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
-    if (!is_finite(x) || !is_finite(y)) {
+    if (!starcat_is_finite(x) || !starcat_is_finite(y)) {
       result->star[i] = STARCAT_DROPPED_NOT_FINITE;
     } else if ((*x < R(0.0)) || (*x >= camera->width_px) || (*y < R(0.0)) ||
                (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
-    } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes + i)) {
+    } else if ((frame->magnitudes != NULL) && starcat_is_finite(frame->magnitudes + i)) {
       call->own->has_magnitudes = 1;
     }
   }
@@ -133,6 +107,26 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
     }
   }
   call->own->count = kept;
+}
+
+/* List the usable centroids by the column of the detector that they are in. */
+void starcat_list_columns(starcat_call *call) {
+  starcat_workspace *w = call->work;
+  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
+  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
+    w->column[n] = 0;
+  }
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    w->column[starcat_column_of(call, w->x[i])]++;
+  }
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
+    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
+  }
+  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
+    const uint32_t n = starcat_column_of(call, w->x[i - 1u]);
+    w->column[n]--;
+    w->in_column[starcat_below(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
+  }
 }
 
 static void set_limits(starcat_call *call, const starcat_options *options) {
@@ -206,13 +200,13 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
   call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
-    if ((frame->sigma_px != NULL) && is_finite(frame->sigma_px + i) &&
+    if ((frame->sigma_px != NULL) && starcat_is_finite(frame->sigma_px + i) &&
         !starcat_is_between(frame->sigma_px[i], STARCAT_LEAST_PX, STARCAT_LARGEST_PX)) {
       return STARCAT_E_OPTIONS;
     }
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
-          (call->own->has_magnitudes != 0u) && is_finite(frame->magnitudes + i);
+          (call->own->has_magnitudes != 0u) && starcat_is_finite(frame->magnitudes + i);
       insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }

@@ -136,6 +136,15 @@ static inline uint32_t starcat_match(const starcat_workspace *w, uint32_t centro
   return starcat_below((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
 }
 
+/* The column of the detector that a place is in; the first or the last one outside of it. */
+static inline uint32_t starcat_column_of(const starcat_call *call, real x_px) {
+  const real scaled = x_px * call->columns_per_px;
+  if (!(scaled > R(0.0))) {
+    return 0;
+  }
+  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
+}
+
 /* The direction of a star. */
 static inline void starcat_star(const starcat_image *image, uint32_t row, real icrs[3]) {
   const int32_t *direction = image->directions + 3u * (size_t)row;
@@ -166,8 +175,14 @@ uint32_t starcat_crc32(uint32_t crc, const uint8_t *bytes, size_t count);
 int starcat_is_sound(const uint8_t *check_block);
 int starcat_block_is_sound(const uint8_t *image, uint32_t data_bytes, uint32_t block);
 
-/* frame.c */
+/* numbers.c */
+int starcat_is_finite(const real *number);
 int starcat_are_finite(const real *numbers, uint32_t count);
+real starcat_log_factorial(uint32_t n);
+real starcat_exponential(real x);
+
+/* budget.c */
+int starcat_spend(const starcat_call *call, uint32_t steps);
 
 /* attitude.c */
 int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
@@ -192,8 +207,6 @@ uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos
                         uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
-real starcat_log_factorial(uint32_t n);
-real starcat_exponential(real x);
 void starcat_count_ways(const starcat_call *call, uint32_t most);
 real starcat_log_ways(const starcat_call *call, uint32_t n);
 
@@ -205,13 +218,12 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
 int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
-int starcat_spend(const starcat_call *call, uint32_t steps);
 int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 int starcat_try(starcat_call *call, const real m[9], real focal);
 void starcat_project(const starcat_call *call, const real m[9], real margin_px);
-void starcat_list_columns(starcat_call *call);
 
 /* frame.c */
+void starcat_list_columns(starcat_call *call);
 starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
                              const starcat_camera *camera, const starcat_options *options,
                              const starcat_frame *frame, starcat_workspace *work,

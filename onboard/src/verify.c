@@ -8,16 +8,6 @@
 #define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
 
-/* Take steps from what is left of the budget. Returns 0 if it is used up. */
-int starcat_spend(const starcat_call *call, uint32_t steps) {
-  if (steps >= call->own->steps_left) {
-    call->own->steps_left = 0;
-    return 0;
-  }
-  call->own->steps_left -= steps;
-  return 1;
-}
-
 /* Whether a centroid may be a star, by their magnitudes. */
 int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
@@ -50,43 +40,14 @@ void starcat_project(const starcat_call *call, const real m[9], real margin_px) 
   call->own->n_within = count;
 }
 
-/* The column of the detector that a place is in; the first or the last one outside of it. */
-static uint32_t column_of(const starcat_call *call, real x_px) {
-  const real scaled = x_px * call->columns_per_px;
-  if (!(scaled > R(0.0))) {
-    return 0;
-  }
-  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
-}
-
-/* List the centroids by the column of the detector that they are in. */
-void starcat_list_columns(starcat_call *call) {
-  starcat_workspace *w = call->work;
-  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
-  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
-    w->column[n] = 0;
-  }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    w->column[column_of(call, w->x[i])]++;
-  }
-  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
-    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
-  }
-  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
-    const uint32_t n = column_of(call, w->x[i - 1u]);
-    w->column[n]--;
-    w->in_column[starcat_below(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
-  }
-}
-
 /* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
  * them is the nearest to it, and to which it is the nearest so far. */
 static void match_star(const starcat_call *call, uint32_t k, real reach_px, real reach) {
   starcat_workspace *w = call->work;
   const real x = w->x_of[k], y = w->y_of[k];
-  const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
+  const uint32_t stop = w->column[starcat_column_of(call, x + reach_px) + 1u];
   w->nearest[k] = UINT16_MAX;
-  for (uint32_t n = w->column[column_of(call, x - reach_px)];
+  for (uint32_t n = w->column[starcat_column_of(call, x - reach_px)];
        (n < stop) && (n < STARCAT_MAX_CENTROIDS); n++) {
     const uint32_t i = starcat_below(w->in_column[n], STARCAT_MAX_CENTROIDS);
     const real dx = w->x[i] - x, dy = w->y[i] - y;
