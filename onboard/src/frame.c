@@ -9,7 +9,7 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-void starcat_default_options(starcat_options *options) {
+void starcat_set_default_options(starcat_options *options) {
   options->tolerance_px = R(2.0);
   options->noise_px = R(0.0);
   options->noise_mag = R(0.0);
@@ -29,7 +29,7 @@ static starcat_status check_options(const starcat_options *o) {
                           STARCAT_LARGEST_PX)) {
     return STARCAT_E_OPTIONS;
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
 /* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
@@ -47,7 +47,7 @@ static int comes_before(const starcat_call *call, real magnitude, real square, r
 }
 
 /* Put a centroid where it belongs among those that are in order. */
-static void insert(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
+static void insert_centroid(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
   const real square = dx * dx + dy * dy;
@@ -97,7 +97,7 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
       k++;
     }
     if (k < kept) {
-      result->star[starcat_below(w->row[i], call->own->given)] = STARCAT_DROPPED_DUPLICATE;
+      result->star[starcat_limit_place(w->row[i], call->own->given)] = STARCAT_DROPPED_DUPLICATE;
     } else {
       w->row[kept] = w->row[i];
       w->x[kept] = w->x[i];
@@ -117,15 +117,15 @@ void starcat_list_columns(starcat_call *call) {
     w->column[n] = 0;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
-    w->column[starcat_column_of(call, w->x[i])]++;
+    w->column[starcat_find_column(call, w->x[i])]++;
   }
   for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
     w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
   }
   for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
-    const uint32_t n = starcat_column_of(call, w->x[i - 1u]);
+    const uint32_t n = starcat_find_column(call, w->x[i - 1u]);
     w->column[n]--;
-    w->in_column[starcat_below(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
+    w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
   }
 }
 
@@ -150,7 +150,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   }
 }
 
-starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
                              const starcat_camera *camera, const starcat_options *options,
                              const starcat_frame *frame, starcat_workspace *work,
                              starcat_result *result) {
@@ -178,10 +178,10 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     return STARCAT_E_TOO_MANY_CENTROIDS;
   }
   starcat_status status = check_options(options);
-  if (status == STARCAT_IDENTIFIED) {
+  if (status == STARCAT_OK) {
     status = starcat_prepare_camera(camera, &call->camera);
   }
-  if (status != STARCAT_IDENTIFIED) {
+  if (status != STARCAT_OK) {
     return status;
   }
   call->image = image;
@@ -207,14 +207,14 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
           (call->own->has_magnitudes != 0u) && starcat_is_finite(frame->magnitudes + i);
-      insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
+      insert_centroid(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }
   }
   drop_repeats(call, result);
   starcat_list_columns(call);
   for (uint32_t i = 0; i < call->own->count; i++) {
-    if (!starcat_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
+    if (!starcat_find_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
     }
   }
@@ -224,5 +224,5 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }

@@ -17,7 +17,7 @@
 
 /* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
  * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
-static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
+static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
                    uint32_t most) {
   const int is_tight = bound >= 2u;
   real *sums = w->sums[bound];
@@ -58,7 +58,7 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
 }
 
 /* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
-static real filled(uint32_t others, uint32_t n) {
+static real log_filled(uint32_t others, uint32_t n) {
   return (real)(others - n) / (real)others * starcat_log_factorial(others) -
          starcat_log_factorial(others - n);
 }
@@ -74,7 +74,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n) {
       logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
                   (real)n * w->log_largest[bound];
       if (bound >= 2u) {
-        logarithm += filled(bound == 2u ? call->own->n_within : call->own->count, n);
+        logarithm += log_filled(bound == 2u ? call->own->n_within : call->own->count, n);
       }
     }
     least = logarithm < least ? logarithm : least;
@@ -89,7 +89,7 @@ static void count_compatible(const starcat_call *call) {
   const real reach = call->mag_reach;
   uint16_t unknown = 0;
   for (uint32_t j = 0; j < call->own->n_within; j++) {
-    const int16_t stored = call->image->magnitudes[starcat_below(w->near_row[starcat_near(w, j)], call->image->n_stars)];
+    const int16_t stored = call->image->magnitudes[starcat_limit_place(w->near_row[starcat_find_near(w, j)], call->image->n_stars)];
     const int is_known = stored != INT16_MIN;
     w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
     w->nearest[j] = is_known ? 0u : (uint16_t)call->own->count;
@@ -124,9 +124,9 @@ void starcat_count_ways(const starcat_call *call, uint32_t most) {
   }
   if (call->mag_reach > R(0.0)) {
     count_compatible(call);
-    add_up(w, 0, w->compatible, call->own->count, most);
-    add_up(w, 1, w->nearest, stars, most);
-    add_up(w, 2, w->compatible, call->own->count, most);
-    add_up(w, 3, w->nearest, stars, most);
+    sum_polynomials(w, 0, w->compatible, call->own->count, most);
+    sum_polynomials(w, 1, w->nearest, stars, most);
+    sum_polynomials(w, 2, w->compatible, call->own->count, most);
+    sum_polynomials(w, 3, w->nearest, stars, most);
   }
 }

@@ -20,9 +20,11 @@ package Starcat is
    subtype Real is Interfaces.C.double;
 
    subtype Status is Interfaces.C.int;
+   Ok                   : constant Status := 0;
    Identified           : constant Status := 0;
    No_Match             : constant Status := 1;
    Too_Few_Stars        : constant Status := 2;
+   Incomplete           : constant Status := 3;
    E_Null               : constant Status := -1;
    E_Short              : constant Status := -2;
    E_Magic              : constant Status := -3;
@@ -115,29 +117,29 @@ package Starcat is
    function Version_Number return Unsigned_32
      with Import, Convention => C, External_Name => "starcat_version_number";
 
-   function Open
+   function Open_Image
      (Opened : out Image;
       Bytes  : System.Address;
       Size   : Interfaces.C.size_t;
       Flags  : Unsigned_32 := 0) return Status
-     with Import, Convention => C, External_Name => "starcat_open" & Suffix;
+     with Import, Convention => C, External_Name => "starcat_open_image" & Suffix;
 
-   function Scrub
+   function Scrub_Image
      (Bytes        : System.Address;
       Size         : Interfaces.C.size_t;
       First, Count : Unsigned_32;
       Bad_Block    : out Unsigned_32) return Status
-     with Import, Convention => C, External_Name => "starcat_scrub";
+     with Import, Convention => C, External_Name => "starcat_scrub_image";
 
-   procedure Camera_Of (Opened : Image; Built_For : out Camera)
+   procedure Get_Camera (Opened : Image; Built_For : out Camera)
      with Import, Convention => C,
-          External_Name => "starcat_camera_of" & Suffix;
+          External_Name => "starcat_get_camera" & Suffix;
 
-   procedure Default_Options (Given : out Options)
+   procedure Set_Default_Options (Given : out Options)
      with Import, Convention => C,
-          External_Name => "starcat_default_options" & Suffix;
+          External_Name => "starcat_set_default_options" & Suffix;
 
-   function Identify
+   function Identify_Frame
      (Opened : Image;
       Lens   : Camera;
       Given  : Options;
@@ -145,9 +147,9 @@ package Starcat is
       Work   : in out Workspace;
       Found  : in out Result) return Status
      with Import, Convention => C,
-          External_Name => "starcat_identify" & Suffix;
+          External_Name => "starcat_identify_frame" & Suffix;
 
-   function Track
+   function Track_Frame
      (Opened          : Image;
       Lens            : Camera;
       Given           : Options;
@@ -156,14 +158,14 @@ package Starcat is
       Uncertainty_Rad : Real;
       Work            : in out Workspace;
       Found           : in out Result) return Status
-     with Import, Convention => C, External_Name => "starcat_track" & Suffix;
+     with Import, Convention => C, External_Name => "starcat_track_frame" & Suffix;
 
    --  Body_Of and Icrs are the addresses of Count rows of three numbers.
-   function Attitude
+   function Fit_Attitude
      (Body_Of, Icrs    : System.Address;
       Count            : Unsigned_32;
       Q_Body_From_Icrs : out Quaternion) return Status
      with Import, Convention => C,
-          External_Name => "starcat_attitude" & Suffix;
+          External_Name => "starcat_fit_attitude" & Suffix;
 
 end Starcat;

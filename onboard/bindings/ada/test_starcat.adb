@@ -70,15 +70,15 @@ begin
    Check (Result'Size / 8 = Size_Of_Result, "size of a result");
    Check (Image'Size / 8 = Size_Of_Image, "size of an image");
    Check (Version_Number >= 200, "the version");
-   Check (Open (Opened, Bytes'Address, 512) = E_Magic, "zeros are no image");
+   Check (Open_Image (Opened, Bytes'Address, 512) = E_Magic, "zeros are no image");
 
    Size := Sky_Image ((1, 2, 300, 0.42, 8), Bytes'Address);
-   Check (Open (Opened, Bytes'Address, Size) = Identified, "it opens");
+   Check (Open_Image (Opened, Bytes'Address, Size) = Ok, "it opens");
    Check (Opened.N_Stars = 300, "it has 300 stars");
-   Check (Scrub (Bytes'Address, Size, 0, 2, Bad) = Identified and Bad = 0,
+   Check (Scrub_Image (Bytes'Address, Size, 0, 2, Bad) = Ok and Bad = 0,
           "it is sound");
-   Camera_Of (Opened, Lens);
-   Default_Options (Given);
+   Get_Camera (Opened, Lens);
+   Set_Default_Options (Given);
    Given.Noise_Px := 0.3;
    for N in 1 .. 20 loop
       Sky_Look (Opened, Lens, State, 0.2, 12, 0, Seen);
@@ -86,15 +86,17 @@ begin
          Spots : constant Frame :=
            (Seen.Count, Seen.X'Address, Seen.Y'Address, others => <>);
       begin
-         if Identify (Opened, Lens, Given, Spots, Work, Found) = Identified
+         if Identify_Frame (Opened, Lens, Given, Spots, Work, Found)
+           = Identified
          then
             Good := Good + 1;
             for K in 0 .. Integer (Seen.Count) - 1 loop
                Check (Found.Star (K) = Seen.Star (K), "the star");
             end loop;
          end if;
-         Check (Track (Opened, Lens, Given, Spots, Seen.Q_Body_From_Icrs, 0.01,
-                       Work, Found) = Identified, "it is tracked");
+         Check (Track_Frame (Opened, Lens, Given, Spots,
+                             Seen.Q_Body_From_Icrs, 0.01, Work, Found)
+                  = Identified, "it is tracked");
       end;
    end loop;
    Check (Good >= 18, "18 of 20 frames are identified");

@@ -45,14 +45,14 @@ class span {
 class image {
  public:
   explicit image(span<const std::uint8_t> bytes, std::uint32_t flags = 0) noexcept
-      : status_(starcat_open(&image_, bytes.data(), bytes.size(), flags)), size_(bytes.size()) {}
+      : status_(starcat_open_image(&image_, bytes.data(), bytes.size(), flags)), size_(bytes.size()) {}
   // Of the 64-bit words that starcat export --to c writes.
   explicit image(span<const std::uint64_t> words, std::uint32_t flags = 0) noexcept
-      : status_(starcat_open(&image_, words.data(), 8u * words.size(), flags)),
+      : status_(starcat_open_image(&image_, words.data(), 8u * words.size(), flags)),
         size_(8u * words.size()) {}
 
   starcat_status status() const noexcept { return status_; }
-  explicit operator bool() const noexcept { return status_ == STARCAT_IDENTIFIED; }
+  explicit operator bool() const noexcept { return status_ == STARCAT_OK; }
   const starcat_image *get() const noexcept { return &image_; }
 
   // What follows is of an image that was opened.
@@ -67,13 +67,13 @@ class image {
   // The camera that it was built for, to be calibrated.
   starcat::camera camera() const noexcept {
     starcat::camera made{};
-    starcat_camera_of(&image_, &made);
+    starcat_get_camera(&image_, &made);
     return made;
   }
   // Check blocks `first` to `first + count`, in idle time.
   starcat_status scrub(std::uint32_t first, std::uint32_t count,
                        std::uint32_t &bad_block) const noexcept {
-    return starcat_scrub(image_.bytes, size_, first, count, &bad_block);
+    return starcat_scrub_image(image_.bytes, size_, first, count, &bad_block);
   }
 
  private:
@@ -95,7 +95,7 @@ struct prior {
 
 inline starcat::options default_options() noexcept {
   starcat::options made{};
-  starcat_default_options(&made);
+  starcat_set_default_options(&made);
   return made;
 }
 
@@ -141,8 +141,8 @@ class matcher {
                                   given.y_px.data(), given.magnitudes.data(), given.sigma_px.data()};
     const starcat_status status =
         near == nullptr
-            ? starcat_identify(image_->get(), &camera, &options, &arrays, &work_, &result_)
-            : starcat_track(image_->get(), &camera, &options, &arrays, near->q_body_from_icrs,
+            ? starcat_identify_frame(image_->get(), &camera, &options, &arrays, &work_, &result_)
+            : starcat_track_frame(image_->get(), &camera, &options, &arrays, near->q_body_from_icrs,
                             near->uncertainty_rad, &work_, &result_);
     count_ = status >= 0 || status == STARCAT_E_BUDGET ? count : 0u;
     return status;

@@ -31,7 +31,7 @@ int main() {
   CHECK(image.name() == "sky-1.0.0");
   CHECK(image.star_ids().size() == SKY_STARS);
   std::uint32_t bad = 9;
-  CHECK(image.scrub(0, 2, bad) == STARCAT_IDENTIFIED && bad == 0);
+  CHECK(image.scrub(0, 2, bad) == STARCAT_OK && bad == 0);
 
   static starcat::matcher matcher(image);
   matcher.options.noise_px = starcat::real(0.3);

@@ -24,7 +24,7 @@ static double now_s(void) {
 static const double LARGEST_MAG = 100.0;
 
 /* What the library found, as Python wants it. */
-static void tell(const starcat_result *result, starcat_answer *answer) {
+static void tell_answer(const starcat_result *result, starcat_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
   answer->reason = (int32_t)result->reason;
   if (result->reason != STARCAT_REASON_NONE) {
@@ -41,7 +41,7 @@ static void tell(const starcat_result *result, starcat_answer *answer) {
   memcpy(answer->q_body_from_icrs, result->q_body_from_icrs, sizeof answer->q_body_from_icrs);
 }
 
-static int identify(const starcat_search *search, uint32_t count, const double *pairs_px,
+static int identify_copied(const starcat_search *search, uint32_t count, const double *pairs_px,
                     const double *magnitudes, const double *sigma_px, const double *q_prior,
                     double uncertainty_rad, starcat_answer *answer, int32_t *star,
                     starcat_memory *memory) {
@@ -63,9 +63,9 @@ static int identify(const starcat_search *search, uint32_t count, const double *
   }
   const double begun_s = now_s();
   const starcat_status status =
-      q_prior == NULL ? starcat_identify(search->image, search->camera, search->options, &frame,
+      q_prior == NULL ? starcat_identify_frame(search->image, search->camera, search->options, &frame,
                                          &memory->work, result)
-                      : starcat_track(search->image, search->camera, search->options, &frame,
+                      : starcat_track_frame(search->image, search->camera, search->options, &frame,
                                       q_prior, uncertainty_rad, &memory->work, result);
   answer->seconds = now_s() - begun_s;
   answer->status = (int32_t)status;
@@ -79,25 +79,25 @@ static int identify(const starcat_search *search, uint32_t count, const double *
     starcat_fit_answer(search->image, search->directions, sigma_px, &memory->work, result);
   }
   if (has_stars) {
-    tell(result, answer);
+    tell_answer(result, answer);
   }
   return answer->status;
 }
 
-int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
                 const void *magnitudes, const void *sigma_px, const void *q_prior,
                 double uncertainty_rad, starcat_memory *memory) {
-  return identify(search, count, pairs_px, magnitudes, sigma_px, q_prior, uncertainty_rad,
+  return identify_copied(search, count, pairs_px, magnitudes, sigma_px, q_prior, uncertainty_rad,
                   &memory->answer, memory->star, memory);
 }
 
-void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
+void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                   const int64_t *starts, const double *pairs_px, const double *magnitudes,
                   const double *sigma_px, starcat_answer *answers, int32_t *stars,
                   starcat_memory *memory) {
   for (uint32_t n = first; n < stop; n++) {
     const int64_t start = starts[n];
-    (void)identify(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
+    (void)identify_copied(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
                    magnitudes == NULL ? NULL : magnitudes + start,
                    sigma_px == NULL ? NULL : sigma_px + start, NULL, 0.0, answers + n,
                    stars + start, memory);

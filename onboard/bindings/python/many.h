@@ -32,7 +32,7 @@ typedef struct {
   double seconds; /* that the library took */
 } starcat_answer;
 
-/* Memory of one call at a time: what it works in, and what starcat_one leaves in it. */
+/* Memory of one call at a time: what it works in, and what starcat_identify_one leaves in it. */
 typedef struct {
   starcat_answer answer;
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
@@ -46,13 +46,13 @@ typedef struct {
 /* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
  * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
  * the status that the answer in the memory has too. */
-int starcat_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
                 const void *magnitudes, const void *sigma_px, const void *q_prior,
                 double uncertainty_rad, starcat_memory *memory);
 
 /* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
  * The centroids of frame n are those from starts[n] to starts[n + 1]. */
-void starcat_many(const starcat_search *search, uint32_t first, uint32_t stop,
+void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                   const int64_t *starts, const double *pairs_px, const double *magnitudes,
                   const double *sigma_px, starcat_answer *answers, int32_t *stars, starcat_memory *memory);
 

@@ -26,12 +26,18 @@ RUNS = [
 ]
 """Proofs, with what is defined, and the sources that they need."""
 CLAIMED = {
-    "start": {"starcat_open", "starcat_scrub", "check_start"},
-    "open": {"starcat_open", "starcat_scrub", "find_sections", "is_complete", "starcat_crc32"},
+    "start": {"starcat_open_image", "starcat_scrub_image", "check_start"},
+    "open": {
+        "starcat_open_image",
+        "starcat_scrub_image",
+        "find_sections",
+        "is_complete",
+        "starcat_update_crc",
+    },
     "lookups": {
-        "starcat_rows_between",
-        "starcat_rows_of",
-        "starcat_star",
+        "starcat_find_rows",
+        "starcat_read_rows",
+        "starcat_read_star",
         "gather_sectors",
         "cell",
     },

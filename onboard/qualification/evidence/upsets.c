@@ -73,7 +73,7 @@ typedef struct {
 /* What the processes share: how far they are, and what they counted. */
 typedef struct {
   uint64_t at;
-  uint64_t missed; /* flips in the image whose block starcat_scrub did not name */
+  uint64_t missed; /* flips in the image whose block starcat_scrub_image did not name */
   uint64_t traps;  /* calls that raised a floating-point exception */
   uint64_t longest; /* call, in basic blocks */
   uint64_t counts[N_PARTS][N_OUTCOMES];
@@ -109,7 +109,7 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   answer a;
   memset(work, 0, sizeof *work);
   memset(&a.result, 0, sizeof a.result);
-  starcat_default_options(&options);
+  starcat_set_default_options(&options);
   options.max_steps = MAX_STEPS;
   if ((way & 4u) != 0u) {
     options.noise_px = (starcat_real)NOISE_PX;
@@ -118,9 +118,9 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   blocks = 0;
   due = at_block;
   a.status = (way & 1u) != 0u
-                 ? starcat_track(&s->image, &camera, &options, &frame, f->q_body_from_icrs,
+                 ? starcat_track_frame(&s->image, &camera, &options, &frame, f->q_body_from_icrs,
                                  (starcat_real)0.009, work, &a.result)
-                 : starcat_identify(&s->image, &camera, &options, &frame, work, &a.result);
+                 : starcat_identify_frame(&s->image, &camera, &options, &frame, work, &a.result);
   a.blocks = blocks;
   due = 0;
   return a;
@@ -210,7 +210,7 @@ static void flip(uint64_t index, uint64_t seed, tally *t) {
   const answer a = call(which, n, way, at_block);
   if (in_image) {
     const uint32_t block = (uint32_t)(at / 4096u);
-    t->missed += (uint64_t)((starcat_scrub(s->bytes, s->size, block, 1, &bad) >= 0) ||
+    t->missed += (uint64_t)((starcat_scrub_image(s->bytes, s->size, block, 1, &bad) >= 0) ||
                             (bad != block));
     *flipped = (uint8_t)(*flipped ^ mask);
   }
@@ -241,10 +241,10 @@ static void prepare(void) {
     s->size = sky_image(&recipes[which], (uint8_t *)words);
     s->bytes = malloc(s->size); /* no byte more, so that a read beyond it is found */
     memcpy(s->bytes, words, s->size);
-    if (starcat_open(&s->image, s->bytes, s->size, 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&s->image, s->bytes, s->size, 0) != STARCAT_OK) {
       abort();
     }
-    starcat_camera_of(&s->image, &s->camera);
+    starcat_get_camera(&s->image, &s->camera);
   }
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     uint32_t right = 0;

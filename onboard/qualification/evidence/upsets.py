@@ -4,7 +4,7 @@
 
 runs upsets.c, half of the flips in double and half in single precision, and a twentieth of them
 again under ASan and UBSan where a clang for that is given. Writes upsets.html and upsets.csv; fails
-where an answer is wrong beyond the bound, a call crashes or does not end, or starcat_scrub does not
+where an answer is wrong beyond the bound, a call crashes or does not end, or starcat_scrub_image does not
 name the block of a flip.
 """
 
@@ -98,7 +98,7 @@ def main(folder: Path, flips: int, seed: int, clang: str) -> int:
         f"<p>{figure}.</p><ul>{''.join(f'<li>{text}</li>' for text in WORDS)}</ul>",
         f"<p>The longest call took {int(max(n['longest'] for n in numbers)):,} basic blocks; "
         f"{int(sum(n['traps'] for n in numbers)):,} calls raised a floating-point exception. "
-        f"starcat_scrub named the block of every flip in the image but "
+        f"starcat_scrub_image named the block of every flip in the image but "
         f"{int(sum(n['missed'] for n in numbers))}. {runs:,} more flips under ASan and UBSan: "
         f"{sum(count['crash'] for count in again.values())} crashes. "
         f"make upsets SEU_FLIPS={flips} SEU_SEED={seed}</p>",

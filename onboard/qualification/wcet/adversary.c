@@ -46,8 +46,8 @@ static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state
   static const double noises_mag[4] = {0.0, 0.1, 1.0, 100.0};
   starcat_camera *c = &made->camera;
   starcat_options *o = &made->options;
-  starcat_camera_of(image, c);
-  starcat_default_options(o);
+  starcat_get_camera(image, c);
+  starcat_set_default_options(o);
   if (g[LENS] % 4u == 0u) {
     c->k1 = (starcat_real)(0.4 * sky_uniform(state) - 0.3);
     c->k2 = (starcat_real)(0.1 * sky_uniform(state) - 0.05);
@@ -195,8 +195,8 @@ starcat_status adversary_call(const starcat_image *image, const adversary *made,
   const starcat_frame frame = {sky->count, sky->x, sky->y,
                                made->has_magnitudes ? sky->magnitudes : NULL,
                                made->has_sigma ? made->sigma_px : NULL};
-  return made->is_tracked ? starcat_track(image, &made->camera, &made->options, &frame,
+  return made->is_tracked ? starcat_track_frame(image, &made->camera, &made->options, &frame,
                                           sky->q_body_from_icrs, made->uncertainty_rad, work, result)
-                          : starcat_identify(image, &made->camera, &made->options, &frame, work,
+                          : starcat_identify_frame(image, &made->camera, &made->options, &frame, work,
                                              result);
 }

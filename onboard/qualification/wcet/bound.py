@@ -29,19 +29,36 @@ VERIFY = ("band", "star", "try", "iteration", "rival", "bound")
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark")
 TRACK = (*VERIFY, "predict", "next", "two")
 PAID_LATER = ("take", "look_up", "third", "star", "try", "predict", "two")
-ROOTS = ("starcat_identify", "starcat_track", "starcat_attitude", "starcat_open", "starcat_scrub")
+ROOTS = (
+    "starcat_identify_frame",
+    "starcat_track_frame",
+    "starcat_fit_attitude",
+    "starcat_open_image",
+    "starcat_scrub_image",
+)
 Form = Counter[tuple[str, str]]
 """How often something runs: a sum of expressions of events."""
 
 Copies = dict[object, dict[object, Form]]
 
-SCALES = ("compare>starcat_angle_of_chord", "bound_shape", "fit_scale", "is_similar",
+SCALES = ("compare_feature>starcat_angle_of_chord", "bound_shape", "fit_scale", "is_similar",
           "look_up_similar")  # fmt: skip
-CROWDED = ("by_neighbours", "list_neighbours", "is_earlier", "starcat_side>starcat_angle_of_chord")
-LENS = ("undistort", "distort", "slopes", "image_of")
-LONGEST = ("by_longest_side", "with_longest_side", "sift")
-MAGNITUDES = ("add_up", "count_compatible")
-TRIANGLES = ("starcat_triangle", "look_up", "look_up_similar", "compare", "try_order")
+CROWDED = (
+    "search_by_neighbours",
+    "list_neighbours",
+    "is_earlier",
+    "starcat_measure_side>starcat_angle_of_chord",
+)
+LENS = ("undistort_point", "distort_point", "differentiate_distortion", "apply_distortion")
+LONGEST = ("search_by_longest_side", "search_with_longest_side", "sift_heap")
+MAGNITUDES = ("sum_polynomials", "count_compatible")
+TRIANGLES = (
+    "starcat_look_up_triangle",
+    "look_up_features",
+    "look_up_similar",
+    "compare_feature",
+    "try_order",
+)
 
 
 @dataclass(frozen=True)
@@ -62,9 +79,9 @@ class Case:
 
     def excluded(self) -> set[str]:
         """Functions, or one inlined in another, that do not run."""
-        left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_pyramid",))
+        left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_look_up_pyramid",))
         left_out |= set() if self.is_crowded else set(CROWDED)
-        left_out |= set(LONGEST if self.has_magnitudes else ("by_brightness", *MAGNITUDES))
+        left_out |= set(LONGEST if self.has_magnitudes else ("search_by_brightness", *MAGNITUDES))
         left_out |= set(LONGEST) if self.is_crowded else set()
         left_out |= {"is_same"} if self.is_unknown else set(SCALES)
         return left_out | (set() if self.has_lens else set(LENS))
@@ -377,13 +394,13 @@ def bound_of(program: Program, source: Source, case: Case) -> Bound:
 
 
 def of_image(program: Program, source: Source) -> tuple[float, float]:
-    """Instructions of starcat_open but for the blocks, and of a block."""
-    costs = Counts(program, source, "starcat_open", set()).costs()
+    """Instructions of starcat_open_image but for the blocks, and of a block."""
+    costs = Counts(program, source, "starcat_open_image", set()).costs()
     return total(costs, "open"), total(costs, "block")
 
 
 def of_attitude(program: Program, source: Source) -> tuple[float, float]:
-    """Instructions of starcat_attitude but for the pairs, and of a pair."""
-    costs = Counts(program, source, "starcat_attitude", set()).costs()
+    """Instructions of starcat_fit_attitude but for the pairs, and of a pair."""
+    costs = Counts(program, source, "starcat_fit_attitude", set()).costs()
     alone = total(costs, "attitude", given=0)
     return alone, total(costs, "attitude", given=1) - alone

@@ -86,9 +86,9 @@ static int measure_open(void) {
   uint32_t bad = 0;
   clock_start();
   const uint64_t start = clock_now();
-  const starcat_status status = starcat_open(&image, image_begin, size, 0);
+  const starcat_status status = starcat_open_image(&image, image_begin, size, 0);
   const uint64_t opened = clock_now();
-  (void)starcat_scrub(image_begin, size, 1, 1, &bad);
+  (void)starcat_scrub_image(image_begin, size, 1, 1, &bad);
   const uint64_t scrubbed = clock_now();
   (void)printf("open %llu blocks: %lu\nscrub %llu\n", (unsigned long long)(opened - start + CLOCK_STEP),
                (unsigned long)(image.total_bytes / 4096u),
@@ -108,7 +108,7 @@ static void measure_attitude(void) {
     }
   }
   const uint64_t before = clock_now();
-  (void)starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs,
+  (void)starcat_fit_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs,
                          STARCAT_MAX_CENTROIDS, q);
   (void)printf("attitude %llu pairs: %u\n", (unsigned long long)(clock_now() - before + CLOCK_STEP),
                STARCAT_MAX_CENTROIDS);

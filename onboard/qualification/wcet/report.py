@@ -16,8 +16,8 @@ from loops import Source, check, read_source
 from machine import Program
 
 NAMES = {
-    "`starcat_identify`, triangles": Case(),
-    "`starcat_identify`, pyramids": Case(has_pairs=True),
+    "`starcat_identify_frame`, triangles": Case(),
+    "`starcat_identify_frame`, pyramids": Case(has_pairs=True),
     "triangles, no magnitudes": Case(has_magnitudes=False),
     "pyramids, no magnitudes": Case(has_pairs=True, has_magnitudes=False),
     "triangles, crowded": Case(is_crowded=True, has_magnitudes=False),
@@ -25,7 +25,7 @@ NAMES = {
     "triangles, unknown focal length": Case(is_unknown=True),
     "triangles, lens": Case(has_lens=True),
     "pyramids, lens": Case(has_pairs=True, has_lens=True),
-    "`starcat_track`": Case(is_track=True),
+    "`starcat_track_frame`": Case(is_track=True),
 }
 
 
@@ -120,7 +120,7 @@ class Target:
             is_within &= took <= alone + blocks * block and others["scrub"][0] <= alone + block
         took, blocks = self.others[0]["open"]
         rows.append(
-            f"`starcat_open`, {blocks} blocks: {took:,} instructions, one block scrubbed "
+            f"`starcat_open_image`, {blocks} blocks: {took:,} instructions, one block scrubbed "
             f"{self.others[0]['scrub'][0]:,}; bound {alone:,.0f} and {block:,.0f} a block"
         )
         alone, pair = of_attitude(self.program, self.source)
@@ -129,7 +129,7 @@ class Target:
             is_within &= took <= alone + pairs * pair
         took, pairs = self.others[0]["attitude"]
         rows.append(
-            f"`starcat_attitude`, {pairs} pairs: {took:,} instructions; bound {alone:,.0f} and "
+            f"`starcat_fit_attitude`, {pairs} pairs: {took:,} instructions; bound {alone:,.0f} and "
             f"{pair:,.0f} a pair"
         )
         return [*rows, *([] if is_within else ["BEYOND THE BOUND"])]

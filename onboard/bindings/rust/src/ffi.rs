@@ -3,6 +3,11 @@
 pub const MAX_CENTROIDS: usize = 1000001;
 pub const MAX_STARS: usize = 1000002;
 
+// Of starcat_status.
+pub const OK: i32 = 0;
+pub const IDENTIFIED: i32 = 0;
+pub const E_CRC: i32 = -8;
+
 #[cfg(feature = "single")]
 pub type Real = f32;
 #[cfg(not(feature = "single"))]
@@ -95,15 +100,15 @@ pub const WORDS: usize = WORKSPACE / 8 + 1;
 extern "C" {
     pub static starcat_crate_sizes: [u32; 6];
     pub fn starcat_version_number() -> u32;
-    pub fn starcat_scrub(bytes: *const u8, size: usize, first: u32, count: u32, bad: *mut u32) -> i32;
-    #[link_name = "starcat_open@SUFFIX@"]
-    pub fn starcat_open(image: *mut Image, bytes: *const u8, size: usize, flags: u32) -> i32;
-    #[link_name = "starcat_camera_of@SUFFIX@"]
-    pub fn starcat_camera_of(image: *const Image, camera: *mut Camera);
-    #[link_name = "starcat_default_options@SUFFIX@"]
-    pub fn starcat_default_options(options: *mut Options);
-    #[link_name = "starcat_identify@SUFFIX@"]
-    pub fn starcat_identify(
+    pub fn starcat_scrub_image(bytes: *const u8, size: usize, first: u32, count: u32, bad: *mut u32) -> i32;
+    #[link_name = "starcat_open_image@SUFFIX@"]
+    pub fn starcat_open_image(image: *mut Image, bytes: *const u8, size: usize, flags: u32) -> i32;
+    #[link_name = "starcat_get_camera@SUFFIX@"]
+    pub fn starcat_get_camera(image: *const Image, camera: *mut Camera);
+    #[link_name = "starcat_set_default_options@SUFFIX@"]
+    pub fn starcat_set_default_options(options: *mut Options);
+    #[link_name = "starcat_identify_frame@SUFFIX@"]
+    pub fn starcat_identify_frame(
         image: *const Image,
         camera: *const Camera,
         options: *const Options,
@@ -111,8 +116,8 @@ extern "C" {
         work: *mut u64,
         found: *mut Found,
     ) -> i32;
-    #[link_name = "starcat_track@SUFFIX@"]
-    pub fn starcat_track(
+    #[link_name = "starcat_track_frame@SUFFIX@"]
+    pub fn starcat_track_frame(
         image: *const Image,
         camera: *const Camera,
         options: *const Options,
@@ -122,8 +127,8 @@ extern "C" {
         work: *mut u64,
         found: *mut Found,
     ) -> i32;
-    #[link_name = "starcat_attitude@SUFFIX@"]
-    pub fn starcat_attitude(
+    #[link_name = "starcat_fit_attitude@SUFFIX@"]
+    pub fn starcat_fit_attitude(
         body: *const [Real; 3],
         icrs: *const [Real; 3],
         count: u32,

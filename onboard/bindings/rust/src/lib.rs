@@ -151,9 +151,9 @@ pub fn scrub(words: &[u64], first: u32, count: u32) -> Result<(), Error> {
     let mut bad = 0;
     // SAFETY: the library reads no more than the bytes that it is told of.
     let status = unsafe {
-        ffi::starcat_scrub(words.as_ptr().cast(), size_of_val(words), first, count, &mut bad)
+        ffi::starcat_scrub_image(words.as_ptr().cast(), size_of_val(words), first, count, &mut bad)
     };
-    if status == 0 {
+    if status == ffi::OK {
         Ok(())
     } else {
         Err(failed(status, bad))
@@ -193,12 +193,12 @@ impl<'a> Image<'a> {
         // SAFETY: the words are aligned by 8 and live as long as the image; the library reads no more
         // than the bytes that it is told of.
         let status = unsafe {
-            ffi::starcat_open(raw.as_mut_ptr(), words.as_ptr().cast(), size_of_val(words), 0)
+            ffi::starcat_open_image(raw.as_mut_ptr(), words.as_ptr().cast(), size_of_val(words), 0)
         };
         match status {
             // SAFETY: the library has filled it in.
-            0 => Ok(Image { raw: unsafe { raw.assume_init() }, words: PhantomData }),
-            -8 => Err(scrub(words, 0, 0).err().unwrap_or(Error::Layout)),
+            ffi::OK => Ok(Image { raw: unsafe { raw.assume_init() }, words: PhantomData }),
+            ffi::E_CRC => Err(scrub(words, 0, 0).err().unwrap_or(Error::Layout)),
             _ => Err(failed(status, 0)),
         }
     }
@@ -210,7 +210,7 @@ impl<'a> Image<'a> {
 
     /// Ids of the stars, by row.
     pub fn star_ids(&self) -> &'a [i64] {
-        // SAFETY: starcat_open has checked that the section has so many, and it is aligned by 64.
+        // SAFETY: starcat_open_image has checked that the section has so many, and it is aligned by 64.
         unsafe { core::slice::from_raw_parts(self.raw.sections[2].cast(), self.n_stars()) }
     }
 
@@ -226,7 +226,7 @@ impl<'a> Image<'a> {
     pub fn camera(&self) -> Camera {
         let mut camera = Camera::default();
         // SAFETY: both are sound.
-        unsafe { ffi::starcat_camera_of(&self.raw, &mut camera) };
+        unsafe { ffi::starcat_get_camera(&self.raw, &mut camera) };
         camera
     }
 }
@@ -237,7 +237,7 @@ impl Default for Options {
         let mut options = MaybeUninit::uninit();
         // SAFETY: the library fills it in.
         unsafe {
-            ffi::starcat_default_options(options.as_mut_ptr());
+            ffi::starcat_set_default_options(options.as_mut_ptr());
             options.assume_init()
         }
     }
@@ -323,7 +323,7 @@ impl<'a> Matcher<'a> {
         // SAFETY: the arrays have `count` numbers; Workspace is large enough, which Image::open has
         // checked, and aligned by 8.
         let status = unsafe {
-            ffi::starcat_identify(
+            ffi::starcat_identify_frame(
                 &self.image.raw,
                 &self.camera,
                 &self.options,
@@ -345,7 +345,7 @@ impl<'a> Matcher<'a> {
         let raw = frame.raw()?;
         // SAFETY: as above.
         let status = unsafe {
-            ffi::starcat_track(
+            ffi::starcat_track_frame(
                 &self.image.raw,
                 &self.camera,
                 &self.options,
@@ -360,7 +360,7 @@ impl<'a> Matcher<'a> {
     }
 
     fn answer(&self, status: i32, count: u32) -> Result<Answer<'_>, Error> {
-        if status == 0 {
+        if status == ffi::IDENTIFIED {
             Ok(Answer { found: &self.found, count: count as usize })
         } else {
             Err(failed(status, self.found.reason))
@@ -446,8 +446,8 @@ pub fn attitude(body: &[[Real; 3]], icrs: &[[Real; 3]]) -> Result<[Real; 4], Err
     let mut q = [0.0; 4];
     // SAFETY: both have `count` rows.
     let status =
-        unsafe { ffi::starcat_attitude(body.as_ptr(), icrs.as_ptr(), count, q.as_mut_ptr()) };
-    if status == 0 {
+        unsafe { ffi::starcat_fit_attitude(body.as_ptr(), icrs.as_ptr(), count, q.as_mut_ptr()) };
+    if status == ffi::OK {
         Ok(q)
     } else {
         Err(failed(status, 0))

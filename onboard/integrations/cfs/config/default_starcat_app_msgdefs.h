@@ -104,7 +104,7 @@ typedef struct {
   uint32 FrameErrors;              /* frames of a wrong length, or that were refused */
   int16 LastStatus;                /* starcat_status of the last frame */
   int16 ImageStatus;               /* starcat_status of the image in use, 0: it can be used */
-  uint8 ActivePlace;               /* place of the image in use */
+  uint8 ActiveSlot;               /* slot of the image in use */
   uint8 LoadState;                 /* 0: none, 1: reading, 2: checking, 3: ready, 4: failed */
   uint8 Spare[2];                  /* zeros */
   uint32 ImageBytes;               /* size of the image in use */

@@ -109,11 +109,11 @@ static void compare_with_truth(const attitude_out *out) {
 static void settings(starcat_camera *camera, starcat_options *options, double *prior_rad,
                      double *age_s) {
   const int is_test_table = hk.CameraSource != STARCAT_APP_CAMERA_OF_IMAGE;
-  starcat_camera_of(&images[0], camera); /* that of the table too */
+  starcat_get_camera(&images[0], camera); /* that of the table too */
   if (hk.CameraSource == STARCAT_APP_CAMERA_OF_COMMAND) {
     *camera = commanded;
   }
-  starcat_default_options(options);
+  starcat_set_default_options(options);
   options->log_chance = -20.723265836946411;
   options->noise_px = is_test_table ? TEST_NOISE_PX : 0.0;
   options->max_steps = hk.MaxSteps;
@@ -147,7 +147,7 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
     return STARCAT_E_CRC;
   }
   if ((hk.Tracking == 1) && has_prior && (fabs(now_s - prior_s) < age_s - 1e-6)) {
-    const starcat_status status = starcat_track(image, &camera, &options, &frame, prior, prior_rad,
+    const starcat_status status = starcat_track_frame(image, &camera, &options, &frame, prior, prior_rad,
                                                 &work, &result);
     *mode = STARCAT_APP_MODE_TRACK;
     *steps = result.steps;
@@ -157,7 +157,7 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
     options.max_steps -= result.steps;
   }
   *mode = STARCAT_APP_MODE_IDENTIFY;
-  const starcat_status status = starcat_identify(image, &camera, &options, &frame, &work, &result);
+  const starcat_status status = starcat_identify_frame(image, &camera, &options, &frame, &work, &result);
   *steps += result.steps;
   return status;
 }
@@ -257,7 +257,7 @@ static void take_command(unsigned code, const uint8_t *payload) {
     memset(not_identified, 0, sizeof not_identified);
   } else if (code == STARCAT_APP_SET_CAMERA_CC) {
     memcpy(&given, payload, sizeof given);
-    starcat_camera_of(&images[0], &commanded);
+    starcat_get_camera(&images[0], &commanded);
     commanded.focal_length_px = given.Camera.FocalLength_px;
   }
 }
@@ -298,7 +298,7 @@ int main(int argc, char **argv) {
   }
   for (int n = 0; n < 2; n++) {
     const size_t size = read_whole(argv[1], names[n], bytes_of[n], sizeof bytes_of[n]);
-    if (starcat_open(&images[n], bytes_of[n], size, 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&images[n], bytes_of[n], size, 0) != STARCAT_OK) {
       return 2;
     }
   }

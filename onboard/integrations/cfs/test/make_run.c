@@ -100,14 +100,14 @@ static void make_images(const char *folder) {
     memset(bytes + 160, 0, 96);
     memcpy(bytes + 160, names[n], strlen(names[n]));
     sky_seal(bytes);
-    if (starcat_open(&images[n], bytes, sizes[n], 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&images[n], bytes, sizes[n], 0) != STARCAT_OK) {
       (void)fprintf(stderr, "make_run: no image\n");
       exit(1);
     }
     write_whole(folder, files[n], bytes, sizes[n]);
   }
   make_patch(folder);
-  starcat_camera_of(&images[0], &camera);
+  starcat_get_camera(&images[0], &camera);
   memcpy(copy, words[0], sizes[0]);
   copy[5u * BLOCK + 17u] ^= 4u;
   write_whole(folder, "damaged.img", copy, sizes[0]);

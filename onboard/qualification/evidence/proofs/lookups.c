@@ -1,14 +1,14 @@
-/* Claim: starcat_rows_between (the K-vector), starcat_rows_of (features), starcat_star (directions),
+/* Claim: starcat_find_rows (the K-vector), starcat_read_rows (features), starcat_read_star (directions),
  * and of sky.c cell and gather_sectors (the grid) cause no run-time error on an opened image,
  * whatever its directions, grid, K-vector and features are, and wherever is looked.
  *
- * Preconditions: what starcat_open leaves: arrays of exactly as many elements as the image says,
+ * Preconditions: what starcat_open_image leaves: arrays of exactly as many elements as the image says,
  * here 30 stars, 12 bands of 24 sectors, 50 features and 14 entries of the K-vector, with indices of
  * 2 or 4 bytes, and the line of the K-vector in its ranges; a feature is below n_features. Values
  * that are looked up are from -1e6 to 1e6; fractions of cell are finite, and any band and
  * sectors of the grid may be gathered, around any centre.
  *
- * Not claimed: the rest of starcat_gather, which turns a centre into bands and sectors by cell. Eva 25
+ * Not claimed: the rest of starcat_gather_stars, which turns a centre into bands and sectors by cell. Eva 25
  * does not see that a comparison with NaN is false, on which cell relies there.
  *
  * SPDX-License-Identifier: MIT
@@ -31,11 +31,11 @@ static uint16_t narrow[3u * FEATURES];
 static void look_up(const starcat_image *image, uint32_t width) {
   uint32_t start, stop, rows[3];
   real icrs[3];
-  starcat_rows_between(image, any_from(-1e6, 1e6), any_from(-1e6, 1e6), &start, &stop);
+  starcat_find_rows(image, any_from(-1e6, 1e6), any_from(-1e6, 1e6), &start, &stop);
   for (uint32_t feature = start; feature < stop; feature++) {
-    starcat_rows_of(image, feature, width, rows);
+    starcat_read_rows(image, feature, width, rows);
     if (rows[0] < image->n_stars) {
-      starcat_star(image, rows[0], icrs);
+      starcat_read_star(image, rows[0], icrs);
     }
   }
 }

@@ -1,4 +1,4 @@
-/* Claim: starcat_open and starcat_scrub cause no run-time error on an image of BLOCKS blocks of
+/* Claim: starcat_open_image and starcat_scrub_image cause no run-time error on an image of BLOCKS blocks of
  * data, whatever every other byte of it is, which blocks are scrubbed, and whether CRCs are checked.
  *
  * Preconditions: `bytes` is aligned by 8 and has exactly as many bytes as an image of so many blocks:
@@ -20,7 +20,7 @@ int main(void) {
   make_any(words, TOTAL);
   header[5] = TOTAL;
   header[6] = BLOCKS * STARCAT_BLOCK_BYTES;
-  (void)starcat_open(&image, words, TOTAL, any_u32());
-  (void)starcat_scrub(words, TOTAL, any_u32(), any_u32(), &bad);
+  (void)starcat_open_image(&image, words, TOTAL, any_u32());
+  (void)starcat_scrub_image(words, TOTAL, any_u32(), any_u32(), &bad);
   return 0;
 }

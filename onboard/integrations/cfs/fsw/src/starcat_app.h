@@ -28,7 +28,7 @@ typedef struct {
   STARCAT_APP_HkTlm_t HkTlm; /* what it reports is counted in it */
   STARCAT_APP_AttitudeTlm_t AttitudeTlm;
 
-  starcat_places Places;
+  starcat_slots Slots;
   starcat_image Image; /* the one in use, if HasImage */
   bool HasImage;
   starcat_camera Camera;
@@ -78,7 +78,7 @@ void STARCAT_APP_TakeCamera(const STARCAT_APP_Camera_t *From, starcat_camera *Ca
 /* starcat_app_frame.c: frames to attitudes */
 void STARCAT_APP_Frame(const STARCAT_APP_FrameTlm_t *Msg);
 
-/* starcat_app_image.c: images in their places */
+/* starcat_app_image.c: images in their slots */
 void STARCAT_APP_StartImages(void);
 void STARCAT_APP_ImageInUse(starcat_status Status);
 CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch);

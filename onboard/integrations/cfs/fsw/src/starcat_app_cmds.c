@@ -60,9 +60,9 @@ void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg) {
   starcat_image Image; /* a switch that fails writes it too */
   starcat_status Status = STARCAT_NO_MATCH;
   if (!IsBusy) {
-    Status = starcat_switch(&STARCAT_APP_Data.Places, &Image);
+    Status = starcat_switch_image(&STARCAT_APP_Data.Slots, &Image);
   }
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_SWITCH_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: no switch: %s, status %d",
@@ -75,15 +75,15 @@ void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg) {
   STARCAT_APP_Data.Image = Image;
   STARCAT_APP_ImageInUse(Status);
   CFE_EVS_SendEvent(STARCAT_APP_SWITCH_INF_EID, CFE_EVS_EventType_INFORMATION,
-                    "STARCAT: image %.*s of place %u is in use", STARCAT_APP_NAME_LEN, HK.ImageName,
-                    (unsigned int)HK.ActivePlace);
+                    "STARCAT: image %.*s of slot %u is in use", STARCAT_APP_NAME_LEN, HK.ImageName,
+                    (unsigned int)HK.ActiveSlot);
 }
 
 void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
   starcat_camera Camera;
   STARCAT_APP_TakeCamera(&Msg->Payload.Camera, &Camera);
   const starcat_status Status = STARCAT_APP_CheckSettings(&Camera, &STARCAT_APP_Data.Options);
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_CAMERA_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: the camera is refused with status %d; the old one stays",
@@ -121,7 +121,7 @@ void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
   starcat_options Options = STARCAT_APP_Data.Options;
   Options.max_steps = Msg->Payload.MaxSteps;
   const starcat_status Status = STARCAT_APP_CheckSettings(NULL, &Options);
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_BUDGET_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: a budget of %lu steps is refused with status %d",

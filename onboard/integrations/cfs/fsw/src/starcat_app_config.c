@@ -38,9 +38,9 @@ starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
   static const starcat_frame NoFrame;
   static const starcat_camera AnyCamera = {1024, 1024, 2048, 512, 512, 0, 0, 0, 0, 0, 0};
   const starcat_status Status =
-      starcat_identify(&NoImage, Camera != NULL ? Camera : &AnyCamera, Options, &NoFrame,
+      starcat_identify_frame(&NoImage, Camera != NULL ? Camera : &AnyCamera, Options, &NoFrame,
                        &STARCAT_APP_Data.Work, &STARCAT_APP_Data.Result);
-  return Status == STARCAT_TOO_FEW_STARS ? STARCAT_IDENTIFIED : Status;
+  return Status == STARCAT_TOO_FEW_STARS ? STARCAT_OK : Status;
 }
 
 CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
@@ -54,7 +54,7 @@ CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
   const bool IsSound = (Config->Prior_rad > 0.0) && (Config->Prior_rad <= WIDEST_PRIOR_RAD) &&
                        (Config->ScrubBlocks > 0) && (Config->LoadPieces > 0) &&
                        (Config->CameraOfImage <= 1) && (Config->Tracking <= 1);
-  if ((Status == STARCAT_IDENTIFIED) && IsSound) {
+  if ((Status == STARCAT_OK) && IsSound) {
     return CFE_SUCCESS;
   }
   CFE_EVS_SendEvent(STARCAT_APP_TABLE_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -76,7 +76,7 @@ static void TakeConfig(const STARCAT_APP_Config_t *Config) {
   } else {
     Hk->CameraSource = STARCAT_APP_CAMERA_OF_IMAGE;
     if (STARCAT_APP_Data.HasImage) {
-      starcat_camera_of(&STARCAT_APP_Data.Image, &STARCAT_APP_Data.Camera);
+      starcat_get_camera(&STARCAT_APP_Data.Image, &STARCAT_APP_Data.Camera);
     }
   }
   CFE_EVS_SendEvent(STARCAT_APP_TABLE_INF_EID, CFE_EVS_EventType_INFORMATION,

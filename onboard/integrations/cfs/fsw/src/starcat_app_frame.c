@@ -30,7 +30,7 @@ static starcat_status Identify(const starcat_frame *Frame, bool HasPrior, uint8 
   *Mode = STARCAT_APP_MODE_TRACK;
   *Steps = 0;
   if (HasPrior) {
-    Status = starcat_track(&Data->Image, &Data->Camera, &Options, Frame, Data->Prior,
+    Status = starcat_track_frame(&Data->Image, &Data->Camera, &Options, Frame, Data->Prior,
                            (starcat_real)Data->Config.Prior_rad, &Data->Work, &Data->Result);
     *Steps = Data->Result.steps;
     if ((Status == STARCAT_IDENTIFIED) || (*Steps >= Options.max_steps)) {
@@ -40,7 +40,7 @@ static starcat_status Identify(const starcat_frame *Frame, bool HasPrior, uint8 
   }
   *Mode = STARCAT_APP_MODE_IDENTIFY;
   Status =
-      starcat_identify(&Data->Image, &Data->Camera, &Options, Frame, &Data->Work, &Data->Result);
+      starcat_identify_frame(&Data->Image, &Data->Camera, &Options, Frame, &Data->Work, &Data->Result);
   *Steps += Data->Result.steps;
   return Status;
 }

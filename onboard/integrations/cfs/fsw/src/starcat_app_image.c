@@ -10,8 +10,8 @@
 #define HK (STARCAT_APP_Data.HkTlm.Payload)
 #define STARCAT_PIECE_BYTES 4096u /* of a block of an image, the unit in which it is checked */
 
-/* The two places, as words: images begin at a multiple of 8. */
-static uint64 Memory[2][STARCAT_APP_PLACE_BYTES / sizeof(uint64)];
+/* The two slots, as words: images begin at a multiple of 8. */
+static uint64 Memory[2][STARCAT_APP_SLOT_BYTES / sizeof(uint64)];
 
 /* A patch as it is read; it is applied when it is whole. */
 static uint32 Patch[STARCAT_APP_PATCH_BYTES / sizeof(uint32)];
@@ -19,20 +19,20 @@ static uint32 Patch[STARCAT_APP_PATCH_BYTES / sizeof(uint32)];
 /* After a start, a switch or damage: what is known of the image in use. */
 void STARCAT_APP_ImageInUse(starcat_status Status) {
   STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
-  Data->HasImage = Status == STARCAT_IDENTIFIED;
+  Data->HasImage = Status == STARCAT_OK;
   Data->HasPrior = false;
   HK.ImageStatus = (int16)Status;
-  HK.ActivePlace = (uint8)Data->Places.active;
+  HK.ActiveSlot = (uint8)Data->Slots.active;
   HK.ScrubBlock = 0;
   HK.ImageBytes = 0;
   memset(HK.ImageName, 0, sizeof HK.ImageName);
   memset(HK.ImageDigest, 0, sizeof HK.ImageDigest);
   if (Data->HasImage) {
-    HK.ImageBytes = (uint32)Data->Places.size[Data->Places.active];
+    HK.ImageBytes = (uint32)Data->Slots.size[Data->Slots.active];
     memcpy(HK.ImageName, Data->Image.name, sizeof HK.ImageName);
     memcpy(HK.ImageDigest, Data->Image.manifest_sha256, sizeof HK.ImageDigest);
     if (HK.CameraSource == STARCAT_APP_CAMERA_OF_IMAGE) {
-      starcat_camera_of(&Data->Image, &Data->Camera);
+      starcat_get_camera(&Data->Image, &Data->Camera);
     }
   }
 }
@@ -42,7 +42,7 @@ static void EndLoad(uint8 State) {
   HK.LoadState = State;
 }
 
-/* Open the file of an image and prepare the other place for it, or the file of a patch. */
+/* Open the file of an image and prepare the other slot for it, or the file of a patch. */
 CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch) {
   os_fstat_t Found;
   memset(&Found, 0, sizeof Found);
@@ -58,11 +58,11 @@ CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch) {
                       "STARCAT: %s cannot be opened, RC = %ld", Path, (long)Status);
     return CFE_STATUS_EXTERNAL_RESOURCE_FAIL;
   }
-  starcat_status Fits = Found.FileSize <= sizeof Patch ? STARCAT_IDENTIFIED : STARCAT_E_SHORT;
+  starcat_status Fits = Found.FileSize <= sizeof Patch ? STARCAT_OK : STARCAT_E_SHORT;
   if (!IsPatch) {
-    Fits = starcat_receive(&STARCAT_APP_Data.Places, Found.FileSize, Crc);
+    Fits = starcat_receive_image(&STARCAT_APP_Data.Slots, Found.FileSize, Crc);
   }
-  if (Fits != STARCAT_IDENTIFIED) {
+  if (Fits != STARCAT_OK) {
     EndLoad(STARCAT_APP_LOAD_FAILED);
     CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: %lu bytes of %s are no image, or too many, status %d",
@@ -79,7 +79,7 @@ CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch) {
   return CFE_SUCCESS;
 }
 
-/* Read a piece of the new image into its place, or of a patch. */
+/* Read a piece of the new image into its slot, or of a patch. */
 static void ReadPiece(void) {
   static uint8 Piece[STARCAT_PIECE_BYTES];
   const int32 Count = OS_read(STARCAT_APP_Data.LoadFile, Piece, sizeof Piece);
@@ -87,12 +87,12 @@ static void ReadPiece(void) {
   if ((Count > 0) && STARCAT_APP_Data.IsPatch) {
     if ((uint32)Count <= sizeof Patch - HK.LoadBytes) {
       memcpy((uint8 *)Patch + HK.LoadBytes, Piece, (size_t)Count);
-      Status = STARCAT_IDENTIFIED;
+      Status = STARCAT_OK;
     }
   } else if (Count > 0) {
-    Status = starcat_put(&STARCAT_APP_Data.Places, HK.LoadBytes, Piece, (size_t)Count);
+    Status = starcat_put_piece(&STARCAT_APP_Data.Slots, HK.LoadBytes, Piece, (size_t)Count);
   }
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     EndLoad(STARCAT_APP_LOAD_FAILED);
     CFE_EVS_SendEvent(STARCAT_APP_LOAD_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: the new image cannot be read at byte %lu, RC = %ld, status %d",
@@ -111,14 +111,14 @@ static void CheckLoaded(void) {
   STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
   const uint32 Blocks = Data->IsPatch ? 0u : HK.LoadSize / STARCAT_PIECE_BYTES;
   uint32_t Bad = 0;
-  starcat_status Status = Data->IsPatch ? starcat_patch(&Data->Places, Patch, HK.LoadSize)
-                                        : starcat_missing(&Data->Places, Blocks, &Bad);
-  if ((Status == STARCAT_IDENTIFIED) && !Data->IsPatch) {
-    Status = starcat_scrub(Data->Places.bytes[1u - Data->Places.active], HK.LoadSize,
+  starcat_status Status = Data->IsPatch ? starcat_apply_patch(&Data->Slots, Patch, HK.LoadSize)
+                                        : starcat_find_missing_block(&Data->Slots, Blocks, &Bad);
+  if ((Status == STARCAT_OK) && !Data->IsPatch) {
+    Status = starcat_scrub_image(Data->Slots.bytes[1u - Data->Slots.active], HK.LoadSize,
                            Data->CheckBlock, Data->Config.ScrubBlocks, &Bad);
   }
   Data->CheckBlock += Data->Config.ScrubBlocks;
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     HK.LoadState = STARCAT_APP_LOAD_FAILED;
     CFE_EVS_SendEvent(STARCAT_APP_REFUSED_ERR_EID, CFE_EVS_EventType_ERROR,
                       "STARCAT: the new image, or patch, is refused, block %lu, status %d",
@@ -132,25 +132,25 @@ static void CheckLoaded(void) {
 
 /* Make damage of the image in use good from parity; where that cannot be, use the other image. */
 static void Repair(uint32 Block) {
-  starcat_places *Places = &STARCAT_APP_Data.Places;
-  const uint32 Active = Places->active;
+  starcat_slots *Slots = &STARCAT_APP_Data.Slots;
+  const uint32 Active = Slots->active;
   uint32_t Mended = 0;
   HK.DamageFound++;
-  starcat_status Status = starcat_mend(Places->bytes[Active], Places->size[Active], &Mended);
+  starcat_status Status = starcat_mend_image(Slots->bytes[Active], Slots->size[Active], &Mended);
   HK.BlocksMended += Mended;
-  if (Status == STARCAT_IDENTIFIED) {
+  if (Status == STARCAT_OK) {
     CFE_EVS_SendEvent(STARCAT_APP_MENDED_INF_EID, CFE_EVS_EventType_INFORMATION,
                       "STARCAT: block %lu was damaged, %lu blocks were mended",
                       (unsigned long)Block, (unsigned long)Mended);
     return;
   }
-  Status = starcat_start(Places, &STARCAT_APP_Data.Image);
+  Status = starcat_start_image(Slots, &STARCAT_APP_Data.Image);
   STARCAT_APP_ImageInUse(Status);
-  if (Status == STARCAT_IDENTIFIED) {
+  if (Status == STARCAT_OK) {
     HK.FallBacks++;
     CFE_EVS_SendEvent(STARCAT_APP_FALLBACK_ERR_EID, CFE_EVS_EventType_ERROR,
-                      "STARCAT: block %lu is damaged beyond its parity, place %u took over",
-                      (unsigned long)Block, (unsigned int)HK.ActivePlace);
+                      "STARCAT: block %lu is damaged beyond its parity, slot %u took over",
+                      (unsigned long)Block, (unsigned int)HK.ActiveSlot);
   } else {
     CFE_EVS_SendEvent(STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
                       "STARCAT: block %lu is damaged beyond its parity, no image is left, status %d",
@@ -160,12 +160,12 @@ static void Repair(uint32 Block) {
 
 static void Scrub(void) {
   STARCAT_APP_Data_t *Data = &STARCAT_APP_Data;
-  const uint32 Active = Data->Places.active;
+  const uint32 Active = Data->Slots.active;
   uint32_t Bad = 0;
   const starcat_status Status =
-      starcat_scrub(Data->Places.bytes[Active], Data->Places.size[Active], HK.ScrubBlock,
+      starcat_scrub_image(Data->Slots.bytes[Active], Data->Slots.size[Active], HK.ScrubBlock,
                     Data->Config.ScrubBlocks, &Bad);
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     Repair(Bad); /* the same blocks are checked again in the next tick */
     return;
   }
@@ -194,9 +194,9 @@ void STARCAT_APP_Wakeup(const STARCAT_APP_WakeupCmd_t *Msg) {
   CFE_ES_PerfLogExit(STARCAT_APP_SCRUB_PERF_ID);
 }
 
-/* Read a file whole into the place that is not `Active` then. */
+/* Read a file whole into the slot that is not `Active` then. */
 static void ReadImage(const char *Path, uint32 Active) {
-  STARCAT_APP_Data.Places.active = Active;
+  STARCAT_APP_Data.Slots.active = Active;
   if (STARCAT_APP_BeginLoad(Path, 0, false) != CFE_SUCCESS) {
     return;
   }
@@ -207,20 +207,20 @@ static void ReadImage(const char *Path, uint32 Active) {
 
 /* Read the images of the start, and open the first one that can be used. */
 void STARCAT_APP_StartImages(void) {
-  starcat_places *Places = &STARCAT_APP_Data.Places;
+  starcat_slots *Slots = &STARCAT_APP_Data.Slots;
   os_fstat_t Found;
-  Places->bytes[0] = (uint8 *)Memory[0];
-  Places->bytes[1] = (uint8 *)Memory[1];
-  Places->capacity = sizeof Memory[0];
+  Slots->bytes[0] = (uint8 *)Memory[0];
+  Slots->bytes[1] = (uint8 *)Memory[1];
+  Slots->capacity = sizeof Memory[0];
   ReadImage(STARCAT_APP_IMAGE_FILE, 1);
   if (OS_stat(STARCAT_APP_OTHER_IMAGE_FILE, &Found) == OS_SUCCESS) {
     ReadImage(STARCAT_APP_OTHER_IMAGE_FILE, 0);
   }
-  Places->active = 0;
+  Slots->active = 0;
   HK.LoadState = STARCAT_APP_LOAD_NONE;
-  const starcat_status Status = starcat_start(Places, &STARCAT_APP_Data.Image);
+  const starcat_status Status = starcat_start_image(Slots, &STARCAT_APP_Data.Image);
   STARCAT_APP_ImageInUse(Status);
-  if (Status != STARCAT_IDENTIFIED) {
+  if (Status != STARCAT_OK) {
     CFE_EVS_SendEvent(STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
                       "STARCAT: no image can be used, status %d", (int)Status);
   }

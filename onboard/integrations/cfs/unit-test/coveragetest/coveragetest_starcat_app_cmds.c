@@ -52,7 +52,7 @@ static void TestSwitchImage(void) {
 }
 
 static void TestSwitchImageThatCannotBe(void) {
-  ONCE(starcat_switch, STARCAT_E_CRC);
+  ONCE(starcat_switch_image, STARCAT_E_CRC);
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandErrorCounter, 1);
   IS(LastEvent(), STARCAT_APP_SWITCH_ERR_EID);
@@ -62,7 +62,7 @@ static void TestSwitchImageThatCannotBe(void) {
   HK.LoadState = STARCAT_APP_LOAD_CHECKING;
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandErrorCounter, 3);
-  CALLED(starcat_switch, 1);
+  CALLED(starcat_switch_image, 1);
   CALLED(STARCAT_APP_ImageInUse, 0);
 }
 

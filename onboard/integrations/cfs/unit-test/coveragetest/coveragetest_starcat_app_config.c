@@ -12,17 +12,17 @@ static STARCAT_APP_Config_t Sound(void) {
 }
 
 static int32 Validated(STARCAT_APP_Config_t Config) {
-  ONCE(starcat_identify, STARCAT_TOO_FEW_STARS);
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
   return STARCAT_APP_ValidateConfig(&Config);
 }
 
 static void TestCheckSettings(void) {
-  ONCE(starcat_identify, STARCAT_TOO_FEW_STARS);
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
   IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
-     STARCAT_IDENTIFIED);
-  ONCE(starcat_identify, STARCAT_TOO_FEW_STARS);
-  IS(STARCAT_APP_CheckSettings(NULL, &STARCAT_APP_Data.Options), STARCAT_IDENTIFIED);
-  ONCE(starcat_identify, STARCAT_E_CAMERA);
+     STARCAT_OK);
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
+  IS(STARCAT_APP_CheckSettings(NULL, &STARCAT_APP_Data.Options), STARCAT_OK);
+  ONCE(starcat_identify_frame, STARCAT_E_CAMERA);
   IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
      STARCAT_E_CAMERA);
 }
@@ -33,7 +33,7 @@ static void TestValidate(void) {
   Config.CameraOfImage = 1;
   IS(Validated(Config), CFE_SUCCESS);
   CALLED(CFE_EVS_SendEvent, 0);
-  ONCE(starcat_identify, STARCAT_E_OPTIONS);
+  ONCE(starcat_identify_frame, STARCAT_E_OPTIONS);
   IS(STARCAT_APP_ValidateConfig(&Config), -1);
   IS(LastEvent(), STARCAT_APP_TABLE_ERR_EID);
 }
@@ -84,7 +84,7 @@ static void TestManage(void) {
   IS(STARCAT_APP_Data.Camera.focal_length_px, 1234);
   STARCAT_APP_Data.HasImage = false;
   Manage(&Config);
-  CALLED(starcat_camera_of, 1);
+  CALLED(starcat_get_camera, 1);
   CALLED(CFE_TBL_Manage, 3);
   CALLED(CFE_TBL_ReleaseAddress, 3);
 }

@@ -18,12 +18,12 @@ static void Fly(uint32 Seconds, starcat_status Track, uint32 TrackSteps, starcat
   for (uint32 n = 0; n < 9; n++) {
     Identified.covariance_rad2[n] = (starcat_real)n;
   }
-  UT_ResetState(UT_KEY(starcat_track));
-  UT_ResetState(UT_KEY(starcat_identify));
-  UT_SetDataBuffer(UT_KEY(starcat_track), &Tracked, sizeof Tracked, true);
-  UT_SetDataBuffer(UT_KEY(starcat_identify), &Identified, sizeof Identified, true);
-  UT_SetDefaultReturnValue(UT_KEY(starcat_track), Track);
-  UT_SetDefaultReturnValue(UT_KEY(starcat_identify), Identify);
+  UT_ResetState(UT_KEY(starcat_track_frame));
+  UT_ResetState(UT_KEY(starcat_identify_frame));
+  UT_SetDataBuffer(UT_KEY(starcat_track_frame), &Tracked, sizeof Tracked, true);
+  UT_SetDataBuffer(UT_KEY(starcat_identify_frame), &Identified, sizeof Identified, true);
+  UT_SetDefaultReturnValue(UT_KEY(starcat_track_frame), Track);
+  UT_SetDefaultReturnValue(UT_KEY(starcat_identify_frame), Identify);
   STARCAT_APP_Frame(&Frame);
 }
 
@@ -52,7 +52,7 @@ static void TestIdentified(void) {
   UtAssert_True(memcmp(OUT.Covariance_rad2, Kept, sizeof Kept) == 0, "covariance");
   CALLED(CFE_SB_TransmitMsg, 1);
   CALLED(CFE_ES_PerfLogAdd, 2); /* entry and exit */
-  CALLED(starcat_track, 0);
+  CALLED(starcat_track_frame, 0);
   IS(STARCAT_APP_Data.HasPrior, true);
 }
 
@@ -123,7 +123,7 @@ static void TestWithoutImage(void) {
   IS(OUT.Status, STARCAT_E_CRC);
   IS(OUT.Mode, STARCAT_APP_MODE_NONE);
   IS(OUT.Matched, 0);
-  CALLED(starcat_identify, 0);
+  CALLED(starcat_identify_frame, 0);
   CALLED(CFE_SB_TransmitMsg, 1);
 }
 

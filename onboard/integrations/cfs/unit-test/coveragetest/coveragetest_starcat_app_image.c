@@ -28,10 +28,10 @@ static void TestLoad(void) {
   IS(HK.LoadState, STARCAT_APP_LOAD_READING);
   IS(HK.LoadSize, 3 * PIECE);
   STARCAT_APP_Wakeup(NULL);
-  CALLED(starcat_put, 2);
+  CALLED(starcat_put_piece, 2);
   IS(HK.LoadBytes, 2 * PIECE);
   STARCAT_APP_Wakeup(NULL);
-  CALLED(starcat_put, 3);
+  CALLED(starcat_put_piece, 3);
   CALLED(OS_close, 1);
   IS(HK.LoadState, STARCAT_APP_LOAD_CHECKING);
   STARCAT_APP_Wakeup(NULL);
@@ -39,7 +39,7 @@ static void TestLoad(void) {
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_READY);
   IS(LastEvent(), STARCAT_APP_READY_INF_EID);
-  CALLED(starcat_scrub, 2);
+  CALLED(starcat_scrub_image, 2);
   STARCAT_APP_Wakeup(NULL); /* scrubs again */
   IS(HK.ScrubBlock, 2);
   CALLED(CFE_ES_PerfLogAdd, 10);
@@ -52,7 +52,7 @@ static void TestLoadThatCannotBegin(void) {
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_STATUS_EXTERNAL_RESOURCE_FAIL);
   IS(LastEvent(), STARCAT_APP_LOAD_ERR_EID);
   IS(HK.LoadState, STARCAT_APP_LOAD_NONE);
-  ONCE(starcat_receive, STARCAT_E_SHORT);
+  ONCE(starcat_receive_image, STARCAT_E_SHORT);
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_STATUS_VALIDATION_FAILURE);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   CALLED(CFE_EVS_SendEvent, 3);
@@ -68,10 +68,10 @@ static void TestLoadThatBreaksOff(void) {
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   IS(LastEvent(), STARCAT_APP_LOAD_ERR_EID);
   CALLED(OS_read, 1);
-  CALLED(starcat_put, 0);
+  CALLED(starcat_put_piece, 0);
   GiveFile(3);
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
-  ONCE(starcat_put, STARCAT_E_SHORT);
+  ONCE(starcat_put_piece, STARCAT_E_SHORT);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
 }
@@ -81,14 +81,14 @@ static void TestLoadOfADamagedImage(void) {
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_CHECKING);
-  ONCE(starcat_missing, STARCAT_E_CRC);
+  ONCE(starcat_find_missing_block, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
   GiveFile(1);
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
   STARCAT_APP_Wakeup(NULL);
-  ONCE(starcat_scrub, STARCAT_E_CRC);
+  ONCE(starcat_scrub_image, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
 }
@@ -96,19 +96,19 @@ static void TestLoadOfADamagedImage(void) {
 static void TestPatch(void) {
   GiveFile(1);
   IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_SUCCESS);
-  CALLED(starcat_receive, 0);
+  CALLED(starcat_receive_image, 0);
   STARCAT_APP_Wakeup(NULL);
-  CALLED(starcat_put, 0);
+  CALLED(starcat_put_piece, 0);
   IS(HK.LoadState, STARCAT_APP_LOAD_CHECKING);
   STARCAT_APP_Wakeup(NULL);
-  CALLED(starcat_patch, 1);
-  CALLED(starcat_missing, 0);
-  CALLED(starcat_scrub, 0);
+  CALLED(starcat_apply_patch, 1);
+  CALLED(starcat_find_missing_block, 0);
+  CALLED(starcat_scrub_image, 0);
   IS(HK.LoadState, STARCAT_APP_LOAD_READY);
   GiveFile(1);
   IS(STARCAT_APP_BeginLoad("/cf/x.patch", 0, true), CFE_SUCCESS);
   STARCAT_APP_Wakeup(NULL);
-  ONCE(starcat_patch, STARCAT_E_VERSION);
+  ONCE(starcat_apply_patch, STARCAT_E_VERSION);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.LoadState, STARCAT_APP_LOAD_FAILED);
   IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
@@ -135,33 +135,33 @@ static void TestScrub(void) {
   IS(HK.ScrubPasses, 1);
   STARCAT_APP_Data.HasImage = false;
   STARCAT_APP_Wakeup(NULL);
-  CALLED(starcat_scrub, 2);
+  CALLED(starcat_scrub_image, 2);
 }
 
 static void TestMend(void) {
   GiveFile(3);
-  ONCE(starcat_scrub, STARCAT_E_CRC);
+  ONCE(starcat_scrub_image, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.DamageFound, 1);
   IS(HK.BlocksMended, 2);
   IS(HK.ScrubBlock, 0);
   IS(LastEvent(), STARCAT_APP_MENDED_INF_EID);
-  CALLED(starcat_start, 0);
+  CALLED(starcat_start_image, 0);
 }
 
 static void TestFallBack(void) {
   GiveFile(3);
   HK.CameraSource = STARCAT_APP_CAMERA_OF_TABLE;
-  ONCE(starcat_scrub, STARCAT_E_CRC);
-  ONCE(starcat_mend, STARCAT_E_CRC);
+  ONCE(starcat_scrub_image, STARCAT_E_CRC);
+  ONCE(starcat_mend_image, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.FallBacks, 1);
-  IS(HK.ImageStatus, STARCAT_IDENTIFIED);
+  IS(HK.ImageStatus, STARCAT_OK);
   IS(LastEvent(), STARCAT_APP_FALLBACK_ERR_EID);
-  CALLED(starcat_camera_of, 0);
-  ONCE(starcat_scrub, STARCAT_E_CRC);
-  ONCE(starcat_mend, STARCAT_E_CRC);
-  ONCE(starcat_start, STARCAT_E_CRC);
+  CALLED(starcat_get_camera, 0);
+  ONCE(starcat_scrub_image, STARCAT_E_CRC);
+  ONCE(starcat_mend_image, STARCAT_E_CRC);
+  ONCE(starcat_start_image, STARCAT_E_CRC);
   STARCAT_APP_Wakeup(NULL);
   IS(HK.FallBacks, 1);
   IS(HK.ImageStatus, STARCAT_E_CRC);
@@ -176,24 +176,24 @@ static void TestStart(void) {
   ONCE(OS_stat, OS_SUCCESS);
   LATER(OS_stat, 1, OS_ERROR); /* no second image */
   STARCAT_APP_StartImages();
-  IS(HK.ImageStatus, STARCAT_IDENTIFIED);
+  IS(HK.ImageStatus, STARCAT_OK);
   IS(HK.ImageName[0], 'n');
   IS(HK.ImageDigest[2], 3);
   IS(STARCAT_APP_Data.Camera.focal_length_px, 1234);
   IS(HK.LoadState, STARCAT_APP_LOAD_NONE);
-  CALLED(starcat_put, 3);
+  CALLED(starcat_put_piece, 3);
 }
 
 static void TestStartOfTwo(void) {
   GiveFile(2);
   STARCAT_APP_StartImages();
-  CALLED(starcat_put, 4);
-  IS(STARCAT_APP_Data.Places.active, 0);
+  CALLED(starcat_put_piece, 4);
+  IS(STARCAT_APP_Data.Slots.active, 0);
 }
 
 static void TestStartWithoutImage(void) {
   UT_SetDefaultReturnValue(UT_KEY(OS_stat), OS_ERROR);
-  UT_SetDefaultReturnValue(UT_KEY(starcat_start), STARCAT_E_LAYOUT);
+  UT_SetDefaultReturnValue(UT_KEY(starcat_start_image), STARCAT_E_LAYOUT);
   STARCAT_APP_StartImages();
   IS(STARCAT_APP_Data.HasImage, false);
   IS(HK.ImageStatus, STARCAT_E_LAYOUT);

@@ -249,7 +249,7 @@ static void Switch(const char *Name, bool IsRight) {
   Command(STARCAT_APP_SWITCH_IMAGE_CC, NULL, 0, IsRight);
   const uint32 Took_us = Since_us(Before);
   LongestSwitch_us = Took_us > LongestSwitch_us ? Took_us : LongestSwitch_us;
-  CHECK(Hk.ImageStatus == STARCAT_IDENTIFIED);
+  CHECK(Hk.ImageStatus == STARCAT_OK);
   CHECK(strcmp(Hk.ImageName, Name) == 0);
 }
 
@@ -393,7 +393,7 @@ static void TestDamagedFiles(void) {
 
 /* Bits of the image in use are turned over, as by radiation, in the app's memory. */
 static void Upset(STARCAT_APP_Data_t *App, size_t Offset) {
-  App->Places.bytes[App->Places.active][Offset] ^= 0x10u;
+  App->Slots.bytes[App->Slots.active][Offset] ^= 0x10u;
 }
 
 static void ScrubUntil(const uint32 *Counter, uint32 Wanted) {
@@ -497,7 +497,7 @@ static void Subscribe(void) {
 static void Fly1000(void) {
   AskHk();
   CHECK(strcmp(Hk.ImageName, TEST_IMAGE_A) == 0);
-  CHECK(Hk.ImageStatus == STARCAT_IDENTIFIED);
+  CHECK(Hk.ImageStatus == STARCAT_OK);
   TestRefusals();
   Longest_us = 0;
   Fly(0, 200);
