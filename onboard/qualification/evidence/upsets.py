@@ -4,8 +4,8 @@
 
 runs upsets.c, half of the flips in double and half in single precision, and a twentieth of them
 again under ASan and UBSan where a clang for that is given. Writes upsets.html and upsets.csv; fails
-where an answer is wrong beyond the bound, a call crashes or does not end, or starcat_scrub_image does not
-name the block of a flip.
+where an answer is wrong beyond the bound, a call crashes or does not end, or starcat_scrub_image
+does not name the block of a flip.
 """
 
 from __future__ import annotations
