@@ -144,7 +144,7 @@ def _read_to_file(
     """Read catalogs, merged where there are several, into a Parquet file."""
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
-    from starcat.pipeline.merged import read_merged
+    from starcat.pipeline.reading import read_merged
     from starcat.specs.product_sections import Crossmatch
 
     paths = {name: locate(name, given) for name in names}

@@ -9,9 +9,7 @@ the build.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -19,13 +17,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
-from starcat.catalog.ingest import Ingested, unmoved_stars
+from starcat.catalog.ingest import unmoved_stars
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_source
-from starcat.progress import Progress, no_progress
+from starcat.pipeline.draft import Draft, stage
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.proper_motion import Motion, propagate
 from starcat.stars.star_table import (
@@ -45,92 +42,75 @@ OF_ENTRY = (
 """Columns of the crossmatch product that the product ``motions`` has too."""
 
 
-@dataclass(frozen=True)
-class JoinedMotions:
-    """What became of the motions of a catalog's stars."""
-
-    catalog: Ingested  # the catalog; its stars have their motions and are at the epoch of the build
-    # rows of the schema ``motions`` for all its stars, in their order; None where the spec asks for
-    # no motions
-    table: pa.Table | None = None
-    # the catalogs that motions were looked for in; ``joined`` counts all stars
-    sources: tuple[SourceFacts, ...] = ()
+def _motions_plan(spec: BuildSpec) -> str | None:
+    names = ", ".join(spec.catalog.motions)
+    return f"take proper motions from {names}, and move stars to J{spec.middle_jyear:g}"
 
 
-def join_motions(
-    catalog: Ingested,
-    spec: BuildSpec,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> JoinedMotions:
-    """Give the stars that have no proper motion those of other catalogs."""
-    if not spec.catalog.motions:
-        return JoinedMotions(catalog)
-    wanted, stars = spec.products.crossmatch, catalog.stars
+@stage(
+    "motions",
+    "read",
+    lambda spec: _motions_plan(spec) if spec.catalog.motions else None,
+    lambda spec: spec.catalog.motions,
+)
+def supply_motions(draft: Draft) -> None:
+    """Give stars without a proper motion that of other catalogs, and move them to the epoch."""
+    spec, stars = draft.spec, draft.stars
     found = _Found.of(stars)
-    sources: list[SourceFacts] = []
-    told: list[str] = []
     for name in spec.catalog.motions:
-        facts, notes, matches = match_source(
-            name, "motions", stars, wanted, inputs, workers, progress
-        )
-        found.note(matches)
-        sources.append(facts)
-        told += notes
+        found.note(match_source(name, supply_motions, stars, draft))
     moved = _with_motions(stars, found, spec.middle_jyear)
-    table = found.table(stars, moved)
+    draft.motions = found.table(stars, moved)
     # What reading said of stars that stay behind is no longer so.
-    stale = unmoved_stars(catalog.source, stars, spec.middle_jyear)
-    told = [*(note for note in catalog.notes if note not in stale), *told]
-    moved = add_nearest_neighbours(moved, workers)
-    return JoinedMotions(replace(catalog, stars=moved, notes=tuple(told)), table, tuple(sources))
+    stale = unmoved_stars(spec.catalog.source, stars, spec.middle_jyear)
+    notes = draft.notes["merge_catalogs"]
+    draft.notes["merge_catalogs"] = [note for note in notes if note not in stale]
+    draft.stars = add_nearest_neighbours(moved, draft.workers)
+    draft.catalog_bytes = draft.stars.nbytes + draft.rejected.nbytes
 
 
-def motions_of(
-    stars: pa.Table, motions: pa.Table | None, guide_stars: pa.Table
-) -> tuple[Product, ...]:
-    """Return the rows of guide stars in a table of the motions of all stars, as a product."""
-    if motions is None:
-        return ()
-    number = stars["star_id"].to_numpy()
+def guide_star_motions(draft: Draft) -> list[Product]:
+    """Return the motions of guide stars as a product; none where the spec asks for no motions."""
+    if draft.motions is None:
+        return []
+    number = draft.stars["star_id"].to_numpy()
+    guide_stars = draft.selected.guide_stars
     rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
-    table = motions.take(pa.array(rows)).combine_chunks()
+    table = draft.motions.take(pa.array(rows)).combine_chunks()
     own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
-    table = table.set_column(0, table.schema.field(0), own)
-    return (Product("motions", table, in_database=False),)
+    return [Product("motions", table.set_column(0, table.schema.field(0), own), in_database=False)]
 
 
-def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[SourceFacts]:
-    """Return what the manifest says of the catalogs of motions."""
-    facts = []
-    for source in joined.sources:
-        table = next(product.table for product in products if product.name == "motions")
-        own = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], source.source))
-        way = floats_of(table.filter(own), "moved_arcsec")
-        moved = None
+@stage(
+    "product motions",
+    "products",
+    lambda spec: "list where each motion is from" if spec.catalog.motions else None,
+)
+def list_motions(draft: Draft) -> None:
+    """List where the motions of guide stars are from, and count the stars of each catalog."""
+    (product,) = guide_star_motions(draft)
+    draft.products.append(product)
+    table = product.table
+    for number, facts in enumerate(draft.sources):
+        if facts.role != "motions":
+            continue
+        own = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], facts.source))
+        way, moved = floats_of(table.filter(own), "moved_arcsec"), None
         if len(way):
             largest, median = float(way.max()), float(np.median(way))
             moved = {"median": round(median, 6), "largest": round(largest, 6)}
-        facts.append(replace(source, joined=len(way), moved_arcsec=moved))
-    return facts
-
-
-def motion_notes(spec: BuildSpec, products: Sequence[Product]) -> tuple[str, ...]:
-    """Return a note where guide stars stay at the epoch of their catalog."""
-    outcomes = [p.table["outcome"].to_pylist() for p in products if p.name == "motions"]
-    if not outcomes:
-        return ()
-    counts = Counter(outcomes[0])
+        draft.sources[number] = replace(facts, joined=len(way), moved_arcsec=moved)
+    counts, spec = Counter(table["outcome"].to_pylist()), draft.spec
     unmoved = sorted(counts.keys() - {JOINED, OWN_MOTION})
-    if not unmoved:
-        return ()
-    reasons = ", ".join(f"{name} {counts[name]:,}" for name in unmoved)
-    return (
-        f"{spec.catalog.source}: {sum(counts[name] for name in unmoved):,} of {counts.total():,} "
-        f"guide stars have no motion in {', '.join(spec.catalog.motions)} and are not moved to "
-        f"J{spec.middle_jyear:g} ({reasons}); the product motions lists them",
-    )
+    if unmoved:
+        reasons = ", ".join(f"{name} {counts[name]:,}" for name in unmoved)
+        draft.note(
+            "supply_motions",
+            f"{spec.catalog.source}: {sum(counts[name] for name in unmoved):,} of "
+            f"{counts.total():,} guide stars have no motion in {', '.join(spec.catalog.motions)} "
+            f"and are not moved to J{spec.middle_jyear:g} ({reasons}); the product motions lists "
+            "them",
+        )
 
 
 @dataclass

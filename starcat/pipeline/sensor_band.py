@@ -6,79 +6,54 @@ Catalogs whose photometry is used as well are matched by the cross-identificatio
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.manifest import SourceFacts
 from starcat.bands.response import Response
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
 from starcat.pipeline.counterparts import read_and_match, source_facts
-from starcat.progress import Progress, no_progress
+from starcat.pipeline.draft import Draft, stage
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import add_nearest_neighbours
 
 
-@dataclass(frozen=True)
-class SensorBand:
-    """The stars in the band that limits are in, and what a user should know of it."""
-
-    stars: pa.Table
-    made: InBand | None = None  # None where the band is the catalog's
-    sources: tuple[SourceFacts, ...] = ()  # the catalogs whose photometry is used as well
-    notes: tuple[str, ...] = ()
+def _band_plan(spec: BuildSpec) -> str | None:
+    wanted = spec.camera.response
+    if wanted.name is None:
+        return None
+    others = f", also from {', '.join(wanted.photometry)}" if wanted.photometry else ""
+    return f"predict magnitudes in {wanted.name}{others}"
 
 
-def in_band_of(
-    stars: pa.Table,
-    spec: BuildSpec,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> SensorBand:
-    """Return the stars of a spec's catalog in the band of its sensor."""
+@stage("photometry", "read", _band_plan, lambda spec: spec.camera.response.photometry)
+def to_sensor_band(draft: Draft) -> None:
+    """Predict the magnitudes of stars in the band of the sensor."""
+    spec, stars = draft.spec, draft.stars
     response = spec.camera.response.response()
     if response is None:
-        return SensorBand(stars)
+        return
     others: list[Other] = []
-    sources: list[SourceFacts] = []
-    notes: list[str] = []
     for name in spec.camera.response.photometry:
-        other, facts, told = _photometry(name, stars, response, spec, inputs, workers, progress)
-        others.append(other)
-        sources.append(facts)
-        notes += told
-    made = in_sensor_band(stars, spec.catalog.source, response, others)
+        others.append(_photometry(name, response, draft))
+    draft.in_band = in_sensor_band(stars, spec.catalog.source, response, others)
     # The neighbours' differences of magnitude are the sensor's too.
-    stars = add_nearest_neighbours(made.stars, workers)
-    return SensorBand(stars, made, tuple(sources), (*notes, *_notes(made, spec)))
+    draft.stars = add_nearest_neighbours(draft.in_band.stars, draft.workers)
+    draft.note(to_sensor_band.name, *_notes(draft.in_band, spec))
 
 
-def _photometry(
-    name: str,
-    stars: pa.Table,
-    response: Response,
-    spec: BuildSpec,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int,
-    progress: Progress,
-) -> tuple[Other, SourceFacts, Sequence[str]]:
-    """Return what another catalog says of the magnitudes of stars, and what it is."""
-    read, matches = read_and_match(
-        name, "photometry", stars, spec.products.crossmatch, inputs, workers, progress
-    )
+def _photometry(name: str, response: Response, draft: Draft) -> Other:
+    """Return what a source says of the magnitudes of stars, and add what was read to the draft."""
+    read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
     is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
     best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
     place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
-    other = other_of(
-        read.stars.take(pa.array(place)), best["star"].to_numpy().astype(np.int64), name, response
-    )
-    own = source_facts(read, "photometry")
-    return other, replace(own, joined=len(best)), read.notes
+    rows = best["star"].to_numpy().astype(np.int64)
+    draft.sources.append(replace(source_facts(read, "photometry"), joined=len(best)))
+    draft.note(to_sensor_band.name, *read.notes)
+    return other_of(read.stars.take(pa.array(place)), rows, name, response)
 
 
 def _notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
