@@ -16,7 +16,7 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.errors import ConfigError
 from starcat.pipeline.build import build
-from starcat.pipeline.merged import read_merged
+from starcat.pipeline.reading import read_merged
 from starcat.pipeline.rebuild import rebuild
 from starcat.specs.product_sections import Crossmatch
 from starcat.specs.reading import spec_from_dict
