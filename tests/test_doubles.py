@@ -28,7 +28,7 @@ from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import reading_keys
-from starcat.pipeline.reading import supply_doubles
+from starcat.pipeline.supply import supply_doubles
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec, Selection
 from starcat.specs.doubtful_stars import Doubles

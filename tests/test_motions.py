@@ -33,8 +33,8 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.draft import Draft, run
-from starcat.pipeline.motions import guide_star_motions, supply_motions
 from starcat.pipeline.rebuild import rebuild
+from starcat.pipeline.supply import guide_star_motions, supply_motions
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict

@@ -18,8 +18,8 @@ from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.motions import guide_star_motions
 from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.supply import guide_star_motions
 from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information

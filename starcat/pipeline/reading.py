@@ -22,14 +22,12 @@ import pyarrow.compute as pc
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.other_catalogs import matched_stars
 from starcat.bands.response import shipped, shipped_names
-from starcat.catalog.doubles import PairTable, read_wds
 from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
 from starcat.catalog.observed import with_observed
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import with_span
-from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.errors import ConfigError
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.draft import Draft, Inputs, stage
@@ -80,8 +78,10 @@ def read_catalogs(draft: Draft) -> None:
 def merge_catalogs(draft: Draft) -> None:
     """Make the star catalogs one, with a row a star."""
     spec = draft.spec
-    neighbours = draft.workers if len(draft.read) > 1 and not spec.catalog.motions else 0
-    whole = merged_catalog(draft.read, spec.products.crossmatch, neighbours)
+    neighbours = not spec.catalog.motions
+    whole = merged_catalog(
+        draft.read, spec.products.crossmatch, draft.workers, neighbours=neighbours
+    )
     draft.read = []
     draft.stars, draft.rejected, draft.problems = whole.stars, whole.rejected, whole.problems
     draft.catalog_bytes = whole.stars.nbytes + whole.rejected.nbytes
@@ -95,49 +95,6 @@ def merge_catalogs(draft: Draft) -> None:
         reasons = count_by_reason(rejected, part.beyond_read_limit)
         facts = SourceFacts(part.source, "stars", part.files, rows, len(stars), reasons)
         draft.sources.append(replace(facts, map=map_of(part.source)))
-
-
-def _join_plan(what: str, names: Sequence[str]) -> str | None:
-    return f"take {what} from {', '.join(names)}" if names else None
-
-
-@stage(
-    "amplitudes",
-    "read",
-    lambda spec: _join_plan("amplitudes of variable stars", spec.selection.variables.join),
-    lambda spec: spec.selection.variables.join,
-)
-def supply_amplitudes(draft: Draft) -> None:
-    """Give stars the amplitudes that other sources know."""
-    for name in draft.spec.selection.variables.join:
-        _join(draft, "supply_amplitudes", read_amplitudes(name, draft.paths[name], draft.progress))
-
-
-@stage(
-    "doubles",
-    "read",
-    lambda spec: _join_plan("companions", spec.selection.doubles.join),
-    lambda spec: spec.selection.doubles.join,
-)
-def supply_doubles(draft: Draft) -> None:
-    """Flag stars with the companions that other sources know."""
-    for name in draft.spec.selection.doubles.join:
-        _join(draft, "supply_doubles", read_wds(draft.paths[name], draft.progress))
-
-
-def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:
-    """Join what a source says to the stars that it knows."""
-    draft.stars, joined = table.join(draft.stars, draft.spec.selection)
-    rows = sum(file.rows for file in table.files)
-    facts = (table.source, table.role, table.files, rows, table.kept, table.rejected, joined)
-    draft.sources.append(SourceFacts(*facts))
-    if not joined:
-        draft.note(
-            stage_name,
-            f"{table.source} says nothing of any star of {draft.spec.catalog.source}: a joined "
-            "source knows stars by their numbers in other catalogs or by place. Join a file that "
-            "has what these stars have, or leave it out",
-        )
 
 
 def _flight_plan(spec: BuildSpec) -> str | None:
@@ -183,46 +140,22 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
             )
 
 
-def read_merged(
-    names: Sequence[str],
-    paths: Mapping[str, Sequence[Path]],
-    wanted: Crossmatch,
-    *,
-    band: str | None = None,
-    epoch_jyear: float | None = None,
-    read_limit_mag: float | None = None,
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> Ingested:
-    """Read several catalogs, the better one first, as one with a row a star.
-
-    The band is that of the first; the read limit is in each catalog's own.
-    """
-    read = read_all(
-        names,
-        paths,
-        band=band,
-        epoch_jyear=epoch_jyear,
-        read_limit_mag=read_limit_mag,
-        workers=workers,
-        progress=progress,
-    )
-    progress("merge", 0, None)
-    return merged_catalog(read, wanted, workers if len(names) > 1 else 0)
-
-
 def read_all(
     names: Sequence[str],
     paths: Mapping[str, Sequence[Path]],
     *,
-    band: str | None,
-    epoch_jyear: float | None,
-    read_limit_mag: float | None,
-    workers: int,
-    progress: Progress,
+    band: str | None = None,
+    epoch_jyear: float | None = None,
+    read_limit_mag: float | None = None,
     neighbours: bool = True,
+    workers: int = 2,
+    progress: Progress = no_progress,
 ) -> list[Ingested]:
-    """Read several catalogs. Nearest neighbours are found only where it is one."""
+    """Read several catalogs, the better one first, to be merged.
+
+    The band is that of the first; the read limit is in each catalog's own. Nearest neighbours are
+    found only where there is one catalog.
+    """
     return [
         read_catalog(
             name,
@@ -238,10 +171,12 @@ def read_all(
     ]
 
 
-def merged_catalog(read: Sequence[Ingested], wanted: Crossmatch, workers: int) -> Ingested:
-    """Return several catalogs as one; the workers find nearest neighbours, 0 leaves that out."""
+def merged_catalog(
+    read: Sequence[Ingested], wanted: Crossmatch, workers: int, *, neighbours: bool = True
+) -> Ingested:
+    """Return several catalogs as one with a row a star; of a single one nothing changes."""
     whole = reduce(partial(_joined, wanted=wanted), read)
-    if not workers:
+    if len(read) == 1 or not neighbours:
         return whole
     return replace(whole, stars=add_nearest_neighbours(whole.stars, workers))
 

@@ -17,17 +17,20 @@ from starcat.pipeline.finish import (
     write_database,
 )
 from starcat.pipeline.guide_stars import check_cost, select, thin, tile
-from starcat.pipeline.motions import list_motions, supply_motions
 from starcat.pipeline.reading import (
     apply_flight_terms,
     apply_span,
     check_inputs,
     merge_catalogs,
     read_catalogs,
+)
+from starcat.pipeline.supply import (
+    list_motions,
     supply_amplitudes,
     supply_doubles,
+    supply_motions,
+    to_sensor_band,
 )
-from starcat.pipeline.sensor_band import to_sensor_band
 from starcat.specs.build_spec import BuildSpec
 
 READ = (

@@ -1,14 +1,16 @@
-"""Proper motions for stars whose own catalog has none, from other catalogs.
+"""The stages that take from other sources what the catalogs of the stars lack.
 
-Each star is matched with the entries of a catalog by the cross-identification of the product
-``crossmatch``: an entry is moved by its own motion to the epoch of the star's position and
-compared there. The star keeps its position and gets the motion, which takes it to the epoch of
-the build.
+Motions and photometry are those of entries that are matched by the cross-identification of the
+product ``crossmatch``, one catalog at a time. An entry is moved by its own motion to the epoch of
+the star's position and compared there. The star keeps its position and gets the motion, which takes
+it to the epoch of the build. Photometry is that of the entry that is a star's only or by far
+likeliest one.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,11 +19,16 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
+from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
+from starcat.bands.response import Response
+from starcat.catalog.doubles import PairTable, read_wds
 from starcat.catalog.ingest import unmoved_stars
+from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
+from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.geometry.sphere import separation
-from starcat.pipeline.counterparts import match_source
+from starcat.pipeline.counterparts import match_source, read_and_match, source_facts
 from starcat.pipeline.draft import Draft, stage
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.proper_motion import Motion, propagate
@@ -43,16 +50,13 @@ OF_ENTRY = (
 
 
 def _motions_plan(spec: BuildSpec) -> str | None:
+    if not spec.catalog.motions:
+        return None
     names = ", ".join(spec.catalog.motions)
     return f"take proper motions from {names}, and move stars to J{spec.middle_jyear:g}"
 
 
-@stage(
-    "motions",
-    "read",
-    lambda spec: _motions_plan(spec) if spec.catalog.motions else None,
-    lambda spec: spec.catalog.motions,
-)
+@stage("motions", "read", _motions_plan, lambda spec: spec.catalog.motions)
 def supply_motions(draft: Draft) -> None:
     """Give stars without a proper motion that of other catalogs, and move them to the epoch."""
     spec, stars = draft.spec, draft.stars
@@ -111,6 +115,104 @@ def list_motions(draft: Draft) -> None:
             f"and are not moved to J{spec.middle_jyear:g} ({reasons}); the product motions lists "
             "them",
         )
+
+
+def _join_plan(what: str, names: Sequence[str]) -> str | None:
+    return f"take {what} from {', '.join(names)}" if names else None
+
+
+@stage(
+    "amplitudes",
+    "read",
+    lambda spec: _join_plan("amplitudes of variable stars", spec.selection.variables.join),
+    lambda spec: spec.selection.variables.join,
+)
+def supply_amplitudes(draft: Draft) -> None:
+    """Give stars the amplitudes that other sources know."""
+    for name in draft.spec.selection.variables.join:
+        _join(draft, "supply_amplitudes", read_amplitudes(name, draft.paths[name], draft.progress))
+
+
+@stage(
+    "doubles",
+    "read",
+    lambda spec: _join_plan("companions", spec.selection.doubles.join),
+    lambda spec: spec.selection.doubles.join,
+)
+def supply_doubles(draft: Draft) -> None:
+    """Flag stars with the companions that other sources know."""
+    for name in draft.spec.selection.doubles.join:
+        _join(draft, "supply_doubles", read_wds(draft.paths[name], draft.progress))
+
+
+def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:
+    """Join what a source says to the stars that it knows."""
+    draft.stars, joined = table.join(draft.stars, draft.spec.selection)
+    rows = sum(file.rows for file in table.files)
+    facts = (table.source, table.role, table.files, rows, table.kept, table.rejected, joined)
+    draft.sources.append(SourceFacts(*facts))
+    if not joined:
+        draft.note(
+            stage_name,
+            f"{table.source} says nothing of any star of {draft.spec.catalog.source}: a joined "
+            "source knows stars by their numbers in other catalogs or by place. Join a file that "
+            "has what these stars have, or leave it out",
+        )
+
+
+def _band_plan(spec: BuildSpec) -> str | None:
+    wanted = spec.camera.response
+    if wanted.name is None:
+        return None
+    others = f", also from {', '.join(wanted.photometry)}" if wanted.photometry else ""
+    return f"predict magnitudes in {wanted.name}{others}"
+
+
+@stage("photometry", "read", _band_plan, lambda spec: spec.camera.response.photometry)
+def to_sensor_band(draft: Draft) -> None:
+    """Predict the magnitudes of stars in the band of the sensor."""
+    spec, stars = draft.spec, draft.stars
+    response = spec.camera.response.response()
+    if response is None:
+        return
+    others: list[Other] = []
+    for name in spec.camera.response.photometry:
+        others.append(_photometry(name, response, draft))
+    draft.in_band = in_sensor_band(stars, spec.catalog.source, response, others)
+    # The neighbours' differences of magnitude are the sensor's too.
+    draft.stars = add_nearest_neighbours(draft.in_band.stars, draft.workers)
+    draft.note(to_sensor_band.name, *_band_notes(draft.in_band, spec))
+
+
+def _photometry(name: str, response: Response, draft: Draft) -> Other:
+    """Return what a source says of the magnitudes of stars, and add what was read to the draft."""
+    read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
+    is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
+    best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
+    place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
+    rows = best["star"].to_numpy().astype(np.int64)
+    draft.sources.append(replace(source_facts(read, "photometry"), joined=len(best)))
+    draft.note(to_sensor_band.name, *read.notes)
+    return other_of(read.stars.take(pa.array(place)), rows, name, response)
+
+
+def _band_notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
+    notes = []
+    alone = made.counts.get(f"{made.band}{ALONE}", 0)
+    if alone:
+        notes.append(
+            f"{spec.catalog.source}: {alone:,} of {len(made.stars):,} stars have neither colour "
+            f"nor spectral type; their magnitudes in {made.response.name} are those of a star of "
+            "the mean colour, with an error to match; camera.response.photometry names catalogs "
+            "that know more of them"
+        )
+    if spec.catalog.read_limit_mag is not None:
+        notes.append(
+            f"catalog.read_limit_mag {spec.catalog.read_limit_mag:g} is in the catalog's band "
+            f"{made.band}, the limits of [selection] are in {made.response.name}: it has to be so "
+            "faint that no star that the sensor sees is left out"
+        )
+    return tuple(notes)
 
 
 @dataclass
