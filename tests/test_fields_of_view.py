@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import chosen
 from scipy.spatial import cKDTree
 
 from starcat.catalog.ingest import ingest
@@ -117,14 +118,12 @@ def test_rows_are_estimated(name, limit_mag, sky_of):
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    from starcat.pipeline.guide_stars import select_stars
-
     def make(limit_mag: float) -> ProductInputs:
         spec = preset(
             "gaia-12deg", {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"}
         )
-        selected, fields = select_stars(embedded_stars(), spec)
-        return ProductInputs(directions_of(selected.guide_stars), fields, spec)
+        draft = chosen(embedded_stars(), spec)
+        return ProductInputs(directions_of(draft.selected.guide_stars), draft.fields, spec)
 
     return make
 

@@ -1,9 +1,12 @@
-"""The guide stars of a build: selected, thinned to the tiling where asked, and counted.
+"""The stages that choose guide stars: selected, thinned to the tiling where asked, and counted.
 
 Selection knows nothing of fields; what a spec asks of a field is looked after here.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +16,10 @@ from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
+from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.supply import guide_star_motions
 from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
@@ -34,28 +40,82 @@ POOL = 2.0
 """Times as many stars of a field as stay on average, the brightest, may stay by another rule."""
 
 
-def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars]:
-    """Select guide stars, thin them if the spec says so, and tile the sphere."""
-    selected = thinned_stars(stars, spec)
-    fields = tile_guide_stars(selected.guide_stars, spec)
-    check_fields(fields, spec)
-    return selected, fields
+def _select_plan(spec: BuildSpec) -> str:
+    limits = spec.selection
+    return f"select stars of {limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag"
 
 
-def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
-    """Select guide stars, and thin them if the spec says so."""
-    selected = select_guide_stars(stars, spec.selection, spec.camera.camera().pixel_arcsec)
-    check_guide_stars(selected, spec)
+@stage("select", "select", _select_plan)
+def select(draft: Draft) -> None:
+    """Select guide stars by the rules of the spec, which know nothing of fields."""
+    spec = draft.spec
+    pixel_arcsec = spec.camera.camera().pixel_arcsec
+    draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
+    check_guide_stars(draft.selected, spec)
+    draft.note(select.name, *depth_notes(draft.stars, spec))
+
+
+def _thin_plan(spec: BuildSpec) -> str | None:
+    thinning, most = spec.selection.thinning, spec.selection.max_stars_per_field
+    if thinning != "brightest":
+        return f"thin stars by {thinning}"
+    return None if most is None else f"keep the {most} brightest stars of every field"
+
+
+@stage("thin", "select", _thin_plan)
+def thin(draft: Draft) -> None:
+    """Keep the stars that fields need."""
+    spec, stars = draft.spec, draft.selected.guide_stars
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
         reason = Reason.beyond_count if most is None else Reason.density
-        selected = reject_dense(selected, even_stars(selected.guide_stars, spec), reason)
+        draft.selected = reject_dense(draft.selected, even_stars(stars, spec), reason)
     elif most is not None:
-        selected = reject_dense(selected, brightest_of_fields(selected.guide_stars, spec, most))
-    else:
-        return selected
-    check_guide_stars(selected, spec)
-    return selected
+        draft.selected = reject_dense(draft.selected, brightest_of_fields(stars, spec, most))
+    check_guide_stars(draft.selected, spec)
+
+
+def _tile_plan(spec: BuildSpec) -> str:
+    return f"tile the sphere with {spec.boresights.count:,} fields, and find the stars of each"
+
+
+@stage("tile", "select", _tile_plan)
+def tile(draft: Draft) -> None:
+    """Tile the sphere, and find the guide stars of each field."""
+    draft.fields = tile_guide_stars(draft.selected.guide_stars, draft.spec)
+    with refusing(draft):
+        check_fields(draft.fields, draft.spec)
+
+
+@stage("cost", "select", lambda spec: "estimate files, memory and time; end where memory is short")
+def check_cost(draft: Draft) -> None:
+    """Estimate files, memory and time, and end a build that has not the memory."""
+    selected, size = draft.selected, draft.rejected_bytes
+    if size is None:
+        size = table_bytes(pa.concat_tables([draft.rejected, selected.rejected]))
+    draft.cost = whole_cost(
+        selected.guide_stars,
+        draft.fields,
+        draft.spec,
+        size,
+        base_memory(draft.catalog_bytes),
+        guide_star_motions(draft),
+    )
+    if draft.announce is not None:
+        draft.announce(draft.cost)
+    with refusing(draft):
+        check_memory(draft.cost, draft.spec, draft.max_memory_bytes)
+
+
+@contextmanager
+def refusing(draft: Draft) -> Iterator[None]:
+    """Keep why the spec cannot be built, where the draft is that of an estimate."""
+    try:
+        yield
+    except BuildError as error:
+        if draft.refusals is None:
+            raise
+        draft.refusals.append(error)
 
 
 def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:

@@ -22,8 +22,16 @@ from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import data_source, star_sources
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
-from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
-from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
+from starcat.pipeline.draft import Draft
+from starcat.pipeline.estimate import (
+    Estimate,
+    choose_stars,
+    chosen_bytes,
+    estimate,
+    magnitude_range,
+    read_draft,
+    reading_keys,
+)
 from starcat.pipeline.guide_stars import MOST_FIELD_STARS
 from starcat.pipeline.starter import Starter, enough_limit, starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -93,18 +101,18 @@ class Catalogs:
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        # Pairs of CatalogSnapshot and CatalogRead; one that is larger than the limit is alone.
-        self._read: LRUCache[str, tuple[CatalogSnapshot, CatalogRead]] = LRUCache(
-            READ_BYTES, lambda pair: min(pair[0].nbytes, READ_BYTES)
+        # Drafts that were read; one that is larger than the limit is alone.
+        self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
+            READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
         )
-        self._choices: LRUCache[Any, Choice] = LRUCache(CHOICE_BYTES, lambda choice: choice.nbytes)
+        self._choices: LRUCache[Any, Draft] = LRUCache(CHOICE_BYTES, chosen_bytes)
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
         self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
         self._limiter = Limiter(AT_ONCE, AT_ONCE)
         self._lock = threading.RLock()
-        self._underway: dict[str, Future[CatalogSnapshot]] = {}
+        self._underway: dict[str, Future[Draft]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
@@ -162,12 +170,12 @@ class Catalogs:
         if found is None:
             read = self.read(spec, key)
             with self._slot():
-                deepest = read.magnitudes[1] if read.magnitudes else np.inf
+                _, deepest = magnitude_range(read.stars) or (np.inf, np.inf)
                 found = enough_limit(read.stars, spec), deepest
             self._cache(self._limits, part, found)
         return found
 
-    def read(self, spec: BuildSpec, key: str | None = None) -> CatalogSnapshot:
+    def read(self, spec: BuildSpec, key: str | None = None) -> Draft:
         """Return the catalogs of a spec; read them where that was not done yet."""
         key = self._key(spec) if key is None else key
         found = self._cached(self._read, key)
@@ -200,8 +208,8 @@ class Catalogs:
         with self._lock:
             self._underway.pop(key, None)
 
-    def _read_files(self, key: str, spec: BuildSpec) -> CatalogSnapshot:
-        found = read_snapshot(spec, {})
+    def _read_files(self, key: str, spec: BuildSpec) -> Draft:
+        found = read_draft(spec, {})
         self._cache(self._read, key, (found, _facts(spec, found)))
         return found
 
@@ -213,7 +221,7 @@ class Catalogs:
         with self._lock, suppress(ValueError):  # larger than the cache
             cache[key] = value
 
-    def _choice(self, read: CatalogSnapshot, key: str, spec: BuildSpec) -> Choice:
+    def _choice(self, read: Draft, key: str, spec: BuildSpec) -> Draft:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["levels"] = content["products"]["levels"]
@@ -306,8 +314,13 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
     return found
 
 
-def _facts(spec: BuildSpec, read: CatalogSnapshot) -> CatalogRead:
-    mags = read.magnitudes
+def _bytes_of(read: Draft) -> int:
+    """Return the memory that a draft that was read takes."""
+    return int(read.stars.nbytes + (0 if read.motions is None else read.motions.nbytes))
+
+
+def _facts(spec: BuildSpec, read: Draft) -> CatalogRead:
+    mags = magnitude_range(read.stars)
     band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
     return CatalogRead(
         spec.catalog.source,
