@@ -22,7 +22,7 @@ from starcat.pipeline.cost import PART_ROWS, PARTS, table_bytes
 from starcat.pipeline.estimate import Estimate, choose_stars, estimate, estimate_spec
 from starcat.pipeline.guide_stars import brightest_of_fields, select_stars
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.products.boresights import NominalField, stars_in_fields
+from starcat.products.tiling import NominalField, stars_in_fields
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
 from starcat.stars.star_table import with_columns

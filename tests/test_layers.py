@@ -55,7 +55,7 @@ LIGHT = {
     "starcat.arrays",
     "starcat.errors",
     "starcat.storage.hdf5",
-    "starcat.storage.product_table",
+    "starcat.products.layouts",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),

@@ -24,7 +24,6 @@ from astropy.time import Time
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION
-from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
@@ -33,6 +32,7 @@ from starcat.catalog.source import data_source
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.motions import JoinedMotions, join_motions, motions_of
 from starcat.pipeline.rebuild import rebuild
+from starcat.products.motions import OUTCOMES, motion_problems
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict

@@ -34,13 +34,7 @@ from starcat.pipeline.guide_stars import depth_notes, select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.merged import read_merged
 from starcat.pipeline.motions import join_motions, motion_notes, motion_sources, motions_of
-from starcat.pipeline.recipes import (
-    RECIPES,
-    ProductInputs,
-    boresight_product,
-    level_product,
-    make_product,
-)
+from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
 from starcat.pipeline.report_data import (
     BuildResults,
     FilterCoverage,
@@ -50,8 +44,8 @@ from starcat.pipeline.report_data import (
     report_content,
 )
 from starcat.pipeline.sensor_band import in_band_of
-from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
+from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport, coverage_warnings, write_report
 from starcat.simulation.selftest import Rates, self_test
@@ -277,16 +271,11 @@ def make_products(
     products = [
         Product("stars", selected.guide_stars),
         Product("rejected", sort_rows(rejected, order), in_database=False),
-        boresight_product(fields, spec.boresights.brightest),
     ]
-    product_inputs = ProductInputs(directions_of(selected.guide_stars), fields, spec)
-    for name in RECIPES:
-        if getattr(spec.products, name).enabled:
-            progress(f"product {name}", 0, None)
-            products.append(make_product(name, product_inputs))
-    if spec.products.levels.enabled:
-        progress("product levels", 0, None)
-        products.append(level_product(selected.guide_stars, spec))
+    given = product_inputs(selected.guide_stars, fields, spec)
+    for name in recipe_names(given):
+        progress(f"product {name}", 0, None)
+        products.append(make_product(name, given))
     return products
 
 

@@ -29,7 +29,6 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
     CoverageSummary,
@@ -39,6 +38,7 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.levels import boresights_of_level, level_fields
+from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
 from starcat.specs.build_spec import BuildSpec, Selection

@@ -14,9 +14,9 @@ from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Reason

@@ -17,14 +17,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.other_catalogs import matched_stars
 from starcat.bands.response import shipped, shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.errors import ConfigError
 from starcat.pipeline.counterparts import match_tables
+from starcat.products.crossmatch import Crossmatch, matched_stars
 from starcat.progress import Progress, no_progress
-from starcat.specs.product_sections import Crossmatch
 from starcat.stars.star_table import add_nearest_neighbours, reject_rows, sort_rows, with_columns
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema

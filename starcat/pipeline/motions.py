@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, unmoved_stars
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_source
+from starcat.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.proper_motion import Motion, propagate

@@ -22,9 +22,9 @@ from starcat.catalog.source import map_of
 from starcat.catalog.span import Validity
 from starcat.catalog.variability import AmplitudeTable
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
 from starcat.products.evenness import evenness_of
+from starcat.products.tiling import FieldStars, tile_sphere
 from starcat.report.report import (
     CoverageReport,
     count_magnitudes,
