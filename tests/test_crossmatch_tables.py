@@ -17,8 +17,8 @@ from jsonschema import Draft202012Validator
 
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.other_catalogs import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
+from starcat.products.table import Products
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
@@ -33,11 +33,16 @@ from starcat.pipeline.counterparts import (
     with_rivals,
 )
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import VERDICTS
+from starcat.products.crossmatch import (
+    Crossmatch,
+    counterpart_problems,
+    matched_stars,
+    moving_stars,
+)
 from starcat.products.match_figures import ARCSEC
+from starcat.products.match_stars import VERDICTS
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.proper_motion import MAS, Motion, propagate
 from starcat.stars.star_table import with_columns

@@ -30,7 +30,7 @@ from starcat.pipeline.estimate import (
 )
 from starcat.pipeline.guide_stars import brightest_of_fields
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.products.boresights import NominalField, stars_in_fields
+from starcat.products.tiling import NominalField, stars_in_fields
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
 from starcat.stars.star_table import with_columns

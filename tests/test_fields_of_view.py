@@ -31,9 +31,9 @@ from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
 from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
-from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
-from starcat.products.pairs_and_triangles import find_triangles
+from starcat.products.tiling import stars_in_fields, tile_sphere
+from starcat.products.triangles import find_triangles
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset

@@ -70,7 +70,7 @@ LIGHT = {
     "starcat.errors",
     "starcat.rooms",
     "starcat.storage.hdf5",
-    "starcat.storage.product_table",
+    "starcat.products.layouts",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),

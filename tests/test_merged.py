@@ -18,7 +18,7 @@ from starcat.errors import ConfigError
 from starcat.pipeline.build import build
 from starcat.pipeline.reading import merged_catalog, read_all
 from starcat.pipeline.rebuild import rebuild
-from starcat.specs.product_sections import Crossmatch
+from starcat.products.crossmatch import Crossmatch
 from starcat.specs.reading import spec_from_dict
 
 STARS = 4000

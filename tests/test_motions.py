@@ -25,7 +25,6 @@ from drafts import merged
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION
-from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
@@ -35,6 +34,7 @@ from starcat.pipeline.build import Built, build
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.supply import guide_star_motions, supply_motions
+from starcat.products.motions import OUTCOMES, motion_problems
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict

@@ -18,7 +18,7 @@ import pytest
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.products.pairs_and_triangles import find_pairs
+from starcat.products.pairs import find_pairs
 from starcat.simulation.simulate import Noise, simulate_frames
 
 ONBOARD = Path(__file__).parents[1] / "onboard"

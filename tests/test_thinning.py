@@ -29,7 +29,6 @@ from starcat.pipeline import guide_stars
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import even_stars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, NominalField, reach_rad, tile_sphere
 from starcat.products.evenness import (
     ARCSEC,
     distribution_entropy,
@@ -40,6 +39,7 @@ from starcat.products.evenness import (
     spread_of_errors,
 )
 from starcat.products.thinning import POWER, PRIOR, cell_areas, thin_by_cells, thin_by_information
+from starcat.products.tiling import FieldStars, NominalField, reach_rad, tile_sphere
 from starcat.simulation.selftest import answers_rightly
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.specs.reading import preset, spec_from_dict

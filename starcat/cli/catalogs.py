@@ -149,7 +149,7 @@ def _read_to_file(
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
     from starcat.pipeline.reading import merged_catalog, read_all
-    from starcat.specs.product_sections import Crossmatch
+    from starcat.products.crossmatch import Crossmatch
 
     paths = {name: locate(name, given) for name in names}
     with progress_bars() as progress:
@@ -192,7 +192,7 @@ def crossmatch(
     """
     from starcat.exchange.formats import expect_parquet
     from starcat.pipeline.counterparts import match_files
-    from starcat.specs.product_sections import Crossmatch
+    from starcat.products.crossmatch import Crossmatch
 
     expect_parquet(output)
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))

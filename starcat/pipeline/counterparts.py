@@ -16,23 +16,23 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.other_catalogs import (
-    NEEDED,
-    counterparts_of,
-    matched_stars,
-    moving_stars,
-    table_from_matches,
-)
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
 from starcat.catalog.source import map_of
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.draft import Draft, Stage, stage
-from starcat.products.crossmatch import VERDICTS, candidate_pairs, crossmatch
+from starcat.products.crossmatch import (
+    NEEDED,
+    Crossmatch,
+    counterparts_of,
+    matched_stars,
+    moving_stars,
+    table_from_matches,
+)
 from starcat.products.match_figures import ARCSEC, MatchModel
+from starcat.products.match_stars import VERDICTS, candidate_pairs, crossmatch
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.product_sections import Crossmatch
 from starcat.stars.star_table import sort_rows
 from starcat.stars.verdict import Reason
 from starcat.storage.parquet import write_table

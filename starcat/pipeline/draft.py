@@ -26,7 +26,7 @@ from starcat.errors import BuildError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.log import Stopwatch
 from starcat.pipeline.report_data import FilterCoverage
-from starcat.products.boresights import FieldStars
+from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport
 from starcat.simulation.selftest import Rates

@@ -31,7 +31,6 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.recipes import field_size
 from starcat.pipeline.stages import READ
-from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
     CoverageSummary,
@@ -41,6 +40,7 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.levels import boresights_of_level, level_fields
+from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
 from starcat.specs.build_spec import BuildSpec, Observed, Selection

@@ -19,15 +19,10 @@ from starcat.catalog.span import validity
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.recipes import (
-    RECIPES,
-    ProductInputs,
-    boresight_product,
-    level_product,
-    make_product,
-)
+from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
 from starcat.pipeline.report_data import coverage_report, filter_coverages
 from starcat.products.coverage import field_coverage
+from starcat.products.table import PRODUCTS
 from starcat.progress import Progress
 from starcat.report.report import count_magnitudes, coverage_warnings, write_report
 from starcat.report.sensor_band import band_content
@@ -44,17 +39,13 @@ takes half a second."""
 _logger = logging.getLogger(__name__)
 
 
-def _enabled(spec: BuildSpec) -> list[str]:
-    """Return the products of a spec that are made from guide stars alone."""
-    names = [name for name in RECIPES if getattr(spec.products, name).enabled]
-    return [*names, "levels"] if spec.products.levels.enabled else names
+def _products_task(spec: BuildSpec) -> str:
+    names = (name for name, kind in PRODUCTS.items() if kind.make is not None)
+    made = [name for name in names if name in spec.products.wanted]
+    return f"make {', '.join(('stars', 'rejected', 'boresights', *made))}"
 
 
-@stage(
-    "products",
-    "products",
-    lambda spec: f"make {', '.join(('stars', 'rejected', 'boresights', *_enabled(spec)))}",
-)
+@stage("products", "products", _products_task)
 def make_products(draft: Draft) -> None:
     """Make the products that need nothing but guide stars and their fields."""
     spec, selected, fields = draft.spec, draft.selected, draft.fields
@@ -64,15 +55,11 @@ def make_products(draft: Draft) -> None:
     draft.products += [
         Product("stars", selected.guide_stars),
         Product("rejected", sort_rows(rejected, order), in_database=False),
-        boresight_product(fields, spec.boresights.brightest),
     ]
-    inputs = ProductInputs(directions_of(selected.guide_stars), fields, spec)
-    for name in _enabled(spec):
+    given = product_inputs(selected.guide_stars, fields, spec)
+    for name in recipe_names(given):
         draft.progress(f"product {name}", 0, None)
-        is_levels = name == "levels"
-        draft.products.append(
-            level_product(selected.guide_stars, spec) if is_levels else make_product(name, inputs)
-        )
+        draft.products.append(make_product(name, given))
 
 
 def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:

@@ -20,9 +20,9 @@ from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_
 from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.pipeline.supply import guide_star_motions
-from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Reason

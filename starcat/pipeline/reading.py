@@ -20,7 +20,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.other_catalogs import matched_stars
 from starcat.bands.response import shipped, shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
 from starcat.catalog.observed import with_observed
@@ -31,9 +30,9 @@ from starcat.catalog.span import with_span
 from starcat.errors import ConfigError
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.draft import Draft, Inputs, stage
+from starcat.products.crossmatch import Crossmatch, matched_stars
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, Observed
-from starcat.specs.product_sections import Crossmatch
 from starcat.stars.star_table import add_nearest_neighbours, reject_rows, sort_rows, with_columns
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema

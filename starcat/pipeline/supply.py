@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
 from starcat.bands.response import Response
 from starcat.catalog.doubles import PairTable, read_wds
@@ -30,6 +29,7 @@ from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_source, read_and_match, source_facts
 from starcat.pipeline.draft import Draft, stage
+from starcat.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.proper_motion import Motion, propagate
 from starcat.stars.star_table import (

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StringConstraints, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.products.kind import SpecFacts
+from starcat.products.table import Products
 from starcat.sections import (
     NAME_PATTERN,
     SOURCE_NAME,
@@ -31,11 +33,6 @@ from starcat.specs.camera_response import CameraResponse
 from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
 from starcat.specs.neighbour_rule import NeighbourRule
-from starcat.specs.product_sections import Products
-
-MOST_BINS = 10_000_000
-"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
-
 
 SHA256_PATTERN = r"^[0-9a-f]{64}$"
 Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
@@ -364,15 +361,6 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
-    def _counterparts_in_other_catalogs(self) -> BuildSpec:
-        if self.catalog.source in self.products.crossmatch.catalogs:
-            raise ValueError(
-                f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
-                "themselves; name others"
-            )
-        return self
-
-    @model_validator(mode="after")
     def _photometry_of_other_catalogs(self) -> BuildSpec:
         named = self.camera.response.photometry
         if self.catalog.source in named or len(set(named)) != len(named):
@@ -393,32 +381,15 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
-    def _levels_are_wider(self) -> BuildSpec:
-        wanted, own_deg = self.products.levels, self.camera.camera().fov_x_deg
-        if not wanted.enabled:
-            return self
-        if not self.products.triangles.enabled:
-            raise ValueError(
-                "products.levels: they begin where the product triangles ends; set "
-                "products.triangles.enabled = true"
-            )
-        if wanted.widest_fov_x_deg <= own_deg:
-            raise ValueError(
-                f"products.levels: widest_fov_x_deg {wanted.widest_fov_x_deg:g} is not above the "
-                f"camera's own field, {own_deg:.4g} deg; the camera is the narrow end of the range"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _look_up_table_of_a_size(self) -> BuildSpec:
-        wanted = self.products.neighbours
-        radius_deg = wanted.radius_deg or self.camera.half_field_deg
-        bins = 360.0 / wanted.angle_bin_deg * radius_deg / wanted.separation_bin_deg
-        if bins > MOST_BINS:
-            raise ValueError(
-                f"products.neighbours: angle_bin_deg and separation_bin_deg make {bins:,.0f} bins; "
-                f"at most {MOST_BINS:,} fit. Make the bins wider or radius_deg smaller"
-            )
+    def _products_agree(self) -> BuildSpec:
+        facts = SpecFacts(
+            self.catalog.source,
+            self.camera.camera(),
+            self.camera.half_field_deg,
+            tuple(self.products.wanted),
+        )
+        for section in self.products.sections.values():
+            section.check_agrees(facts)
         return self
 
     @property
@@ -450,16 +421,25 @@ class BuildSpec(Section):
     @property
     def fields_deg(self) -> tuple[float, float]:
         """Narrowest and widest horizontal field of view that the database is for."""
-        own_deg, levels = self.camera.camera().fov_x_deg, self.products.levels
-        return own_deg, levels.widest_fov_x_deg if levels.enabled else own_deg
+        own_deg = self.camera.camera().fov_x_deg
+        return own_deg, max(
+            each.widest_field_deg(own_deg) for each in self.products.sections.values()
+        )
+
+    @property
+    def is_for_a_range(self) -> bool:
+        """Whether the database serves fields of view that are wider than the camera's."""
+        narrowest, widest = self.fields_deg
+        return widest > narrowest
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
-        wanted = self.products.crossmatch
         names = [*self.catalog.catalogs, *self.catalog.motions, *self.joins]
         names += self.camera.response.photometry
-        return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
+        for section in self.products.sections.values():
+            names += section.sources
+        return tuple(dict.fromkeys(names))
 
     def __repr__(self) -> str:
         camera = self.camera.camera()

@@ -22,8 +22,8 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.estimate import Estimate
 from starcat.pipeline.starter import LimitRow, Starter
-from starcat.products.boresights import FieldStars
 from starcat.products.coverage import CoverageSummary, Spread
+from starcat.products.tiling import FieldStars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import spec_from_dict
 from starcat.workers.channel import Channel, return_free_memory

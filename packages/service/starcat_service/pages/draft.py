@@ -19,6 +19,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
 from starcat.specs.reading import (
@@ -64,17 +65,6 @@ FIELDS = (
     "selection.neighbours.action",
 )
 """Keys that the form has a field for, by the same names."""
-
-PRODUCTS = (
-    "pairs",
-    "triangles",
-    "neighbours",
-    "hausdorff_angular",
-    "hausdorff_l2",
-    "grid",
-    "radial",
-)
-"""Products that the form has a box for."""
 
 _OF_LENS = {"field": ("camera.focal_length_mm", "camera.pixel_um"), "focal": ("camera.fov_x_deg",)}
 """What goes away where a camera is told by the one or by the other."""
@@ -181,7 +171,7 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
         draft,
         values=values,
         lens="focal" if form.get(LENS) == "focal" else "field",
-        products={name: f"products.{name}.{ENABLED}" in form for name in PRODUCTS},
+        products={name: f"products.{name}.{ENABLED}" in form for name in USUAL_PRODUCTS},
         bands=bands_of(form.get("catalog.source", "")),
         responses=responses_of(values[NAME]),
     )
@@ -214,7 +204,8 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
                 wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN))
     has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
     enabled = {
-        name: value_at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS
+        name: value_at(content, f"products.{name}.{ENABLED}") is not False
+        for name in USUAL_PRODUCTS
     }
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
@@ -316,7 +307,7 @@ def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
     if lens in _OF_LENS:
         _change_lens(edit, lens)
     if "products" in form:
-        for name in PRODUCTS:
+        for name in USUAL_PRODUCTS:
             is_wanted = f"products.{name}.{ENABLED}" in form
             if is_wanted != (value_at(content, f"products.{name}.{ENABLED}") is not False):
                 edit.put(f"products.{name}.{ENABLED}", None if is_wanted else False)

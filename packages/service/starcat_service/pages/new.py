@@ -14,6 +14,7 @@ from starlette.datastructures import UploadFile
 from starcat.catalog.source import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.pipeline.starter import advice
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.build_spec import CameraSpec
 from starcat.specs.reading import preset, preset_names
 from starcat_service.access import Reader, principal_of
@@ -28,7 +29,6 @@ from starcat_service.pages.design import (
     query_of,
 )
 from starcat_service.pages.draft import (
-    PRODUCTS,
     TEXT,
     Draft,
     draft_of_content,
@@ -198,7 +198,7 @@ def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
         "boresights.count": boresights.count,
         "boresights.brightest": boresights.brightest,
     }
-    for name in PRODUCTS:
+    for name in USUAL_PRODUCTS:
         changes[f"products.{name}.enabled"] = False if name in starter.left_out else None
     fov = camera.camera()
     told = (

@@ -1,6 +1,8 @@
-"""The product table: columns, indices, numbers and ranges of each product in a database.
+"""Layouts: the columns, indices, numbers and ranges of the products that the matcher opens.
 
-The writer, ``starcat verify`` and the matcher read it. Units and meanings are in the schemas.
+The matcher checks every dataset that it maps against them, and it runs where neither pydantic nor
+pyarrow is installed. This module therefore needs nothing, and the modules of the products take
+their layouts from it. Units and meanings are in the schemas.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ class ProductLayout:
         return (*self.columns, *lists, *self.indices)
 
 
-PRODUCTS: dict[str, ProductLayout] = {
+LAYOUTS: dict[str, ProductLayout] = {
     "stars": ProductLayout(
         texts=("designation",), wholes=("star_id",), reals=("x", "y", "z", "mag")
     ),
@@ -130,9 +132,4 @@ PRODUCTS: dict[str, ProductLayout] = {
         lists=dict.fromkeys(("stars", "i", "j", "k"), lambda _, count: count),
     ),
 }
-"""The products of a database, by name."""
-
-
-def indices_of(product: str) -> tuple[str, ...]:
-    """Return the datasets that stand beside the columns of a product; most have none."""
-    return PRODUCTS[product].indices if product in PRODUCTS else ()
+"""The products that a method of the matcher reads, by name."""

@@ -1,8 +1,7 @@
-"""Star pairs by separation, and triangles of the brightest stars of each field by area.
+"""The product ``triangles``: those of the brightest stars of each field, by area, with a K-vector.
 
-Both have a K-vector over what they are sorted by. The sides of a triangle are great-circle
-separations and the triangle is the plane one with those sides, so that its features do not depend
-on where in a frame it lies.
+The sides of a triangle are great-circle separations and the triangle is the plane one with those
+sides, so that its features do not depend on where in a frame it lies.
 """
 
 from __future__ import annotations
@@ -14,53 +13,28 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Directions
-from starcat.geometry.kvector import KVector, build_kvector
+from starcat.arrays import Directions
+from starcat.geometry.kvector import build_kvector
 from starcat.geometry.patterns import triangle_area
-from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import separation
-from starcat.products.boresights import FieldStars
+from starcat.products.counting import count_triangles
 from starcat.products.index import Index, kvector_index
+from starcat.products.kind import (
+    Extent,
+    ProductInputs,
+    ProductKind,
+    ProductSection,
+    RowCost,
+    star_row_bytes,
+)
+from starcat.products.layouts import LAYOUTS
+from starcat.products.tiling import FieldStars
+
+POSITION = 50
 
 
-@dataclass(frozen=True)
-class StarPairs:
-    """All pairs of stars within a range of separations."""
-
-    # i, j: shape (M,): rows of the star table, i < j
-    i: NDArray[np.int32]
-    j: NDArray[np.int32]
-    # over the separations, radians; ``kvector.values`` are the separations themselves, ascending,
-    # equal ones in order of (i, j)
-    kvector: KVector
-
-    @property
-    def index(self) -> Index:
-        """The K-vector as the database holds it."""
-        return kvector_index(self.kvector)
-
-    @property
-    def separation_rad(self) -> Array:
-        """Separations in radians, ascending, shape (M,)."""
-        return self.kvector.values
-
-
-def find_pairs(
-    directions: Directions, min_separation_rad: float, max_separation_rad: float
-) -> StarPairs:
-    """Find all pairs of stars whose separation lies in a range.
-
-    The interval is closed; the rows are sorted by (separation, i, j).
-    """
-    found, angle = pairs_within(directions, max_separation_rad)
-    far = angle >= min_separation_rad
-    found, angle = found[far].astype(np.int32), angle[far]
-    order = np.argsort(angle)
-    if bool(np.any(np.diff(angle[order]) == 0.0)):
-        # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
-        order = np.argsort(angle, kind="stable")
-    i, j = found[order, 0], found[order, 1]
-    return StarPairs(i, j, build_kvector(angle[order]))
+class Triangles(ProductSection):
+    """Triangles of the brightest stars of each boresight's field (S4)."""
 
 
 _PACKED_BITS = 21  # three row numbers of so many bits fit into one int64
@@ -68,7 +42,7 @@ AT_ONCE = 1 << 19  # number of triangles whose features are computed together
 
 
 @dataclass(frozen=True)
-class Triangles:
+class FieldTriangles:
     """Distinct triangles, by area."""
 
     # i, j, k: shape (M,): rows of the star table, i < j < k
@@ -90,7 +64,7 @@ class Triangles:
         return int(self.times_seen.sum())
 
 
-def find_triangles(fields: FieldStars, directions: Directions, brightest: int) -> Triangles:
+def find_triangles(fields: FieldStars, directions: Directions, brightest: int) -> FieldTriangles:
     """Find all triangles of the brightest stars of each field.
 
     Sorted by (area, i, j, k); n stars of a field make n (n - 1) (n - 2) / 6. Collinear
@@ -104,7 +78,7 @@ def find_triangles(fields: FieldStars, directions: Directions, brightest: int) -
     order = np.argsort(narrow, kind="stable")
     kvector = kvector_index(build_kvector(narrow[order].astype(np.float64)))
     i, j, k = np.ascontiguousarray(stars[order].astype(np.int32).T)
-    return Triangles(
+    return FieldTriangles(
         i,
         j,
         k,
@@ -178,3 +152,28 @@ def _distinct_rows(
     is_first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     first = np.flatnonzero(is_first)
     return rows[first], np.diff(first, append=len(rows))
+
+
+def _make(inputs: ProductInputs, wanted: Triangles) -> FieldTriangles:
+    return find_triangles(inputs.fields, inputs.directions, inputs.brightest)
+
+
+def _count(inputs: ProductInputs, wanted: Triangles) -> Extent:
+    records, distinct = count_triangles(inputs.fields, len(inputs.directions), inputs.brightest)
+    return Extent(distinct, reached=distinct, records=records)
+
+
+def _file_bytes(extent: Extent, stars: int, wanted: Triangles) -> float:
+    shape = 9.0  # of area, sides, angles and how many fields have it
+    return extent.rows * (3.0 * star_row_bytes(stars) + shape)
+
+
+KIND = ProductKind(
+    name="triangles",
+    make=_make,
+    section=Triangles,
+    layout=LAYOUTS["triangles"],
+    count=_count,
+    cost=RowCost(34.0, 50.0, 2.6),
+    file_bytes=_file_bytes,
+)
