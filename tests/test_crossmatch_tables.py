@@ -22,7 +22,6 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
@@ -36,6 +35,7 @@ from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
 from starcat.products.match_figures import ARCSEC
 from starcat.resources import resource_folder
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict

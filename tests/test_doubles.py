@@ -20,7 +20,6 @@ from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
-from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
@@ -28,8 +27,10 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.pipeline.build import build, join_all, join_notes
 from starcat.pipeline.catalog_snapshot import reading_keys
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Selection
-from starcat.specs.doubtful_stars import Doubles
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import select_guide_stars
+from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.stars.proper_motion import Motion, propagate
 from starcat.stars.star_table import floats_of, table_from_columns

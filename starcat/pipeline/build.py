@@ -21,7 +21,6 @@ from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.doubles import PairTable, read_wds
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.observed import with_observed
-from starcat.catalog.selection import Selected
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import validity, with_span
 from starcat.catalog.variability import AmplitudeTable, read_amplitudes
@@ -54,6 +53,7 @@ from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport, coverage_warnings, write_report
+from starcat.selection.selecting import Selected
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, sort_rows

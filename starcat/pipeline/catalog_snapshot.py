@@ -18,7 +18,8 @@ from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
 from starcat.pipeline.sensor_band import in_band_of
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec, Observed
+from starcat.selection.rules.distrust import Observed
+from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import floats_of
 
 SECONDS_PER_RECORD = 4.5e-6

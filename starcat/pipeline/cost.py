@@ -20,12 +20,12 @@ import pyarrow.compute as pc
 from starcat.artifact.database import stored_dtype
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
 from starcat.errors import BuildError
 from starcat.pipeline.counts import Extent, LevelExtent, count_levels, count_products
 from starcat.pipeline.log import available_memory_bytes
 from starcat.pipeline.recipes import ProductInputs, boresight_product
 from starcat.products.boresights import FieldStars
+from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes

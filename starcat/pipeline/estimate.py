@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
@@ -41,9 +40,12 @@ from starcat.products.coverage import (
 from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
-from starcat.specs.build_spec import BuildSpec, Selection
+from starcat.selection.rules.magnitude import TOO_FAINT
+from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
+from starcat.selection.ruleset import ALL_REASONS, Selection
+from starcat.selection.selecting import Selected
+from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import floats_of, reject_rows, sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 
 MOST_FOR_GAPS = 50_000
@@ -81,11 +83,11 @@ def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
     _check_levels(len(selected.guide_stars), spec)
     fields = tile_guide_stars(selected.guide_stars, spec)
     blank = len(mag) - int(np.searchsorted(mag, np.inf))
-    found = dict.fromkeys((reason.name for reason in Reason), 0)
+    found = dict.fromkeys(ALL_REASONS, 0)
     for counts in (
         read.rejected,
         count_by_reason(selected.rejected),
-        {Reason.no_magnitude.name: blank, Reason.too_faint.name: len(mag) - len(bright) - blank},
+        {NO_MAGNITUDE.name: blank, TOO_FAINT.name: len(mag) - len(bright) - blank},
     ):
         for name, count in counts.items():
             found[name] += count
@@ -208,7 +210,7 @@ def _rejected_bytes(read: CatalogSnapshot, choice: Choice, spec: BuildSpec) -> i
     faint = np.flatnonzero(~(mag <= _faintest(spec.selection)))  # or of no magnitude
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
-    some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
+    some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
     listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
     size = table_bytes(listed, len(seen) + len(faint))
     return size + read.rejected_bytes

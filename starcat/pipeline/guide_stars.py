@@ -10,16 +10,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
+from starcat.selection.rules.count import BEYOND_COUNT
+from starcat.selection.rules.density import DENSITY
+from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Reason
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
@@ -48,7 +49,7 @@ def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
     check_guide_stars(selected, spec)
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
-        reason = Reason.beyond_count if most is None else Reason.density
+        reason = BEYOND_COUNT if most is None else DENSITY
         selected = reject_dense(selected, even_stars(selected.guide_stars, spec), reason)
     elif most is not None:
         selected = reject_dense(selected, brightest_of_fields(selected.guide_stars, spec, most))

@@ -16,7 +16,6 @@ from starcat.artifact.reader import Artifact
 from starcat.artifact.writer import Product
 from starcat.catalog.doubles import PairTable
 from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
-from starcat.catalog.selection import NeighbourTally, Selected, Step
 from starcat.catalog.sensor_band import InBand
 from starcat.catalog.source import map_of
 from starcat.catalog.span import Validity
@@ -32,10 +31,12 @@ from starcat.report.report import (
     report_coverage,
 )
 from starcat.report.sensor_band import band_content
+from starcat.selection.rules.neighbours import NeighbourTally
+from starcat.selection.ruleset import ALL_REASONS
+from starcat.selection.selecting import Selected, Step
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Reason
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def report_content(folder: Path, results: BuildResults, coverage: CoverageReport
         "frame": "ICRS",
         "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
         "sources": sources,
-        "reasons": {reason.name: reason.value for reason in Reason if reason.name in found},
+        "reasons": {name: words for name, words in ALL_REASONS.items() if name in found},
         "products": products,
         "database_bytes": (folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in results.filters],

@@ -23,8 +23,8 @@ from rows import Options, Rows, ended, fresh
 from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.pipeline.recipes import RECIPES, ProductInputs, make_product, tile_guide_stars
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.stars.star_table import directions_of
