@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import NeighbourTally, Selected, select_guide_stars
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.images.centroiding import centres_of_mass, find_spots
@@ -28,8 +27,9 @@ from starcat.pipeline.build import build
 from starcat.pipeline.estimate import choose_stars, count_rejected, read_draft
 from starcat.pipeline.guide_stars import depth_notes
 from starcat.products.blends import Blends, blends, widths_px
-from starcat.specs.build_spec import Selection
-from starcat.specs.neighbour_rule import NeighbourRule
+from starcat.selection.rules.neighbours import NeighbourRule, NeighbourTally
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.stars.verdict import Quality

@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
+from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.artifact.reader import open_artifact
 from starcat.catalog.ingest import count_by_reason, ingest
-from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build

@@ -15,14 +15,13 @@ import pytest
 from artifact_copies import copied, seal
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.diff import diff_artifacts
-from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import open_artifact
 from starcat.products.table import Products
+from starcat.artifact.diff import diff_artifacts
+from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
@@ -42,6 +41,7 @@ from starcat.products.crossmatch import (
 from starcat.products.match_figures import ARCSEC
 from starcat.products.match_stars import VERDICTS
 from starcat.resources import resource_folder
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.proper_motion import MAS, Motion, propagate

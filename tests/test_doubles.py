@@ -21,7 +21,6 @@ from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
-from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
@@ -30,8 +29,10 @@ from starcat.pipeline.build import build
 from starcat.pipeline.estimate import reading_keys
 from starcat.pipeline.supply import supply_doubles
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Selection
-from starcat.specs.doubtful_stars import Doubles
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import select_guide_stars
+from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.stars.proper_motion import Motion, propagate
 from starcat.stars.star_table import floats_of, table_from_columns

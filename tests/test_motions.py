@@ -24,7 +24,7 @@ from astropy.time import Time
 from drafts import merged
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION
+from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
@@ -219,7 +219,7 @@ def test_every_guide_star_is_listed_once(artifact, built):
 
 def test_the_manifest_says_what_came_from_where(artifact, inputs):
     manifest = artifact.manifest
-    schema = (resource_folder("schemas") / f"manifest-{MOTIONS_VERSION}.json").read_text()
+    schema = (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
     Draft202012Validator(json.loads(schema)).validate(manifest)
     assert [(s["source"], s["role"]) for s in manifest["sources"]] == [
         ("gaia", "stars"),

@@ -21,13 +21,13 @@ import pyarrow.compute as pc
 from starcat.artifact.database import stored_dtype
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
 from starcat.errors import BuildError
 from starcat.pipeline.log import available_memory_bytes
 from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
 from starcat.products.kind import Extent, ProductInputs, RowCost
 from starcat.products.table import PRODUCTS
 from starcat.products.tiling import FieldStars
+from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
 from starcat.storage.schema import product_schema

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
 from starcat.catalog.source import map_of
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.draft import Draft, Stage, stage
@@ -32,9 +31,10 @@ from starcat.products.crossmatch import (
 )
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.products.match_stars import VERDICTS, candidate_pairs, crossmatch
+from starcat.selection.merging import MERGED
+from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
@@ -118,7 +118,7 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     entry elsewhere. Stars that were merged into a guide star are part of it.
     """
     guide_stars = selected.guide_stars.select(NEEDED)
-    apart = pc.not_equal(selected.rejected["reason"], Reason.merged.name)
+    apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
     rejected = selected.rejected.filter(apart)["star_id"].combine_chunks()
     others = stars.select(NEEDED).filter(pc.is_in(stars["star_id"], rejected))
     near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)

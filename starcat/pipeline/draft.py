@@ -19,7 +19,6 @@ import pyarrow as pa
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
 from starcat.catalog.sensor_band import InBand
 from starcat.catalog.span import Validity
 from starcat.errors import BuildError
@@ -29,6 +28,7 @@ from starcat.pipeline.report_data import FilterCoverage
 from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport
+from starcat.selection.selecting import Selected
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 

@@ -43,9 +43,12 @@ from starcat.products.levels import boresights_of_level, level_fields
 from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
-from starcat.specs.build_spec import BuildSpec, Observed, Selection
+from starcat.selection.rules.distrust import Observed
+from starcat.selection.rules.magnitude import TOO_FAINT
+from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
+from starcat.selection.ruleset import ALL_REASONS, Selection
+from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import floats_of, reject_rows, sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 
 SECONDS_PER_RECORD = 4.5e-6
@@ -141,11 +144,11 @@ def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
     mag = floats_of(read.stars, "mag")
     blank = int(np.count_nonzero(~(mag < np.inf)))
     bright = int(np.count_nonzero(_is_bright(mag, chosen.spec.selection)))
-    found = dict.fromkeys((reason.name for reason in Reason), 0)
+    found = dict.fromkeys(ALL_REASONS, 0)
     for counts in (
         *(source.rejected for source in read.sources if source.role == "stars"),
         count_by_reason(chosen.selected.rejected),
-        {Reason.no_magnitude.name: blank, Reason.too_faint.name: len(mag) - bright - blank},
+        {NO_MAGNITUDE.name: blank, TOO_FAINT.name: len(mag) - bright - blank},
     ):
         for name, count in counts.items():
             found[name] += count
@@ -243,7 +246,7 @@ def _rejected_bytes(read: Draft, chosen: Draft) -> int:
     faint = np.flatnonzero(~_is_bright(floats_of(read.stars, "mag"), chosen.spec.selection))
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
-    some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
+    some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
     listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
     return table_bytes(listed, len(seen) + len(faint)) + (read.rejected_bytes or 0)
 

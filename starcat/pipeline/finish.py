@@ -26,10 +26,10 @@ from starcat.products.table import PRODUCTS
 from starcat.progress import Progress
 from starcat.report.report import count_magnitudes, coverage_warnings, write_report
 from starcat.report.sensor_band import band_content
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of, sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
@@ -183,7 +183,7 @@ def report_content(draft: Draft) -> dict[str, Any]:
         "frame": "ICRS",
         "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
         "sources": sources,
-        "reasons": {reason.name: reason.value for reason in Reason if reason.name in found},
+        "reasons": {name: words for name, words in ALL_REASONS.items() if name in found},
         "products": products,
         "database_bytes": (draft.folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in draft.filters],

@@ -13,7 +13,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
@@ -23,9 +22,11 @@ from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
 from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.selection.rules.count import BEYOND_COUNT
+from starcat.selection.rules.density import DENSITY
+from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Reason
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
@@ -68,7 +69,7 @@ def thin(draft: Draft) -> None:
     spec, stars = draft.spec, draft.selected.guide_stars
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
-        reason = Reason.beyond_count if most is None else Reason.density
+        reason = BEYOND_COUNT if most is None else DENSITY
         draft.selected = reject_dense(draft.selected, even_stars(stars, spec), reason)
     elif most is not None:
         draft.selected = reject_dense(draft.selected, brightest_of_fields(stars, spec, most))

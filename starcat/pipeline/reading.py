@@ -32,7 +32,8 @@ from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.draft import Draft, Inputs, stage
 from starcat.products.crossmatch import Crossmatch, matched_stars
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec, Observed
+from starcat.selection.rules.distrust import Observed
+from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import add_nearest_neighbours, reject_rows, sort_rows, with_columns
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema

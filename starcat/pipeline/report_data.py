@@ -9,12 +9,12 @@ import numpy as np
 
 from starcat.arrays import Directions
 from starcat.artifact.reader import Artifact
-from starcat.catalog.selection import Step
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
 from starcat.products.evenness import evenness_of
 from starcat.products.tiling import FieldStars, tile_sphere
 from starcat.report.report import CoverageReport, report_coverage
+from starcat.selection.selecting import Step
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of
 

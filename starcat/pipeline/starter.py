@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError, OutputError
@@ -31,6 +30,7 @@ from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.products.tiling import tile_sphere
 from starcat.progress import Progress, no_progress
+from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_exposure import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import spec_toml

@@ -23,9 +23,9 @@ from rows import Options, Rows, ended, fresh
 from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
 from starcat.products.table import USUAL_PRODUCTS
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.storage.parquet import write_parquet

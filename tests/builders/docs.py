@@ -16,8 +16,8 @@ from starcat.cli.main import app
 from starcat.pipeline.stages import CHOOSE, FINISH, PRODUCTS, READ
 from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import read_schema
 from starcat_lab.report.files import reproduction_page
 
@@ -64,7 +64,7 @@ def products_page() -> str:
         page.append("")
     page.append("## Reasons\n\nWhy a record is not a guide star, in the order in which they are")
     page.append("tried; the first that applies is the verdict.\n\n| reason | meaning |\n|---|---|")
-    page += [f"| {reason.name} | {reason.value} |" for reason in Reason]
+    page += [f"| {name} | {words} |" for name, words in ALL_REASONS.items()]
     return "\n".join(page) + "\n"
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import rates_of
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
@@ -107,7 +108,7 @@ def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     for source in manifest["sources"]:
         if source["role"] == "stars":
             counts.update(source["rejected"])
-    words = {reason.name: reason.value for reason in Reason}
+    words = ALL_REASONS
     return [
         {
             "name": name.replace("_", " "),
