@@ -68,7 +68,7 @@ def error_of_kind(
     found = globals().get(kind)
     if not (isinstance(found, type) and issubclass(found, StarcatError)):
         return None
-    if issubclass(found, ConfigError):
+    if issubclass(found, ConfigError | BuildError):
         return found(words, key=key, fields=tuple(fields))
     return None if issubclass(found, OnboardSizeError) else found(words, fields=tuple(fields))
 
@@ -173,6 +173,7 @@ class DownloadError(SourceError):
 class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
+    key: str | None = None  # the key of the spec to change
     built: object = None  # after a self-test: `starcat.pipeline.build.Built`, its folder gone
 
 
@@ -270,3 +271,7 @@ class QueryLimitError(QueryError):
     """A query that was stopped: it took too long, or more memory than it may."""
 
     exit_code = 1
+
+
+class AnswerTooLarge(QueryLimitError):  # noqa: N818 - the name reads as the fact
+    """The answer of a query is larger than it may be."""

@@ -14,8 +14,8 @@ from starcat.geometry.sphere import (
     saff_kuijlaars,
     separation,
 )
-from starcat.products.boresights import FieldStars, NominalField, stars_in_fields, tile_sphere
-from starcat.products.pairs_and_triangles import find_pairs
+from starcat.products.pairs import find_pairs
+from starcat.products.tiling import FieldStars, NominalField, stars_in_fields, tile_sphere
 
 # Both sides round their coordinates; nothing else differs.
 ROUNDING_RAD = 1e-15

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import chosen
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -18,18 +19,17 @@ from scipy.spatial.transform import Rotation
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import NeighbourTally, Selected, select_guide_stars
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.images.centroiding import centres_of_mass, find_spots
 from starcat.images.render import Optics, render_image, star_electrons
 from starcat.pipeline.build import build
-from starcat.pipeline.catalog_snapshot import read_snapshot
-from starcat.pipeline.estimate import choose_stars
-from starcat.pipeline.guide_stars import depth_notes, select_stars
+from starcat.pipeline.estimate import choose_stars, count_rejected, read_draft
+from starcat.pipeline.guide_stars import depth_notes
 from starcat.products.blends import Blends, blends, widths_px
-from starcat.specs.build_spec import Selection
-from starcat.specs.neighbour_rule import NeighbourRule
+from starcat.selection.rules.neighbours import NeighbourRule, NeighbourTally
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.stars.verdict import Quality
@@ -491,12 +491,14 @@ def wide_spec(small_spec: str, action: str, most: int | None = None) -> Any:
 @pytest.mark.parametrize("most", [None, 5])
 def test_stars_are_chosen_by_an_estimate_as_in_a_build(small_spec, sao_file, action, most):
     spec = wide_spec(small_spec, action, most)
-    read = read_snapshot(spec, {"sao": [sao_file]})
-    selected, fields = select_stars(read.stars, spec)
-    found = choose_stars(read, spec)
+    read = read_draft(spec, {"sao": [sao_file]})
+    built, found = chosen(read.stars, spec), choose_stars(read, spec)
+    selected = built.selected
     assert found.selected.guide_stars.equals(selected.guide_stars)
-    assert np.array_equal(found.fields.star_index, fields.star_index)
-    assert sum(found.rejected.values()) == len(selected.rejected) + sum(read.rejected.values())
+    assert np.array_equal(found.fields.star_index, built.fields.star_index)
+    [source] = read.sources
+    rejected = count_rejected(read, found)
+    assert sum(rejected.values()) == len(selected.rejected) + sum(source.rejected.values())
     assert selected.neighbours is not None
     assert action != "merge" or selected.neighbours.absorbed > 0
 

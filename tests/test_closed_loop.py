@@ -1,4 +1,4 @@
-"""The star tracker for Basilisk, in an environment that has Basilisk and ``onboard/basilisk``."""
+"""The star tracker for Basilisk, in an environment that has ``onboard/integrations/basilisk``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def python() -> str:
     if found is None:
         pytest.skip(
             "set STARCAT_BASILISK_PYTHON to the Python of an environment in which "
-            "`pip install ./onboard/basilisk` was run"
+            "`pip install ./onboard/integrations/basilisk` was run"
         )
     return found
 

@@ -15,15 +15,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
+from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.artifact.reader import open_artifact
 from starcat.catalog.ingest import count_by_reason, ingest
-from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import check_fields
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.products.boresights import FieldStars, NominalField, tile_sphere
 from starcat.products.coverage import (
     coverage_from_counts,
     covering_radius,
@@ -31,6 +30,7 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
+from starcat.products.tiling import FieldStars, NominalField, tile_sphere
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 

@@ -21,9 +21,9 @@ from starcat.geometry.sphere import (
     separation,
     tangent_axes,
 )
-from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, TILES, MagnitudeCounts, MatchModel
 from starcat.products.match_odds import pair_probabilities
+from starcat.products.match_stars import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
 
 Array = NDArray[np.float64]
 
@@ -537,7 +537,7 @@ def test_searches_in_pieces_find_the_same(random_directions, monkeypatch):
     u = random_directions(5000, 9)
     stars, others = moving(*radec_from_directions(u)), moving(*radec_from_directions(u[::-1]))
     whole = candidate_pairs(stars, others, 0.01)
-    monkeypatch.setattr("starcat.products.crossmatch.CHUNK", 700)
+    monkeypatch.setattr("starcat.products.match_stars.CHUNK", 700)
     pieces = candidate_pairs(stars, others, 0.01)
     assert whole.star.tolist() == pieces.star.tolist()
     assert whole.counterpart.tolist() == pieces.counterpart.tolist()

@@ -17,27 +17,33 @@ from jsonschema import Draft202012Validator
 
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.other_catalogs import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
-    match_catalogs,
+    find_counterparts,
     match_files,
     match_tables,
     read_star_table,
     with_rivals,
 )
+from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import VERDICTS
+from starcat.products.crossmatch import (
+    Crossmatch,
+    counterpart_problems,
+    matched_stars,
+    moving_stars,
+)
 from starcat.products.match_figures import ARCSEC
+from starcat.products.match_stars import VERDICTS
+from starcat.products.table import Products
 from starcat.resources import resource_folder
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.proper_motion import MAS, Motion, propagate
 from starcat.stars.star_table import with_columns
@@ -229,13 +235,22 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
     both = with_rivals(stars, selected, 10.0 * ARCSEC)
     assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
-    found = match_catalogs(stars, selected, spec, {"gaia": [files]})
-    table = found.products[0].table
+    draft = Draft(spec, {"gaia": [files]})
+    draft.paths, draft.stars, draft.selected = {"gaia": [files]}, stars, selected
+    run(draft, (find_counterparts,))
+    table = draft.product("crossmatch")
     row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
     assert table["star"][row].as_py() == 9
     assert (table["n_stars"][row].as_py(), table["verdict"][row].as_py()) == (2, "best")
     assert table["star"].to_numpy().max() < len(selected.guide_stars)
-    assert found.sources[0].joined == len(matched_stars(table)) == len(table)
+    assert draft.sources[0].joined == len(matched_stars(table)) == len(table)
+
+
+def test_a_source_that_lists_no_stars_has_no_counterparts(files, small_spec, tmp_path):
+    spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
+    inputs = {"sao": [files / "sao.dat"], "gcvs": [files / "sao.dat"]}
+    with pytest.raises(ConfigError, match="gcvs is not a star catalog"):
+        build(spec, inputs, tmp_path)
 
 
 def test_a_missing_catalog_is_known_before_anything_is_read(
@@ -261,7 +276,6 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
         ({"enabled": True}, "no catalogs; name some"),
         ({"enabled": True, "catalogs": ["gaia", "gaia"]}, "named twice"),
         ({"enabled": True, "catalogs": ["sao"]}, "sao is the catalog of the stars themselves"),
-        ({"enabled": True, "catalogs": ["gcvs"]}, "'gcvs'"),
         ({"radius_arcsec": 0.0}, "greater than or equal to 0.001"),
         ({"radius_arcsec": 700.0}, "less than or equal to 600"),
         ({"outlier_share": 1.0}, "less than or equal to 0.99"),

@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.artifact.other_catalogs import matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
@@ -25,9 +24,9 @@ from starcat.catalog.ingest import ingest
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import VERDICTS, crossmatch
+from starcat.products.crossmatch import Crossmatch, matched_stars, moving_stars
 from starcat.products.match_figures import ARCSEC, MatchModel
-from starcat.specs.product_sections import Crossmatch
+from starcat.products.match_stars import VERDICTS, crossmatch
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import floats_of
 

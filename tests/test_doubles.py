@@ -14,22 +14,25 @@ import pyarrow as pa
 import pytest
 from archives import archive_records, record
 from catalog_folder import bright_sky
+from drafts import merged
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.doubles import PairTable, join_pairs, read_wds
 from starcat.catalog.ingest import ingest
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
-from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
-from starcat.pipeline.build import build, join_all, join_notes
-from starcat.pipeline.catalog_snapshot import reading_keys
+from starcat.pipeline.build import build
+from starcat.pipeline.estimate import reading_keys
+from starcat.pipeline.supply import supply_doubles
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Selection
-from starcat.specs.doubtful_stars import Doubles
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import select_guide_stars
+from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.stars.proper_motion import Motion, propagate
 from starcat.stars.star_table import floats_of, table_from_columns
@@ -359,13 +362,12 @@ def test_catalogs_are_read_anew_where_other_pairs_would_count():
 
 def test_a_source_that_knows_no_star_is_told(ingested, catalogs):
     spec = preset("sao-12deg", {"selection.doubles.join": '["wds"]'})
-    stars = ingested("sao", "sao.dat.gz").stars
-    _, joined = join_all(stars, [read_wds([catalogs / FILES["wds"]])], spec)
-    assert joined == {"wds": 0}  # SAO has HD numbers
-    assert [note[:39] for note in join_notes(joined, spec)] == [
+    draft = merged(ingested("sao", "sao.dat.gz"), spec, {"wds": [catalogs / FILES["wds"]]})
+    supply_doubles(draft)
+    assert draft.sources[-1].joined == 0  # SAO has HD numbers
+    assert [note[:39] for note in draft.notes["supply_doubles"]] == [
         "wds says nothing of any star of sao: a "
     ]
-    assert join_notes({"wds": 1}, spec) == ()
 
 
 def test_the_key_is_recorded_only_where_it_is_used():

@@ -16,7 +16,7 @@ import pytest
 from starcat.cli.console import progress_bars
 from starcat.errors import ConfigError, SourceMissing
 from starcat.failures import DEFECT, MAX_MESSAGE, failure_of, hint_in
-from starcat.pipeline import build as pipeline
+from starcat.pipeline import finish
 from starcat.version import install_command
 
 Run = Callable[[list[Any]], Any]
@@ -158,7 +158,7 @@ def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_file, tm
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr(pipeline, "run_self_test", broken)
+    monkeypatch.setattr(finish, "run_self_test", broken)
     run = starcat(
         ["build", tmp_path / "spec.toml", "--input", f"sao={sao_file}", "-o", tmp_path / "dist"]
     )

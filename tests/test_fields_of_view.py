@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import chosen
 from scipy.spatial import cKDTree
 
 from starcat.catalog.ingest import ingest
@@ -30,9 +31,9 @@ from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
 from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
-from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
-from starcat.products.pairs_and_triangles import find_triangles
+from starcat.products.tiling import stars_in_fields, tile_sphere
+from starcat.products.triangles import find_triangles
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
@@ -117,14 +118,12 @@ def test_rows_are_estimated(name, limit_mag, sky_of):
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    from starcat.pipeline.guide_stars import select_stars
-
     def make(limit_mag: float) -> ProductInputs:
         spec = preset(
             "gaia-12deg", {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"}
         )
-        selected, fields = select_stars(embedded_stars(), spec)
-        return ProductInputs(directions_of(selected.guide_stars), fields, spec)
+        draft = chosen(embedded_stars(), spec)
+        return ProductInputs(directions_of(draft.selected.guide_stars), draft.fields, spec)
 
     return make
 

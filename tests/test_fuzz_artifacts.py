@@ -21,8 +21,8 @@ from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
+from starcat.products.layouts import LAYOUTS
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.storage.product_table import PRODUCTS
 
 FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
@@ -177,7 +177,7 @@ STRUCTURES: dict[str, Structure] = {
     "other numbers": holding(np.linspace(0.0, 1.0, 10)),
 }
 
-DATASETS = [(product, name) for product, layout in PRODUCTS.items() for name in layout.datasets]
+DATASETS = [(product, name) for product, layout in LAYOUTS.items() for name in layout.datasets]
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 
@@ -264,7 +264,7 @@ def test_made_up_databases_hurt_nobody(some, copy, frame, small_artifact):
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
         product = data.draw(st.sampled_from(USED))
-        names = PRODUCTS[product].datasets
+        names = LAYOUTS[product].datasets
         kind = data.draw(st.sampled_from(["structure", "values", "values", "attribute"]))
         if kind == "structure":
             name = data.draw(st.sampled_from(names))

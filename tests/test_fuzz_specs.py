@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from drafts import chosen
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from starcat.artifact.writer import write_products
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.errors import ConfigError, StarcatError
-from starcat.pipeline.build import database_facts, make_products, run_self_test
-from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.finish import database_facts, make_products, run_self_test
 from starcat.pipeline.report_data import filter_coverages
 from starcat.products.coverage import tiling_gap
 from starcat.progress import no_progress
@@ -186,12 +186,13 @@ def build_from(spec: BuildSpec, catalog: Ingested) -> None:
 
 
 def build_a_little(spec: BuildSpec, catalog: Ingested) -> None:
-    selected, fields = select_stars(catalog.stars, spec)
-    filter_coverages(selected.steps, fields, spec)
-    tiling_gap(fields.boresights, spec.camera.camera().radius_rad)
-    products = make_products(spec, catalog, selected, fields)
+    draft = chosen(catalog.stars, spec)
+    draft.rejected = catalog.rejected
+    filter_coverages(draft.selected.steps, draft.fields, spec)
+    tiling_gap(draft.fields.boresights, spec.camera.camera().radius_rad)
+    make_products(draft)
     with tempfile.TemporaryDirectory() as folder:
-        write_products(Path(folder), products, database_facts(spec))
+        write_products(Path(folder), draft.products, database_facts(spec))
         # Where a pixel is wider than that, a tolerance of two holds every star: it takes minutes.
         camera = spec.camera.camera()
         if camera.fov_x_deg <= camera.width_px:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import importlib
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import starcat
+from starcat.rooms import exports_of
 
 PACKAGE = Path(starcat.__file__).parent
 PACKAGES = {
@@ -26,10 +29,20 @@ HOUSE = Path(__file__).parents[1] / "docs" / "house.md"
 
 def rooms_of_the_house() -> list[str]:
     """Return the rooms of the table in docs/house.md, in its order."""
-    return re.findall(r"^\| `(\w+)` \|", HOUSE.read_text(encoding="utf-8"), re.MULTILINE)
+    found = re.findall(r"^\| `(\w+)` \|", HOUSE.read_text(encoding="utf-8"), re.MULTILINE)
+    return [name for name in found if name != "starcat"]  # an entry point of the packages
 
 
 ROOMS = rooms_of_the_house()
+
+
+def entry_points_of_the_house() -> list[str]:
+    """Return the modules and rooms of starcat that the packages beside it can import from."""
+    text = HOUSE.read_text(encoding="utf-8")
+    return re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", text, re.MULTILINE)
+
+
+ENTRY_POINTS = entry_points_of_the_house()
 
 SINGLE_MODULES = {
     "ground": [
@@ -40,6 +53,7 @@ SINGLE_MODULES = {
         "plugins",
         "progress",
         "resources",
+        "rooms",
         "sections",
         "threads",
         "version",
@@ -54,8 +68,9 @@ LIGHT = {
     "starcat.arguments",
     "starcat.arrays",
     "starcat.errors",
+    "starcat.rooms",
     "starcat.storage.hdf5",
-    "starcat.storage.product_table",
+    "starcat.products.layouts",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
@@ -132,6 +147,50 @@ def test_no_import_leads_upwards(module):
     allowed = places[: places.index(room_of(module)) + 1]
     upward = {name for name in of_starcat(imports_of(module)) if room_of(name) not in allowed}
     assert not upward, f"{module} imports {', '.join(sorted(upward))} from a later room"
+
+
+OF_PACKAGES = [name for name in MODULES if name.partition(".")[0] in PACKAGES]
+
+
+@pytest.mark.parametrize("module", OF_PACKAGES)
+def test_packages_import_from_entry_points_only(module):
+    of_builder = {name for name in imports_of(module) if name.split(".")[0] == "starcat"}
+    inner = of_builder - set(ENTRY_POINTS)
+    assert not inner, f"{module} imports {', '.join(sorted(inner))}; {HOUSE.name} lists what it can"
+
+
+def names_that_packages_import() -> dict[str, set[str]]:
+    """Return by entry point the names that the packages import from it."""
+    found: dict[str, set[str]] = {}
+    for module in OF_PACKAGES:
+        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                found.setdefault(str(node.module), set()).update(one.name for one in node.names)
+            elif isinstance(node, ast.Import):
+                for alias in node.names:
+                    found.setdefault(alias.name, set())
+    return found
+
+
+def test_rooms_export_what_packages_import_and_nothing_else():
+    imported = names_that_packages_import()
+    assert len(ENTRY_POINTS) <= 30
+    assert set(ENTRY_POINTS) <= set(imported)
+    exported = {
+        f"starcat.{stub.parent.name}": set(exports_of(stub))
+        for stub in PACKAGE.glob("*/__init__.pyi")
+    }
+    rooms = [name for name in ENTRY_POINTS if name.removeprefix("starcat.") in ROOMS]
+    assert exported == {room: imported[room] for room in rooms}
+
+
+def test_a_room_gives_the_names_that_it_exports():
+    for room in (name for name in ENTRY_POINTS if name.removeprefix("starcat.") in ROOMS):
+        module = importlib.import_module(room)
+        for name in exports_of(Path(str(module.__file__)).with_suffix(".pyi")):
+            assert not isinstance(getattr(module, name), ModuleType), f"{room}.{name} is a module"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = importlib.import_module("starcat.query").nothing
 
 
 def test_no_imports_go_in_circles():

@@ -22,8 +22,8 @@ from starcat.images.render import Optics, render_image
 from starcat.matcher.blind import BEYOND, levels, parts_of_range
 from starcat.matcher.database import ProductArrays
 from starcat.matcher.matcher import Matcher
-from starcat.products.boresights import NominalField
 from starcat.products.levels import FEWEST_BORESIGHTS, find_levels, level_fields
+from starcat.products.tiling import NominalField
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 768, fov_x_deg=10.0)

@@ -16,9 +16,9 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.errors import ConfigError
 from starcat.pipeline.build import build
-from starcat.pipeline.merged import read_merged
+from starcat.pipeline.reading import merged_catalog, read_all
 from starcat.pipeline.rebuild import rebuild
-from starcat.specs.product_sections import Crossmatch
+from starcat.products.crossmatch import Crossmatch
 from starcat.specs.reading import spec_from_dict
 
 STARS = 4000
@@ -84,7 +84,9 @@ def sky(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
 @pytest.fixture(scope="module")
 def merged(sky: dict[str, Path]) -> Ingested:
     paths = {name: [path] for name, path in sky.items()}
-    return read_merged(("bright", "deep"), paths, Crossmatch(), epoch_jyear=2026.0)
+    return merged_catalog(
+        read_all(("bright", "deep"), paths, epoch_jyear=2026.0), Crossmatch(), workers=2
+    )
 
 
 def test_there_is_one_row_a_star_and_a_reason_for_every_other_record(merged):
@@ -178,7 +180,7 @@ def test_catalogs_that_number_stars_alike_are_refused(sky):
     pq.write_table(shifted, sky["bright"].with_name("twin.parquet"))
     paths["twin"] = [sky["bright"].with_name("twin.parquet")]
     with pytest.raises(ConfigError, match="number stars alike"):
-        read_merged(("bright", "twin"), paths, Crossmatch())
+        merged_catalog(read_all(("bright", "twin"), paths), Crossmatch(), workers=2)
 
 
 @pytest.mark.slow

@@ -21,18 +21,20 @@ from artifact_copies import copied, seal
 from astropy import units
 from astropy.coordinates import Distance, SkyCoord
 from astropy.time import Time
+from drafts import merged
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION
-from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
+from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
 from starcat.pipeline.build import Built, build
-from starcat.pipeline.motions import JoinedMotions, join_motions, motions_of
+from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
+from starcat.pipeline.supply import guide_star_motions, supply_motions
+from starcat.products.motions import OUTCOMES, motion_problems
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
@@ -217,7 +219,7 @@ def test_every_guide_star_is_listed_once(artifact, built):
 
 def test_the_manifest_says_what_came_from_where(artifact, inputs):
     manifest = artifact.manifest
-    schema = (resource_folder("schemas") / f"manifest-{MOTIONS_VERSION}.json").read_text()
+    schema = (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
     Draft202012Validator(json.loads(schema)).validate(manifest)
     assert [(s["source"], s["role"]) for s in manifest["sources"]] == [
         ("gaia", "stars"),
@@ -306,19 +308,17 @@ def test_a_manifest_that_says_otherwise_is_told(damage, built, tmp_path):
 # Which entry is which star -------------------------------------------------------------------
 
 
-def motions_with(
-    lines: list[bytes], sky: Ingested, folder: Path, **changes: object
-) -> JoinedMotions:
+def motions_with(lines: list[bytes], sky: Ingested, folder: Path, **changes: object) -> Draft:
     """The motions of the sky's stars in a Tycho-2 of some records."""
     (folder / "tyc2.dat").write_bytes(b"".join(lines))
     spec = spec_of(motions=["tycho2"], **changes)
-    return join_motions(sky, spec, {"tycho2": [folder / "tyc2.dat"]})
+    return run(merged(sky, spec, {"tycho2": [folder / "tyc2.dat"]}), (supply_motions,))
 
 
-def outcome_of(found: JoinedMotions, star_id: int) -> dict[str, object]:
-    rows = np.flatnonzero(found.catalog.stars["star_id"].to_numpy() == star_id)
-    assert found.table is not None
-    (row,) = found.table.take(pa.array(rows)).to_pylist()
+def outcome_of(found: Draft, star_id: int) -> dict[str, object]:
+    rows = np.flatnonzero(found.stars["star_id"].to_numpy() == star_id)
+    assert found.motions is not None
+    (row,) = found.motions.take(pa.array(rows)).to_pylist()
     return row
 
 
@@ -358,7 +358,7 @@ def test_two_entries_that_fit_as_well_give_no_motion(tycho2, sky, artifact, tmp_
     assert (lost["outcome"], lost["n_candidates"]) == ("no_candidate", 0)
     assert [lost[name] for name in ("catalog", "counterpart_id", "moved_arcsec")] == [None] * 3
     for star_id in stars["star_id"].take([twice, gone]).to_pylist():
-        moved = found.catalog.stars.filter(pc.equal(found.catalog.stars["star_id"], star_id))
+        moved = found.stars.filter(pc.equal(found.stars["star_id"], star_id))
         assert moved["epoch_jyear"].to_pylist() == [2016.0]
         assert moved["pm_dec_mas_yr"].null_count == 1
     # The other stars do not mind.
@@ -389,18 +389,20 @@ def test_an_entry_without_motion_gives_none(tycho2, sky, artifact, tmp_path):
 def test_a_star_with_a_motion_keeps_it(sky, inputs, tmp_path):
     motion = {"pm_ra_cosdec_mas_yr": 12.5, "pm_dec_mas_yr": -3.0}
     own = replace(sky, stars=with_columns(sky.stars, motion))
-    found = join_motions(own, spec_of(), inputs)
-    assert found.table is not None
-    assert set(found.table["outcome"].to_pylist()) == {"own_motion"}
+    found = run(merged(own, spec_of(), inputs), (supply_motions,))
+    assert found.motions is not None
+    assert set(found.motions["outcome"].to_pylist()) == {"own_motion"}
     for name in ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "epoch_jyear"):
-        assert found.catalog.stars[name].equals(own.stars[name])
+        assert found.stars[name].equals(own.stars[name])
 
 
 def test_threads_do_not_matter(sky, inputs):
-    one, two = (join_motions(sky, spec_of(), inputs, workers) for workers in (1, 2))
-    assert one.table is not None
-    assert one.table.equals(two.table)
-    assert one.catalog.stars.equals(two.catalog.stars)
+    one, two = (
+        run(merged(sky, spec_of(), inputs, workers), (supply_motions,)) for workers in (1, 2)
+    )
+    assert one.motions is not None
+    assert one.motions.equals(two.motions)
+    assert one.stars.equals(two.stars)
 
 
 # Asking for it -------------------------------------------------------------------------------
@@ -412,9 +414,10 @@ def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
     # Bytes of manifests and databases without it are those of earlier versions.
     assert "motions" not in spec.recorded()["catalog"]
     assert preset("gaia-12deg-2026").recorded()["catalog"]["motions"] == ["tycho2"]
-    found = join_motions(sky, spec, {})
-    assert found.catalog is sky
-    assert (found.sources, motions_of(sky.stars, found.table, sky.stars)) == ((), ())
+    found = run(merged(sky, spec, {}), (supply_motions,))
+    assert found.stars is sky.stars
+    assert [facts.role for facts in found.sources] == ["stars"]
+    assert guide_star_motions(found) == []
     assert open_artifact(small_artifact).manifest["manifest_version"] == MANIFEST_VERSION
 
 

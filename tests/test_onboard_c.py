@@ -18,7 +18,7 @@ import pytest
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.products.pairs_and_triangles import find_pairs
+from starcat.products.pairs import find_pairs
 from starcat.simulation.simulate import Noise, simulate_frames
 
 ONBOARD = Path(__file__).parents[1] / "onboard"
@@ -244,6 +244,7 @@ def rows(heading: str) -> list[list[str]]:
 
 def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
     header = (ONBOARD / "include" / "starcat.h").read_text()
+    declared = "".join(path.read_text() for path in ONBOARD.glob("include/*.h"))
     enum = header[header.index("typedef enum") : header.index("} starcat_status")]
     sources = {path.name: path.read_text() for path in ONBOARD.glob("tests/test_*.c")}
     named = set()
@@ -256,7 +257,7 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
             assert name in parts[1].split("\n}\n")[0], f"{function} does not reach {name}"
         assert tests
         for called in re.findall(r"`(\w+)`", functions):
-            assert f"starcat_{called}(" in header
+            assert f"starcat_{called}(" in declared
         named.add(name)
     assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
 
@@ -264,6 +265,17 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
 def test_callers_of_other_configurations_do_not_link(folder):
     said = make(folder, "misuse", "CFLAGS=-O0", "BUILD=build-misuse")
     assert "3 callers of other configurations do not link, 5 flags do not compile" in said
+
+
+def test_no_file_calls_back_into_one_that_needs_it(folder, tmp_path):
+    assert "none leads back" in make(folder, "cycles", "BUILD=build-cycles")
+    copy = tmp_path / "onboard"
+    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("build*"))
+    with (copy / "src" / "budget.c").open("a", encoding="utf-8") as file:
+        file.write("int back(starcat_call *call) { return starcat_try_attitude(call, 0, 1); }\n")
+    ran = subprocess.run(["make", "-s", "cycles"], cwd=copy, capture_output=True, text=True)
+    assert ran.returncode != 0
+    assert "need each other in a circle" in ran.stdout
 
 
 def test_every_deviation_from_misra_is_explained():
@@ -293,7 +305,7 @@ def test_tools_find_nothing(folder, target):
 
 def test_every_requirement_has_its_tests(folder, tmp_path):
     """And every function of the unit test a requirement; the bill of materials has every file."""
-    matrix = [sys.executable, "-B", "evidence/matrix.py", str(tmp_path)]
+    matrix = [sys.executable, "-B", "qualification/evidence/matrix.py", str(tmp_path)]
     said = subprocess.run(matrix, cwd=ONBOARD, capture_output=True, text=True, check=True).stdout
     assert said.rstrip().endswith(" 0 missing")
     test = folder / "tests" / "test_unnamed.c"
@@ -303,7 +315,7 @@ def test_every_requirement_has_its_tests(folder, tmp_path):
     for name in ("with.json", "again.json", "without.json"):
         if name == "without.json":
             test.unlink()
-        bill = [sys.executable, "-B", "evidence/sbom.py", str(tmp_path / name)]
+        bill = [sys.executable, "-B", "qualification/evidence/sbom.py", str(tmp_path / name)]
         subprocess.run(bill, cwd=folder, capture_output=True, check=True)
         bills.append((tmp_path / name).read_bytes())
     assert ran.returncode == 1
@@ -324,11 +336,11 @@ def test_the_evidence_is_complete(folder):
 
 def test_every_loop_has_its_longest_count(folder, tmp_path):
     """``loops.md`` has every loop; one that is added to the source is named."""
-    compare = [sys.executable, "-B", "wcet/loops.py"]
+    compare = [sys.executable, "-B", "qualification/wcet/loops.py"]
     said = subprocess.run(compare, cwd=folder, capture_output=True, text=True, check=True).stdout
     assert re.match(r"loops.md has all \d+ loops of the library", said)
     copy = tmp_path / "onboard"
-    for name in ("src", "wcet"):
+    for name in ("src", "qualification"):
         shutil.copytree(folder / name, copy / name)
     source = copy / "src" / "sky.c"
     text = source.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The app for cFS in ``onboard/cfs`` and its ICD.
+"""The app for cFS in ``onboard/integrations/cfs`` and its ICD.
 
 The app is built and run where an archive of cFS is, the component where fpp is.
 """
@@ -17,6 +17,7 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "onboard" / "integrations" / "cfs"
 CFS = Path(os.environ.get("STARCAT_CFS", ROOT / "../shared/flight/cfs.tar.xz"))
 needs_cfs = pytest.mark.real  # the source of cFS is not part of the repository
 
@@ -33,16 +34,15 @@ def icd_of(folder: Path) -> ModuleType:
 
 
 def test_the_icd_is_what_the_headers_say():
-    icd = icd_of(ROOT / "onboard" / "cfs")
-    assert (ROOT / "onboard/cfs/starcat.xml").read_text() == icd.render(icd.read_headers())
+    icd = icd_of(FOLDER)
+    assert (FOLDER / "starcat.xml").read_text() == icd.render(icd.read_headers())
 
 
 def test_the_readme_lists_every_event_command_and_message():
-    folder = ROOT / "onboard" / "cfs"
-    said = (folder / "README.md").read_text()
-    events = (folder / "fsw/inc/starcat_app_eventids.h").read_text()
-    codes = (folder / "config/default_starcat_app_fcncodes.h").read_text()
-    topics = (folder / "config/default_starcat_app_topicids.h").read_text()
+    said = (FOLDER / "README.md").read_text()
+    events = (FOLDER / "fsw/inc/starcat_app_eventids.h").read_text()
+    codes = (FOLDER / "config/default_starcat_app_fcncodes.h").read_text()
+    topics = (FOLDER / "config/default_starcat_app_topicids.h").read_text()
     for pattern, text in (
         (r"STARCAT_APP_(\w+)_EID +(\d+)", events),
         (r"STARCAT_APP_(\w+)_CC +(\d+)", codes),

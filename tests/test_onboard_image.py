@@ -32,8 +32,9 @@ from starcat.onboard.layout import (
 )
 from starcat.onboard.reading import read_image
 from starcat.onboard.shrink import LEAST_SHARE, shrink
-from starcat.products.boresights import tile_sphere
-from starcat.products.pairs_and_triangles import find_pairs, find_triangles
+from starcat.products.pairs import find_pairs
+from starcat.products.tiling import tile_sphere
+from starcat.products.triangles import find_triangles
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
 

@@ -7,13 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.photometry import (
-    JOHNSON_COLOUR_RANGE_MAG,
-    blend_weights,
-    combined_magnitude,
-    johnson_v,
-)
+from starcat.catalog.photometry import JOHNSON_COLOUR_RANGE_MAG, blend_weights, johnson_v
 from starcat.errors import ConfigError
+from starcat.selection.merging import combined_magnitude
 
 # Magnitudes of order 10 are rounded to 2e-15.
 ROUNDING_MAG = 1e-13

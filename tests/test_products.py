@@ -17,16 +17,15 @@ from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.patterns import bin_of, cell_of, ring_of
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.recipes import table_from_result
-from starcat.products.boresights import FieldStars, NominalField, tile_sphere
+from starcat.products.grid import grid_patterns
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Ragged
-from starcat.products.neighbours import (
-    angular_reference_sets,
-    find_neighbours,
-    planar_reference_sets,
-    position_angles,
-)
-from starcat.products.pairs_and_triangles import distinct_triangles, find_pairs, find_triangles
-from starcat.products.star_patterns import grid_patterns, radial_patterns
+from starcat.products.neighbours import find_neighbours, position_angles
+from starcat.products.pairs import find_pairs
+from starcat.products.radial import radial_patterns
+from starcat.products.tiling import FieldStars, NominalField, tile_sphere
+from starcat.products.triangles import distinct_triangles, find_triangles
 from starcat.storage.schema import product_schema
 
 RADIUS, BUFFER = 0.6, 0.1

@@ -13,12 +13,12 @@ from astropy import units as u
 from astropy.coordinates import angular_separation
 from cdshealpix.nested import lonlat_to_healpix
 
-from starcat.catalog.photometry import combined_magnitude
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
 from starcat.query.gallery import macros
 from starcat.query.session import Session, open_session
+from starcat.selection.merging import combined_magnitude
 
 POLES_AND_SEAMS = [(0.0, 90.0), (123.0, -90.0), (0.0, 0.0), (360.0, 0.0), (359.999999, 41.81),
                    (45.0, 41.8103148957786), (90.0, -41.8103148957786), (270.0, 89.9999999),

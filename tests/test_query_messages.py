@@ -20,11 +20,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.errors import QueryError
-from starcat.query import arrow_stream, engine, frames
-from starcat.query.engine import AnswerTooLarge, Engine
-from starcat.query.frames import HEAD, MalformedMessage
+from starcat.errors import AnswerTooLarge, QueryError
+from starcat.query import arrow_stream, engine
+from starcat.query.engine import Engine
 from starcat.query.session import Limits, Session, open_session
+from starcat.workers import process
+from starcat.workers.messages import HEAD, MalformedMessage
 
 DAY, UTC = dt.date(2020, 2, 29), dt.UTC
 ZONE = dt.timezone(dt.timedelta(hours=-3, minutes=-30))
@@ -150,7 +151,7 @@ def test_every_type_arrives_in_batches(session, text):
 def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifact):
     limits = Limits(message_bytes=1 << 20, rows_bytes=3 << 20)
     with open_session([str(small_artifact)], limits) as session:
-        process = session._engine._process
+        before = session._engine._process
         with pytest.raises(AnswerTooLarge, match="more than 3 MB; ask for fewer rows"):
             rows_of(session, "SELECT repeat('x', 1000) FROM range(10000)")
         with pytest.raises(AnswerTooLarge):
@@ -159,7 +160,7 @@ def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifac
             list(answer.batches())
         # Parts of an answer are made so small that each may be sent.
         assert len(rows_of(session, "SELECT repeat('x', 1000) FROM range(2500)")) == 2500
-        assert session._engine._process is process
+        assert session._engine._process is before
 
 
 def arrow(array: pa.Array, **options: object) -> bytes:
@@ -229,6 +230,10 @@ def replies(ran: Path) -> dict[str, bytes]:
         "no known kind": message("x", b"1"),
         "JSON nested without end": message("d", b"[" * 1_000_000),
         "a number of too many digits": message("d", b"9" * 10_000),
+        "an error that is none": message("e", b"[1]"),
+        "an error of a strange class": message(
+            "e", b'{"kind":"eval","message":"1","key":null,"fields":[],"errno":null}'
+        ),
         "rows of different lengths": message("p", b'[1,[["any",[1]],["any",[1,2]]],[]]'),
         "rows of no known form": message("p", b'[1,[["code",["os.system"]]],[]]'),
         "rows with a value of no type": message("p", b'[1,[["any",[["eval","1"]]]],[]]'),
@@ -246,8 +251,8 @@ def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeyp
     ran, content = tmp_path / "ran", tmp_path / "content"
     content.write_bytes(replies(ran)[name])
     monkeypatch.setattr(
-        engine,
-        "_PROGRAM",
+        process,
+        "PROGRAM",
         f"import sys; sys.stdin.buffer.read(1); out = sys.stdout.buffer; "
         f"out.write(open({str(content)!r}, 'rb').read()); out.flush()",
     )
@@ -268,8 +273,8 @@ def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeyp
 def test_a_child_that_keeps_the_pipe_open_keeps_nobody_waiting(tmp_path, monkeypatch):
     """The process is killed when its time is over; what it started goes on writing."""
     monkeypatch.setattr(
-        engine,
-        "_PROGRAM",
+        process,
+        "PROGRAM",
         "import os, sys, time\n"
         "if os.fork() == 0:\n"
         "    until_s = time.monotonic() + 20\n"
@@ -292,4 +297,3 @@ def test_no_module_of_the_package_unpickles():
     root = Path(sys.modules["starcat"].__file__ or "").parent
     found = [path.name for path in root.rglob("*.py") if "import pickle" in path.read_text()]
     assert found == []
-    assert frames.MalformedMessage is MalformedMessage

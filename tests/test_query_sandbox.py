@@ -383,7 +383,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
 def landlock_is_there() -> bool:
     code = (
         "import sys, tempfile; from pathlib import Path\n"
-        "from starcat.query.confinement import forbid_writing\n"
+        "from starcat.workers.confinement import forbid_writing\n"
         "print(forbid_writing(Path(tempfile.gettempdir())))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected, select_guide_stars
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
-from starcat.specs.build_spec import Selection
-from starcat.specs.doubtful_stars import Doubles, Variables
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.rules.variables import Variables
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.stars.verdict import Quality
 

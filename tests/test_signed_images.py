@@ -83,7 +83,7 @@ def test_the_library_that_flies_opens_a_signed_image(signed):
     data = signed.read_bytes()
     words = np.frombuffer(data, dtype=np.uint64).copy()
     image = ffi.new("starcat_image *")
-    assert lib.starcat_open(image, ffi.from_buffer(words), len(data), 0) == 0
+    assert lib.starcat_open_image(image, ffi.from_buffer(words), len(data), 0) == lib.STARCAT_OK
     assert image.n_stars == len(read_image(signed).star_id)
 
 

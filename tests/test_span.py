@@ -16,7 +16,6 @@ from archives import record
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.source import data_source
 from starcat.catalog.span import drifts, position_errors, validity, with_span
 from starcat.errors import ConfigError
@@ -24,7 +23,8 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
-from starcat.specs.build_spec import Selection
+from starcat.selection.ruleset import Selection
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.reading import read_spec
 from starcat.stars.proper_motion import MAS, Motion, propagate_in_space
 from starcat.stars.star_table import directions_of, floats_of, move_to_epoch, table_from_columns

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import chosen
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 
@@ -26,9 +27,8 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline import guide_stars
 from starcat.pipeline.build import Built, build
-from starcat.pipeline.guide_stars import even_stars, thinned_stars
+from starcat.pipeline.guide_stars import even_stars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, NominalField, reach_rad, tile_sphere
 from starcat.products.evenness import (
     ARCSEC,
     distribution_entropy,
@@ -39,6 +39,7 @@ from starcat.products.evenness import (
     spread_of_errors,
 )
 from starcat.products.thinning import POWER, PRIOR, cell_areas, thin_by_cells, thin_by_information
+from starcat.products.tiling import FieldStars, NominalField, reach_rad, tile_sphere
 from starcat.simulation.selftest import answers_rightly
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.specs.reading import preset, spec_from_dict
@@ -272,7 +273,7 @@ def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_sp
     for name in ("brightest", rule):
         content = tomllib.loads(small_spec)
         content["selection"].update(limits, thinning=name)
-        made.append(thinned_stars(stars, spec_from_dict(content, "small.toml")))
+        made.append(chosen(stars, spec_from_dict(content, "small.toml")).selected)
     brightest, other = made
     assert len(other.guide_stars) == len(brightest.guide_stars) < len(stars)
     assert other.guide_stars["star_id"] != brightest.guide_stars["star_id"]
@@ -302,9 +303,7 @@ def test_a_tiling_too_dense_to_thin_is_refused(small_artifact, small_spec, monke
     content["selection"].update(max_stars=100, thinning="information")
     monkeypatch.setattr(guide_stars.check_tiling, "__defaults__", (1000, "estimate"))
     with pytest.raises(BuildError, match="small: too dense to thin by information: the 200 fields"):
-        thinned_stars(
-            open_artifact(small_artifact).table("stars"), spec_from_dict(content, "small.toml")
-        )
+        chosen(open_artifact(small_artifact).table("stars"), spec_from_dict(content, "small.toml"))
 
 
 # Acceptance ---------------------------------------------------------------------------------

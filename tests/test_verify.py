@@ -21,10 +21,11 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.errors import ProductError
+from starcat.products.layouts import LAYOUTS
+from starcat.products.table import PRODUCTS
 from starcat.resources import resource_folder
 from starcat.storage.digests import json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
-from starcat.storage.product_table import PRODUCTS, indices_of
 
 SCHEMAS = resource_folder("schemas")
 
@@ -106,8 +107,9 @@ def test_every_index_that_is_written_is_named(small_artifact):
             for column in artifact.schema(name).columns:
                 parts = ("_offsets", "_values") if column.is_list else ("",)
                 columns |= {f"{column.name}{part}" for part in parts}
-            assert set(file[name]) - columns == set(indices_of(name))
-    assert set(PRODUCTS) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+            assert set(file[name]) - columns == set(PRODUCTS[name].layout.indices)
+    schemas = {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+    assert set(LAYOUTS) <= set(PRODUCTS) == schemas - {"manifest"}
 
 
 # Whole and damaged files --------------------------------------------------------------------

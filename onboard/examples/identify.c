@@ -4,7 +4,7 @@
  *
  * IMAGE is a file of `starcat export --to onboard`; FRAME has a line "x y magnitude" a centroid.
  * With an image linked in (`starcat export --to c`) the reading of it falls away:
- * starcat_open(&image, starcat_sao_12deg_1_0_0, sizeof starcat_sao_12deg_1_0_0, 0).
+ * starcat_open_image(&image, starcat_sao_12deg_1_0_0, sizeof starcat_sao_12deg_1_0_0, 0).
  *
  * SPDX-License-Identifier: MIT
  */
@@ -65,17 +65,17 @@ int main(int argc, char **argv) {
     return 2;
   }
   void *bytes = read_image(argv[1], &size);
-  starcat_status status = starcat_open(&image, bytes, size, 0);
-  if (status != STARCAT_IDENTIFIED) {
+  starcat_status status = starcat_open_image(&image, bytes, size, 0);
+  if (status != STARCAT_OK) {
     (void)fprintf(stderr, "%s: status %d\n", argv[1], (int)status);
     free(bytes);
     return 2;
   }
-  starcat_camera_of(&image, &camera);
-  starcat_default_options(&options);
+  starcat_get_camera(&image, &camera);
+  starcat_set_default_options(&options);
   const uint32_t count = read_frame(argv[2], columns);
   const starcat_frame frame = {count, columns[0], columns[1], columns[2], NULL};
-  status = starcat_identify(&image, &camera, &options, &frame, &work, &result);
+  status = starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
   (void)printf("%.96s: %u stars, status %d after %u steps\n", image.name, (unsigned)image.n_stars,
                (int)status, (unsigned)result.steps);
   if (status == STARCAT_IDENTIFIED) {

@@ -11,9 +11,9 @@
 
 #include "starcat_update.h"
 
-#define CAPACITY (16u * 1048576u) /* of a place */
+#define CAPACITY (16u * 1048576u) /* of a slot */
 
-/* The two places, and memory for a patch: static, as flight software has them. */
+/* The two slots, and memory for a patch: static, as flight software has them. */
 static uint64_t places_of_images[2][CAPACITY / 8u], patch[CAPACITY / 8u];
 
 static size_t read_file(const char *path, uint64_t *into) {
@@ -28,23 +28,23 @@ static size_t read_file(const char *path, uint64_t *into) {
 
 int main(int argc, char **argv) {
   starcat_image image;
-  starcat_places places = {
+  starcat_slots slots = {
       {(uint8_t *)places_of_images[0], (uint8_t *)places_of_images[1]}, CAPACITY, {0, 0}, 0, 0};
   if (argc != 4) {
     (void)fprintf(stderr, "patch IMAGE PATCH NEXT\n");
     return 2;
   }
-  places.size[0] = read_file(argv[1], places_of_images[0]);
-  starcat_status status = starcat_start(&places, &image);
-  if (status != STARCAT_IDENTIFIED) {
+  slots.size[0] = read_file(argv[1], places_of_images[0]);
+  starcat_status status = starcat_start_image(&slots, &image);
+  if (status != STARCAT_OK) {
     (void)fprintf(stderr, "%s: cannot be used, status %d\n", argv[1], (int)status);
     return 1;
   }
-  status = starcat_patch(&places, patch, read_file(argv[2], patch));
-  if (status == STARCAT_IDENTIFIED) {
-    status = starcat_switch(&places, &image);
+  status = starcat_apply_patch(&slots, patch, read_file(argv[2], patch));
+  if (status == STARCAT_OK) {
+    status = starcat_switch_image(&slots, &image);
   }
-  if (status != STARCAT_IDENTIFIED) {
+  if (status != STARCAT_OK) {
     (void)fprintf(stderr, "%s: cannot be applied, status %d\n", argv[2], (int)status);
     return 1;
   }

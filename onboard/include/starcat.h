@@ -81,18 +81,20 @@ typedef STARCAT_REAL starcat_real;
 #define STARCAT_JOIN(name, centroids, stars, real) STARCAT_JOINED(name, centroids, stars, real)
 #define STARCAT_SYMBOL(name) \
   STARCAT_JOIN(name, STARCAT_MAX_CENTROIDS, STARCAT_MAX_STARS, STARCAT_REAL)
-#define starcat_camera_of STARCAT_SYMBOL(starcat_camera_of)
-#define starcat_default_options STARCAT_SYMBOL(starcat_default_options)
-#define starcat_open STARCAT_SYMBOL(starcat_open)
-#define starcat_identify STARCAT_SYMBOL(starcat_identify)
-#define starcat_track STARCAT_SYMBOL(starcat_track)
-#define starcat_attitude STARCAT_SYMBOL(starcat_attitude)
+#define starcat_get_camera STARCAT_SYMBOL(starcat_get_camera)
+#define starcat_set_default_options STARCAT_SYMBOL(starcat_set_default_options)
+#define starcat_open_image STARCAT_SYMBOL(starcat_open_image)
+#define starcat_identify_frame STARCAT_SYMBOL(starcat_identify_frame)
+#define starcat_track_frame STARCAT_SYMBOL(starcat_track_frame)
+#define starcat_fit_attitude STARCAT_SYMBOL(starcat_fit_attitude)
 
 /* What a call came to. Values below 0 are errors of the caller or of the image. */
 typedef enum {
-  STARCAT_IDENTIFIED = 0,
+  STARCAT_OK = 0,                   /* done */
+  STARCAT_IDENTIFIED = 0,           /* the same of a frame: it has an answer */
   STARCAT_NO_MATCH = 1,             /* no attitude explains the frame beyond chance */
   STARCAT_TOO_FEW_STARS = 2,        /* fewer than four usable centroids, or two directions */
+  STARCAT_INCOMPLETE = 3,           /* there is more to come, or to do */
   STARCAT_E_NULL = -1,              /* a pointer is null */
   STARCAT_E_SHORT = -2,             /* fewer bytes than the image says it has */
   STARCAT_E_MAGIC = -3,             /* not an image of starcat */
@@ -100,7 +102,7 @@ typedef enum {
   STARCAT_E_BYTE_ORDER = -5,        /* written for the other byte order */
   STARCAT_E_ALIGNMENT = -6,         /* the image does not begin at a multiple of 8 */
   STARCAT_E_LAYOUT = -7,            /* sizes or sections that contradict each other */
-  STARCAT_E_CRC = -8,               /* a damaged block; starcat_scrub names it */
+  STARCAT_E_CRC = -8,               /* a damaged block; starcat_scrub_image names it */
   STARCAT_E_CAPACITY = -9,          /* more stars in a field than STARCAT_MAX_STARS */
   STARCAT_E_TOO_MANY_CENTROIDS = -10,
   STARCAT_E_NOT_FINITE = -11,       /* an option, the prior or a direction is not finite */
@@ -126,10 +128,10 @@ typedef enum {
 #define STARCAT_DROPPED_OUT_OF_FRAME (-3)
 #define STARCAT_DROPPED_DUPLICATE (-4)
 
-/* Flags of starcat_open. */
+/* Flags of starcat_open_image. */
 #define STARCAT_SKIP_CRC 1u
 
-/* An image in place. Filled by starcat_open; its pointers point into the image. */
+/* An image in place. Filled by starcat_open_image; its pointers point into the image. */
 typedef struct {
   const uint8_t *bytes;
   uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
@@ -213,33 +215,33 @@ const char *starcat_version(void);
 uint32_t starcat_version_number(void);
 
 /* Fill in the camera that the image was built for, and the options that the ground uses. */
-void starcat_camera_of(const starcat_image *image, starcat_camera *camera);
-void starcat_default_options(starcat_options *options);
+void starcat_get_camera(const starcat_image *image, starcat_camera *camera);
+void starcat_set_default_options(starcat_options *options);
 
 /* Open an image of `size` bytes at `bytes`, which stays where it is. */
-starcat_status starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
+starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
 
 /* Check blocks `first` to `first + count` of an image; every block if count is 0. On
  * STARCAT_E_CRC `bad_block` is the first one that is damaged. */
-starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count,
+starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
                              uint32_t *bad_block);
 
 /* Identify the stars of a frame without any prior knowledge. */
-starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
+starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result);
 
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
  * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is
  * STARCAT_E_CAPACITY: state the prior more narrowly. */
-starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
+starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,
                              starcat_workspace *work, starcat_result *result);
 
 /* Find the attitude A that fits pairs of unit vectors (rows) best: body = A icrs. `body` has camera
  * components. A component beyond 2 is an error. */
-starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
+starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
                                 uint32_t count, starcat_real q_body_from_icrs[4]);
 
 #include "starcat_workspace.h"

@@ -5,7 +5,7 @@
 #include "internal.h"
 
 /* Say why there is no answer, and how good the best agreement was. */
-static starcat_status refuse(const starcat_call *call, starcat_result *result) {
+static starcat_status refuse_frame(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   result->best_n_matched = w->best.n_matched;
   result->best_log_chance = w->best.log_bound;
@@ -21,7 +21,7 @@ static starcat_status refuse(const starcat_call *call, starcat_result *result) {
 }
 
 /* The noise of a centroid on each axis; 0 where it is not stated. */
-static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
+static real find_noise(const real *sigma_px, real noise_px, uint32_t row) {
   if (sigma_px == NULL) {
     return noise_px;
   }
@@ -29,9 +29,9 @@ static real noise_of(const real *sigma_px, real noise_px, uint32_t row) {
 }
 
 /* The same of one of the usable centroids. */
-static real noise_of_centroid(const starcat_call *call, uint32_t centroid) {
-  const uint32_t row = call->work->row[starcat_below(centroid, STARCAT_MAX_CENTROIDS)];
-  return noise_of(call->sigma_px, call->noise_px, starcat_below(row, call->own->given));
+static real find_centroid_noise(const starcat_call *call, uint32_t centroid) {
+  const uint32_t row = call->work->row[starcat_limit_place(centroid, STARCAT_MAX_CENTROIDS)];
+  return find_noise(call->sigma_px, call->noise_px, starcat_limit_place(row, call->own->given));
 }
 
 /* List the centroids of the best agreement that are stars, with directions of the image or others,
@@ -43,14 +43,14 @@ static uint32_t take_stars(const starcat_image *image, const real *directions,
   uint32_t n = 0;
   for (uint32_t i = 0; i < count; i++) {
     if (w->best.star[i] >= 0) {
-      const uint32_t star = starcat_below((uint32_t)w->best.star[i], image->n_stars);
+      const uint32_t star = starcat_limit_place((uint32_t)w->best.star[i], image->n_stars);
       real *icrs = w->seen_icrs[n];
-      starcat_star(image, star, icrs);
+      starcat_read_star(image, star, icrs);
       for (uint32_t k = 0; k < 3u; k++) {
         w->seen_body[n][k] = w->scaled[i][k];
         icrs[k] = directions != NULL ? directions[3u * (size_t)star + k] : icrs[k];
       }
-      const real noise = noise_of(sigma_px, R(0.0), starcat_below(w->row[i], given));
+      const real noise = find_noise(sigma_px, R(0.0), starcat_limit_place(w->row[i], given));
       least = (noise > R(0.0)) && ((noise < least) || !(least > R(0.0))) ? noise : least;
       w->weight[n] = noise;
       w->seen[n] = (uint16_t)i;
@@ -69,10 +69,10 @@ static uint32_t take_stars(const starcat_image *image, const real *directions,
 /* Fit the attitude of the answer to the stars that are listed. */
 static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result *result) {
   real square = R(0.0);
-  starcat_refine(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
+  starcat_refine_attitude(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
                  count, 4);
-  starcat_quaternion(result->matrix, result->q_body_from_icrs);
-  starcat_matrix(result->q_body_from_icrs, result->matrix);
+  starcat_make_quaternion(result->matrix, result->q_body_from_icrs);
+  starcat_make_matrix(result->q_body_from_icrs, result->matrix);
   for (uint32_t i = 0; i < count; i++) {
     real turned[3];
     starcat_turn(result->matrix, w->seen_icrs[i], turned);
@@ -98,11 +98,11 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
   const starcat_workspace *w = call->work;
   real square = R(0.0);
   for (uint32_t n = 0; n < n_seen; n++) {
-    const uint32_t i = starcat_below(w->seen[n], STARCAT_MAX_CENTROIDS);
-    const real noise = noise_of_centroid(call, i);
+    const uint32_t i = starcat_limit_place(w->seen[n], STARCAT_MAX_CENTROIDS);
+    const real noise = find_centroid_noise(call, i);
     real body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
     starcat_turn(m, w->seen_icrs[n], body);
-    (void)starcat_pixel(&call->camera, body, &x, &y);
+    (void)starcat_find_pixel(&call->camera, body, &x, &y);
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     square += dx * dx + dy * dy;
     if (noise > R(0.0)) {
@@ -130,7 +130,7 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   }
   for (uint32_t n = 0; n < n_seen; n++) {
     const real *b = w->seen_body[n], v = w->weight[n];
-    const real noise = noise_of_centroid(call, w->seen[n]);
+    const real noise = find_centroid_noise(call, w->seen[n]);
     const real scale = v * (noise > R(0.0) ? noise : unstated);
     real turn[2][3];
     h[0] += v * (R(1.0) - b[0] * b[0]);
@@ -139,13 +139,13 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
     h[3] += v * (R(1.0) - b[1] * b[1]);
     h[4] -= v * b[1] * b[2];
     h[5] += v * (R(1.0) - b[2] * b[2]);
-    starcat_turns_of_pixel(&call->camera, b, turn);
+    starcat_find_turns(&call->camera, b, turn);
     for (uint32_t k = 0; k < 9u; k++) {
       const uint32_t i = k / 3u, j = k % 3u;
       s[i][j] += scale * scale * (turn[0][i] * turn[0][j] + turn[1][i] * turn[1][j]);
     }
   }
-  if (!starcat_solve(h, s[0], unused, inverse)) {
+  if (!starcat_solve_symmetric(h, s[0], unused, inverse)) {
     return 1; /* all stars are at one place */
   }
   const real p[3][3] = {{inverse[0], inverse[1], inverse[2]},
@@ -159,14 +159,14 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   return 1;
 }
 
-starcat_status starcat_end(starcat_call *call, const starcat_options *options,
+starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                            starcat_result *result) {
   starcat_workspace *w = call->work;
   result->steps = options->max_steps - call->own->steps_left;
   result->n_tried = call->own->n_tried;
   if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance <= call->log_limit) ||
       !(w->best.log_bound <= call->log_limit)) {
-    return refuse(call, result);
+    return refuse_frame(call, result);
   }
   call->focal = R(0.0); /* so that the directions are worked out again */
   starcat_set_focal(call, w->best.focal);
@@ -174,20 +174,20 @@ starcat_status starcat_end(starcat_call *call, const starcat_options *options,
   const uint32_t n_seen =
       take_stars(call->image, NULL, call->sigma_px, count, call->own->given, w);
   if (n_seen < STARCAT_MIN_STARS) {
-    return refuse(call, result);
+    return refuse_frame(call, result);
   }
   for (uint32_t k = 0; k < 9u; k++) {
     result->matrix[k] = w->best.matrix[k];
   }
   fit_stars(w, n_seen, result);
   if (!tell_errors(call, n_seen, result)) {
-    return refuse(call, result);
+    return refuse_frame(call, result);
   }
   result->log_chance = w->best.log_chance;
   result->n_matched = n_seen;
   result->focal_length_px = call->camera.given.focal_length_px;
   for (uint32_t i = 0; i < count; i++) {
-    result->star[starcat_below(w->row[i], call->own->given)] = w->best.star[i];
+    result->star[starcat_limit_place(w->row[i], call->own->given)] = w->best.star[i];
   }
   return STARCAT_IDENTIFIED;
 }

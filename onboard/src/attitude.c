@@ -6,7 +6,7 @@
 
 /* The attitude that turns a1 into b1 exactly, and a2 into the plane of b1 and b2 (TRIAD; Black
  * 1964). Returns 0 if two directions coincide. */
-int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
+int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
                   real m[9]) {
   real bn[3], an[3], bt[3], at[3];
   starcat_cross(b1, b2, bn);
@@ -28,7 +28,7 @@ int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const re
 
 /* Solve a symmetric system of three: m is xx, xy, xz, yy, yz, zz, and so is its inverse.
  * Returns 0 if the matrix is not positive definite. */
-int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
+int starcat_solve_symmetric(const real m[6], const real v[3], real x[3], real inverse[6]) {
   const real xx = m[3] * m[5] - m[4] * m[4];
   const real xy = m[2] * m[4] - m[1] * m[5];
   const real xz = m[1] * m[4] - m[2] * m[3];
@@ -50,10 +50,10 @@ int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]) 
 }
 
 /* Invert a matrix of four. Returns 0 if it is not positive definite. */
-int starcat_invert(const starcat_information *m, starcat_information *inverse) {
+int starcat_invert_information(const starcat_information *m, starcat_information *inverse) {
   const real *c = m->with_scale;
   real along[3], of_angles[6];
-  if (!starcat_solve(m->angles, c, along, of_angles)) {
+  if (!starcat_solve_symmetric(m->angles, c, along, of_angles)) {
     return 0;
   }
   const real left = m->scale - starcat_dot(c, along);
@@ -74,7 +74,7 @@ int starcat_invert(const starcat_information *m, starcat_information *inverse) {
 }
 
 /* Turn an attitude by the small angles w about the camera's axes (Cayley's rotation). */
-static void turn_by(real m[9], const real w[3]) {
+static void turn_matrix(real m[9], const real w[3]) {
   const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};
   const real scale = R(2.0) / (R(1.0) + starcat_dot(h, h));
   for (uint32_t k = 0; k < 3u; k++) {
@@ -92,7 +92,7 @@ static void turn_by(real m[9], const real w[3]) {
  * Newton's method on Wahba's loss, whose steps square the error. body[i] belongs to
  * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
  * It works with differences of directions, so that narrow fields lose no digits. */
-void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
                     const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {
     real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
@@ -116,10 +116,10 @@ void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_
       h[4] -= half * (a[1] * b[2] + a[2] * b[1]);
       h[5] += v * (d - a[2] * b[2]);
     }
-    if (!starcat_solve(h, g, w, inverse)) {
+    if (!starcat_solve_symmetric(h, g, w, inverse)) {
       return;
     }
-    turn_by(m, w);
+    turn_matrix(m, w);
     if (starcat_dot(w, w) < R(1e-12)) {
       return;
     }
@@ -127,7 +127,7 @@ void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_
 }
 
 /* Quaternion of a rotation matrix; the largest component first (Shepperd 1978). */
-void starcat_quaternion(const real m[9], real q[4]) {
+void starcat_make_quaternion(const real m[9], real q[4]) {
   const real trace = m[0] + m[4] + m[8];
   uint32_t i = 0;
   real largest = m[0];
@@ -162,7 +162,7 @@ void starcat_quaternion(const real m[9], real q[4]) {
 }
 
 /* Rotation matrix of a unit quaternion. */
-void starcat_matrix(const real q[4], real m[9]) {
+void starcat_make_matrix(const real q[4], real m[9]) {
   const real x = q[0], y = q[1], z = q[2], w = q[3];
   m[0] = R(1.0) - R(2.0) * (y * y + z * z);
   m[1] = R(2.0) * (x * y + z * w);
@@ -187,7 +187,7 @@ static real spread(const real (*v)[3], uint32_t i, uint32_t j) {
   return starcat_dot(normal, normal);
 }
 
-starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
+starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
                                 uint32_t count, starcat_real q_body_from_icrs[4]) {
   real m[9], widest = R(0.0);
   uint32_t second = 0;
@@ -204,10 +204,10 @@ starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_rea
       second = i;
     }
   }
-  if ((count < 2u) || !starcat_triad(body[0], body[second], icrs[0], icrs[second], m)) {
+  if ((count < 2u) || !starcat_fit_triad(body[0], body[second], icrs[0], icrs[second], m)) {
     return STARCAT_TOO_FEW_STARS;
   }
-  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
-  starcat_quaternion(m, q_body_from_icrs);
-  return STARCAT_IDENTIFIED;
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
+  starcat_make_quaternion(m, q_body_from_icrs);
+  return STARCAT_OK;
 }

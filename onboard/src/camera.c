@@ -21,7 +21,7 @@
 #endif
 
 /* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
-static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) {
+static void apply_distortion(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
                       R(2.0) * (c->p2 * u + c->p1 * v);
@@ -30,17 +30,17 @@ static void image_of(const starcat_camera *c, real u, real v, real *x, real *y) 
 }
 
 /* The same; returns 0 from the fold outwards. */
-static int distort(const starcat_camera *c, real u, real v, real *x, real *y) {
+static int distort_point(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   if (!(s < FARTHEST) || ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius))) {
     return 0;
   }
-  image_of(c, u, v, x, y);
+  apply_distortion(c, u, v, x, y);
   return 1;
 }
 
 /* How the image of the direction x/z = u, y/z = v moves with these: dx/du, dx/dv, dy/du, dy/dv. */
-static void slopes(const starcat_camera *c, real u, real v, real slope[4]) {
+static void differentiate_distortion(const starcat_camera *c, real u, real v, real slope[4]) {
   const real s = u * u + v * v;
   const real along = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
   const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
@@ -54,7 +54,7 @@ static void slopes(const starcat_camera *c, real u, real v, real slope[4]) {
 
 /* The direction that the lens puts at the image x, y: Newton's method in the plane, started at
  * the image. Returns 0 if there is none inside the fold, or it is too far to be found. */
-static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) {
+static int undistort_point(const starcat_camera *c, real x, real y, real *u, real *v) {
   *u = x;
   *v = y;
   for (uint32_t step = 0; step < NEWTON_STEPS; step++) {
@@ -62,8 +62,8 @@ static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) 
     if (!(*u * *u + *v * *v < FARTHEST)) {
       return 0;
     }
-    image_of(c, *u, *v, &there_x, &there_y);
-    slopes(c, *u, *v, slope);
+    apply_distortion(c, *u, *v, &there_x, &there_y);
+    differentiate_distortion(c, *u, *v, slope);
     const real miss_x = there_x - x, miss_y = there_y - y;
     const real determinant = slope[0] * slope[3] - slope[1] * slope[2];
     real step_u = slope[3] * miss_x - slope[1] * miss_y;
@@ -90,12 +90,12 @@ static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) 
   return 0;
 }
 
-int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]) {
+int starcat_find_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]) {
   const starcat_camera *c = &camera->given;
   const real x = (x_px - c->x0_px) / c->focal_length_px;
   const real y = (y_px - c->y0_px) / c->focal_length_px;
   real u = x, v = y;
-  if (camera->distorted && !undistort(c, x, y, &u, &v)) {
+  if (camera->distorted && !undistort_point(c, x, y, &u, &v)) {
     return 0;
   }
   const real scale = R(1.0) / STARCAT_SQRT(R(1.0) + u * u + v * v);
@@ -105,14 +105,14 @@ int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real b
   return scale >= STARCAT_LEAST_COSINE;
 }
 
-int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px) {
+int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px) {
   const starcat_camera *c = &camera->given;
   if (!(body[2] > LEAST_SEEN)) {
     return 0;
   }
   const real scale = R(1.0) / body[2];
   real x = body[0] * scale, y = body[1] * scale;
-  if (camera->distorted && !distort(c, x, y, &x, &y)) {
+  if (camera->distorted && !distort_point(c, x, y, &x, &y)) {
     return 0;
   }
   *x_px = x * c->focal_length_px + c->x0_px;
@@ -121,11 +121,11 @@ int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, 
 }
 
 /* How a direction turns with its pixel's x and y: the turn, radians, for one pixel of each. */
-void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], real turn[2][3]) {
+void starcat_find_turns(const starcat_optics *camera, const real body[3], real turn[2][3]) {
   const real u = body[0] / body[2], v = body[1] / body[2];
   real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
   if (camera->distorted != 0) {
-    slopes(&camera->given, u, v, s);
+    differentiate_distortion(&camera->given, u, v, s);
   }
   /* b x db/du = z (b x e_x), and so for v. At the very fold of a lens the turn has no bound. */
   const real least = R(1e-6) * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + s[3] * s[3]) + R(1e-12);
@@ -139,7 +139,7 @@ void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], re
 }
 
 /* The largest of the lens's terms; 0: there is no distortion. */
-static real distortion_of(const starcat_camera *c) {
+static real largest_distortion(const starcat_camera *c) {
   return starcat_larger(
       starcat_larger(starcat_absolute(c->k1), starcat_absolute(c->k2)),
       starcat_larger(starcat_absolute(c->k3),
@@ -156,7 +156,7 @@ static int is_possible(const starcat_camera *c) {
   return (starcat_smaller(c->width_px, c->height_px) >= R(1.0)) &&
          (most_px <= STARCAT_LARGEST_PX) &&
          starcat_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
-         (starcat_larger(distortion_of(c), c->fold_radius) <= R(1e9)) &&
+         (starcat_larger(largest_distortion(c), c->fold_radius) <= R(1e9)) &&
          (c->fold_radius >= R(0.0));
 }
 
@@ -168,11 +168,11 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
   camera->given = *given;
   camera->half_width = R(0.5) * given->width_px;
   camera->half_height = R(0.5) * given->height_px;
-  camera->distorted = distortion_of(given) > R(0.0);
+  camera->distorted = largest_distortion(given) > R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);
-    if (!starcat_direction(camera, x, y, camera->corner[n])) {
+    if (!starcat_find_direction(camera, x, y, camera->corner[n])) {
       return STARCAT_E_CAMERA;
     }
     if (camera->corner[n][2] < widest) {
@@ -183,7 +183,7 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
   camera->sin_radius = STARCAT_SQRT(R(1.0) - widest * widest);
   camera->log_area = STARCAT_LOG(given->width_px * given->height_px);
   camera->log_focal = STARCAT_LOG(given->focal_length_px);
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
 /* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
@@ -192,9 +192,9 @@ static int scale_camera(starcat_call *call, real focal) {
   starcat_workspace *w = call->work;
   starcat_camera given = call->camera.given;
   given.focal_length_px = focal * call->focal_px;
-  int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_IDENTIFIED;
+  int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_OK;
   for (uint32_t i = 0; good && (i < call->own->count); i++) {
-    good = starcat_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
+    good = starcat_find_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
@@ -222,7 +222,7 @@ void starcat_allow_scales(starcat_call *call, real fov_error) {
   }
 }
 
-void starcat_camera_of(const starcat_image *image, starcat_camera *camera) {
+void starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
   camera->width_px = image->width_px;
   camera->height_px = image->height_px;
   camera->focal_length_px = image->focal_length_px;

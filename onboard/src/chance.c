@@ -39,7 +39,7 @@ static real information_of_places(const starcat_call *call, real *of_scale) {
       cross[1] -= x * (b + y * y);
     }
   }
-  *of_scale = starcat_solve(h, cross, share, unused) ? along - starcat_dot(cross, share) : R(0.0);
+  *of_scale = starcat_solve_symmetric(h, cross, share, unused) ? along - starcat_dot(cross, share) : R(0.0);
   return h[0] * (h[3] * h[5] - h[4] * h[4]) + h[1] * (h[2] * h[4] - h[1] * h[5]) +
          h[2] * (h[1] * h[4] - h[2] * h[3]);
 }
@@ -119,7 +119,7 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
 
 /* Add the information that a direction gives about an attitude (Shuster and Oh 1981) and about the
  * focal length. */
-void starcat_inform(starcat_information *h, const real b[3]) {
+void starcat_add_information(starcat_information *h, const real b[3]) {
   const real square = b[2] * b[2];
   h->angles[0] += R(1.0) - b[0] * b[0];
   h->angles[1] -= b[0] * b[1];
@@ -146,7 +146,7 @@ static real corner_deviation(const starcat_information *covariance, const starca
   real worst = R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     starcat_information h = {{0}, {0}, R(0.0)};
-    starcat_inform(&h, camera->corner[n]);
+    starcat_add_information(&h, camera->corner[n]);
     worst = starcat_larger(worst, trace(covariance, &h));
   }
   return STARCAT_SQRT(worst);
@@ -157,12 +157,12 @@ static int invert_angles(const starcat_information *matched, starcat_information
   const starcat_information none = {{0}, {0}, R(0.0)};
   real unused[3];
   *covariance = none;
-  return starcat_solve(matched->angles, matched->with_scale, unused, covariance->angles);
+  return starcat_solve_symmetric(matched->angles, matched->with_scale, unused, covariance->angles);
 }
 
 /* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
  * whether its stars determine the whole frame, even where the focal length is not trusted. */
-void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad,
+void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
                    starcat_agreement *found) {
   const starcat_workspace *w = call->work;
   const real n = (real)found->n_matched;
@@ -170,12 +170,12 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
   starcat_information own, with_scale;
   const int has_scale = call->fov_error > R(0.0);
   for (uint32_t i = 0; i < call->own->count; i++) {
-    starcat_inform(&centroids, call->body[i]);
+    starcat_add_information(&centroids, call->body[i]);
     if (w->match[i] >= 0) {
-      starcat_inform(&matched, call->body[i]);
+      starcat_add_information(&matched, call->body[i]);
     }
   }
-  const int is_whole = starcat_invert(&matched, &with_scale);
+  const int is_whole = starcat_invert_information(&matched, &with_scale);
   real corner = R(0.0);
   found->is_firm = 0;
   if (is_whole != 0) {
@@ -192,8 +192,8 @@ void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad
   }
   for (uint32_t j = 0; j < call->own->n_within; j++) {
     real body[3];
-    starcat_turn(m, w->near_icrs[starcat_near(w, j)], body);
-    starcat_inform(&stars, body);
+    starcat_turn(m, w->near_icrs[starcat_find_near(w, j)], body);
+    starcat_add_information(&stars, body);
   }
   const starcat_information *covariance = has_scale ? &with_scale : &own;
   const real unknowns = has_scale ? R(4.0) : R(3.0);
@@ -218,7 +218,7 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   real extent = R(0.0), product = R(0.0), left = R(0.0);
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = starcat_match(w, i);
+      const uint32_t j = starcat_find_match(w, i);
       mean_x += w->x_of[j] / n;
       mean_y += w->y_of[j] / n;
       off_x += (w->x[i] - w->x_of[j]) / n;
@@ -227,7 +227,7 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = starcat_match(w, i);
+      const uint32_t j = starcat_find_match(w, i);
       const real x = w->x_of[j] - mean_x, y = w->y_of[j] - mean_y;
       extent += x * x + y * y;
       product += x * (w->x[i] - w->x_of[j]) + y * (w->y[i] - w->y_of[j]);
@@ -243,7 +243,7 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      const uint32_t j = starcat_match(w, i);
+      const uint32_t j = starcat_find_match(w, i);
       const real x = w->x[i] - w->x_of[j] - off_x - excess * (w->x_of[j] - mean_x);
       const real y = w->y[i] - w->y_of[j] - off_y - excess * (w->y_of[j] - mean_y);
       left += x * x + y * y;

@@ -9,39 +9,13 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-/* The exponent's part of a number's first two bytes: all set where it is infinite or not one. */
-#ifdef STARCAT_SINGLE
-#define EXPONENT 0x7f80u
-#else
-#define EXPONENT 0x7ff0u
-#endif
-
-void starcat_default_options(starcat_options *options) {
+void starcat_set_default_options(starcat_options *options) {
   options->tolerance_px = R(2.0);
   options->noise_px = R(0.0);
   options->noise_mag = R(0.0);
   options->log_chance = LOG_CERTAIN;
   options->fov_error = R(0.0);
   options->max_steps = 4000000u;
-}
-
-/* Whether a number is finite, by its exponent: where what is not a number is compared or subtracted,
- * a processor may trap. */
-static int is_finite(const real *number) {
-  const uint8_t *bytes = (const uint8_t *)(const void *)number;
-  const uint16_t one = 1;
-  const size_t is_little = *(const uint8_t *)(const void *)&one;
-  const uint32_t first = bytes[is_little * (sizeof(real) - 1u)];
-  const uint32_t second = bytes[1u + is_little * (sizeof(real) - 3u)];
-  return ((first << 8 | second) & EXPONENT) != EXPONENT;
-}
-
-int starcat_are_finite(const real *numbers, uint32_t count) {
-  int finite = 1;
-  for (uint32_t n = 0; n < count; n++) {
-    finite &= is_finite(numbers + n);
-  }
-  return finite;
 }
 
 static starcat_status check_options(const starcat_options *o) {
@@ -55,7 +29,7 @@ static starcat_status check_options(const starcat_options *o) {
                           STARCAT_LARGEST_PX)) {
     return STARCAT_E_OPTIONS;
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
 /* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
@@ -73,7 +47,7 @@ static int comes_before(const starcat_call *call, real magnitude, real square, r
 }
 
 /* Put a centroid where it belongs among those that are in order. */
-static void insert(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
+static void insert_centroid(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
   const real square = dx * dx + dy * dy;
@@ -102,12 +76,12 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
   for (uint32_t i = 0; i < frame->count; i++) {
     const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
-    if (!is_finite(x) || !is_finite(y)) {
+    if (!starcat_is_finite(x) || !starcat_is_finite(y)) {
       result->star[i] = STARCAT_DROPPED_NOT_FINITE;
     } else if ((*x < R(0.0)) || (*x >= camera->width_px) || (*y < R(0.0)) ||
                (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
-    } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes + i)) {
+    } else if ((frame->magnitudes != NULL) && starcat_is_finite(frame->magnitudes + i)) {
       call->own->has_magnitudes = 1;
     }
   }
@@ -123,7 +97,7 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
       k++;
     }
     if (k < kept) {
-      result->star[starcat_below(w->row[i], call->own->given)] = STARCAT_DROPPED_DUPLICATE;
+      result->star[starcat_limit_place(w->row[i], call->own->given)] = STARCAT_DROPPED_DUPLICATE;
     } else {
       w->row[kept] = w->row[i];
       w->x[kept] = w->x[i];
@@ -133,6 +107,26 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
     }
   }
   call->own->count = kept;
+}
+
+/* List the usable centroids by the column of the detector that they are in. */
+void starcat_list_columns(starcat_call *call) {
+  starcat_workspace *w = call->work;
+  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
+  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
+    w->column[n] = 0;
+  }
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    w->column[starcat_find_column(call, w->x[i])]++;
+  }
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
+    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
+  }
+  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
+    const uint32_t n = starcat_find_column(call, w->x[i - 1u]);
+    w->column[n]--;
+    w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
+  }
 }
 
 static void set_limits(starcat_call *call, const starcat_options *options) {
@@ -156,7 +150,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   }
 }
 
-starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
                              const starcat_camera *camera, const starcat_options *options,
                              const starcat_frame *frame, starcat_workspace *work,
                              starcat_result *result) {
@@ -184,10 +178,10 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     return STARCAT_E_TOO_MANY_CENTROIDS;
   }
   starcat_status status = check_options(options);
-  if (status == STARCAT_IDENTIFIED) {
+  if (status == STARCAT_OK) {
     status = starcat_prepare_camera(camera, &call->camera);
   }
-  if (status != STARCAT_IDENTIFIED) {
+  if (status != STARCAT_OK) {
     return status;
   }
   call->image = image;
@@ -206,21 +200,21 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
   call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
-    if ((frame->sigma_px != NULL) && is_finite(frame->sigma_px + i) &&
+    if ((frame->sigma_px != NULL) && starcat_is_finite(frame->sigma_px + i) &&
         !starcat_is_between(frame->sigma_px[i], STARCAT_LEAST_PX, STARCAT_LARGEST_PX)) {
       return STARCAT_E_OPTIONS;
     }
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
-          (call->own->has_magnitudes != 0u) && is_finite(frame->magnitudes + i);
-      insert(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
+          (call->own->has_magnitudes != 0u) && starcat_is_finite(frame->magnitudes + i);
+      insert_centroid(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
              frame->y_px[i]);
     }
   }
   drop_repeats(call, result);
   starcat_list_columns(call);
   for (uint32_t i = 0; i < call->own->count; i++) {
-    if (!starcat_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
+    if (!starcat_find_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
       return STARCAT_E_CAMERA;
     }
   }
@@ -230,5 +224,5 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
     result->reason = STARCAT_REASON_TOO_FEW_STARS;
     return STARCAT_TOO_FEW_STARS;
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }

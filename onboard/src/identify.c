@@ -9,17 +9,17 @@
 #define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
 
-starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
+starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result) {
   starcat_call call;
-  const starcat_status status = starcat_begin(&call, image, camera, options, frame, work, result);
-  if (status != STARCAT_IDENTIFIED) {
+  const starcat_status status = starcat_begin_call(&call, image, camera, options, frame, work, result);
+  if (status != STARCAT_OK) {
     return status;
   }
-  starcat_each_triangle(&call,
-                        image->method == STARCAT_TRIANGLE ? starcat_triangle : starcat_pyramid);
-  return starcat_end(&call, options, result);
+  starcat_search_triangles(&call,
+                        image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle : starcat_look_up_pyramid);
+  return starcat_end_call(&call, options, result);
 }
 
 /* A prior attitude and how far from their predicted places it may put stars. */
@@ -51,7 +51,7 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   for (uint32_t n = 0; n < 4u; n++) {
     unit[n] = q[n] / STARCAT_SQRT(square);
   }
-  starcat_matrix(unit, p->matrix);
+  starcat_make_matrix(unit, p->matrix);
   const real c = STARCAT_COS(uncertainty_rad), s = STARCAT_SIN(uncertainty_rad);
   p->cos_radius = camera->cos_radius * c - camera->sin_radius * s;
   p->sin_radius = camera->sin_radius * c + camera->cos_radius * s;
@@ -62,20 +62,20 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   p->shift_px = uncertainty_rad * stretch * camera->given.focal_length_px + call->reach_px;
   p->turn = R(2.0) * uncertainty_rad * stretch;
   p->is_stale = 1;
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
 /* Put the stars around the prior's frame where the prior predicts them. Returns 0 if they are too
  * many, or the budget is used up. */
-static int predict(const starcat_call *call, prior *p) {
+static int predict_stars(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
-    call->own->n_near = starcat_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
+    call->own->n_near = starcat_gather_stars(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
                                w->near_row, w->near_icrs);
-    if ((call->own->n_near > STARCAT_MAX_STARS) || !starcat_spend(call, call->own->n_near)) {
+    if ((call->own->n_near > STARCAT_MAX_STARS) || !starcat_spend_steps(call, call->own->n_near)) {
       return 0;
     }
-    starcat_project(call, p->matrix, p->shift_px);
+    starcat_project_stars(call, p->matrix, p->shift_px);
     p->is_stale = 0;
   }
   return 1;
@@ -87,14 +87,14 @@ static real square_from(const starcat_workspace *w, uint32_t star, real x, real 
 }
 
 /* The star predicted next farther from a centroid than `past`; -1 if none is within the slack. */
-static int32_t next_star(const starcat_call *call, const prior *p, uint32_t centroid, real *past) {
+static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t centroid, real *past) {
   const starcat_workspace *w = call->work;
   real least = p->shift_px * p->shift_px;
   int32_t found = -1;
   for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x[centroid], w->y[centroid]);
     if ((square > *past) && (square <= least) &&
-        starcat_compatible(call, centroid, w->near_row[starcat_near(w, k)])) {
+        starcat_is_compatible(call, centroid, w->near_row[starcat_find_near(w, k)])) {
       least = square;
       found = (int32_t)k;
     }
@@ -104,7 +104,7 @@ static int32_t next_star(const starcat_call *call, const prior *p, uint32_t cent
 }
 
 /* The centroid farthest from another one: the two determine the attitude best. */
-static uint32_t farthest(const starcat_call *call, uint32_t from) {
+static uint32_t find_farthest(const starcat_call *call, uint32_t from) {
   const starcat_workspace *w = call->work;
   uint32_t best = from;
   real most = R(0.0);
@@ -128,20 +128,20 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
              high = starcat_chord_of_angle(apart + error);
   const real dx = w->x[b] - w->x[a], dy = w->y[b] - w->y[a];
   const real slack = R(2.0) * call->reach_px + p->turn * STARCAT_SQRT(dx * dx + dy * dy);
-  const real *first = w->near_icrs[starcat_near(w, star)];
+  const real *first = w->near_icrs[starcat_find_near(w, star)];
   real least = slack * slack, m[9];
   int32_t partner = -1;
   for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
     if (square <= least) {
-      const real chord = starcat_chord_square(first, w->near_icrs[starcat_near(w, k)]);
+      const real chord = starcat_chord_square(first, w->near_icrs[starcat_find_near(w, k)]);
       if ((chord >= low * low) && (chord <= high * high)) {
         least = square;
         partner = (int32_t)k;
       }
     }
   }
-  if (!starcat_spend(call, call->own->n_within + 1u)) {
+  if (!starcat_spend_steps(call, call->own->n_within + 1u)) {
     return 1;
   }
   if (partner < 0) {
@@ -152,14 +152,14 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
     body[0][k] = w->body[a][k];
     body[1][k] = w->body[b][k];
     icrs[0][k] = first[k];
-    icrs[1][k] = w->near_icrs[starcat_near(w, (uint32_t)partner)][k];
+    icrs[1][k] = w->near_icrs[starcat_find_near(w, (uint32_t)partner)][k];
   }
-  if (!starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+  if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
   p->is_stale = 1;
-  return starcat_try(call, m, R(1.0));
+  return starcat_try_attitude(call, m, R(1.0));
 }
 
 /* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if
@@ -168,10 +168,10 @@ static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
   real past = R(-1.0);
   int32_t star = 0;
   while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
-    if (!predict(call, p) || !starcat_spend(call, call->own->n_within + 1u)) {
+    if (!predict_stars(call, p) || !starcat_spend_steps(call, call->own->n_within + 1u)) {
       return 1;
     }
-    star = next_star(call, p, a, &past);
+    star = find_next_star(call, p, a, &past);
     if ((star >= 0) && try_pair(call, p, a, (uint32_t)star, b)) {
       return 1;
     }
@@ -179,7 +179,7 @@ static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
   return 0;
 }
 
-starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
+starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,
                              starcat_workspace *work, starcat_result *result) {
@@ -188,22 +188,22 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
   if (q_prior == NULL) {
     return STARCAT_E_NULL;
   }
-  starcat_status status = starcat_begin(&call, image, camera, options, frame, work, result);
-  if (status == STARCAT_IDENTIFIED) {
+  starcat_status status = starcat_begin_call(&call, image, camera, options, frame, work, result);
+  if (status == STARCAT_OK) {
     status = set_prior(&call, q_prior, uncertainty_rad, &p);
   }
-  if (status != STARCAT_IDENTIFIED) {
+  if (status != STARCAT_OK) {
     return status;
   }
-  if (!predict(&call, &p) && (call.counters.steps_left > 0u)) {
+  if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
     return STARCAT_E_CAPACITY; /* so wide a prior, and so many stars */
   }
   for (uint32_t a = 0; (a < call.counters.count) && (a < MOST_ANCHORS); a++) {
-    const uint32_t b = farthest(&call, a);
+    const uint32_t b = find_farthest(&call, a);
     /* A false spot may be the farthest one; then the next one in order serves. */
     if (try_anchor(&call, &p, a, b) || try_anchor(&call, &p, a, (a + 1u) % call.counters.count)) {
       break;
     }
   }
-  return starcat_end(&call, options, result);
+  return starcat_end_call(&call, options, result);
 }

@@ -82,7 +82,7 @@ typedef struct {
 } starcat_optics;
 
 /* What a call counts. It is not in the workspace, where a flipped bit of it would lead out of that;
- * what is in there and leads to a place is held to its range by starcat_below when it is used. */
+ * what is in there and leads to a place is held to its range by starcat_limit_place when it is used. */
 typedef struct {
   uint32_t given;          /* centroids of the frame */
   uint32_t count;          /* those that can be used */
@@ -122,22 +122,31 @@ typedef struct {
 } starcat_information;
 
 /* A place in an array of so many; the first one where it is beyond them, by a flipped bit. */
-static inline uint32_t starcat_below(uint32_t place, uint32_t count) {
+static inline uint32_t starcat_limit_place(uint32_t place, uint32_t count) {
   return place < count ? place : 0u;
 }
 
 /* The place among the near stars of one of those within reach. */
-static inline uint32_t starcat_near(const starcat_workspace *w, uint32_t star) {
-  return starcat_below(w->within[star], STARCAT_MAX_STARS);
+static inline uint32_t starcat_find_near(const starcat_workspace *w, uint32_t star) {
+  return starcat_limit_place(w->within[star], STARCAT_MAX_STARS);
 }
 
 /* The place among those within reach of the star that a centroid is. */
-static inline uint32_t starcat_match(const starcat_workspace *w, uint32_t centroid) {
-  return starcat_below((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
+static inline uint32_t starcat_find_match(const starcat_workspace *w, uint32_t centroid) {
+  return starcat_limit_place((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
+}
+
+/* The column of the detector that a place is in; the first or the last one outside of it. */
+static inline uint32_t starcat_find_column(const starcat_call *call, real x_px) {
+  const real scaled = x_px * call->columns_per_px;
+  if (!(scaled > R(0.0))) {
+    return 0;
+  }
+  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
 }
 
 /* The direction of a star. */
-static inline void starcat_star(const starcat_image *image, uint32_t row, real icrs[3]) {
+static inline void starcat_read_star(const starcat_image *image, uint32_t row, real icrs[3]) {
   const int32_t *direction = image->directions + 3u * (size_t)row;
   icrs[0] = STARCAT_UNIT * (real)direction[0];
   icrs[1] = STARCAT_UNIT * (real)direction[1];
@@ -145,7 +154,7 @@ static inline void starcat_star(const starcat_image *image, uint32_t row, real i
 }
 
 /* The rows of the stars of a feature. */
-static inline void starcat_rows_of(const starcat_image *image, uint32_t feature, uint32_t width,
+static inline void starcat_read_rows(const starcat_image *image, uint32_t feature, uint32_t width,
                                    uint32_t rows[3]) {
   const size_t at = (size_t)feature * width;
   if (image->index_bytes == 2u) {
@@ -162,57 +171,60 @@ static inline void starcat_rows_of(const starcat_image *image, uint32_t feature,
 }
 
 /* image.c */
-uint32_t starcat_crc32(uint32_t crc, const uint8_t *bytes, size_t count);
-int starcat_is_sound(const uint8_t *check_block);
-int starcat_block_is_sound(const uint8_t *image, uint32_t data_bytes, uint32_t block);
+uint32_t starcat_update_crc(uint32_t crc, const uint8_t *bytes, size_t count);
+int starcat_is_check_block_sound(const uint8_t *check_block);
+int starcat_is_block_sound(const uint8_t *image, uint32_t data_bytes, uint32_t block);
 
-/* frame.c */
+/* numbers.c */
+int starcat_is_finite(const real *number);
 int starcat_are_finite(const real *numbers, uint32_t count);
+real starcat_log_factorial(uint32_t n);
+real starcat_exponential(real x);
+
+/* budget.c */
+int starcat_spend_steps(const starcat_call *call, uint32_t steps);
 
 /* attitude.c */
-int starcat_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
+int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
                   real m[9]);
-int starcat_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
-int starcat_invert(const starcat_information *m, starcat_information *inverse);
-void starcat_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+int starcat_solve_symmetric(const real m[6], const real v[3], real x[3], real inverse[6]);
+int starcat_invert_information(const starcat_information *m, starcat_information *inverse);
+void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
                     const real *weight, uint32_t count, uint32_t most);
-void starcat_quaternion(const real m[9], real q[4]);
-void starcat_matrix(const real q[4], real m[9]);
+void starcat_make_quaternion(const real m[9], real q[4]);
+void starcat_make_matrix(const real q[4], real m[9]);
 
 /* camera.c */
 starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera);
 void starcat_set_focal(starcat_call *call, real focal);
 void starcat_allow_scales(starcat_call *call, real fov_error);
-int starcat_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
-int starcat_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);
-void starcat_turns_of_pixel(const starcat_optics *camera, const real body[3], real turn[2][3]);
+int starcat_find_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
+int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);
+void starcat_find_turns(const starcat_optics *camera, const real body[3], real turn[2][3]);
 
 /* sky.c */
-uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
+uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
                         uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
-real starcat_log_factorial(uint32_t n);
-real starcat_exponential(real x);
 void starcat_count_ways(const starcat_call *call, uint32_t most);
 real starcat_log_ways(const starcat_call *call, uint32_t n);
 
 /* chance.c */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched);
-void starcat_inform(starcat_information *h, const real b[3]);
-void starcat_weigh(const starcat_call *call, const real m[9], real tolerance_rad,
+void starcat_add_information(starcat_information *h, const real b[3]);
+void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
                    starcat_agreement *found);
 int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
-int starcat_spend(const starcat_call *call, uint32_t steps);
-int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
-int starcat_try(starcat_call *call, const real m[9], real focal);
-void starcat_project(const starcat_call *call, const real m[9], real margin_px);
-void starcat_list_columns(starcat_call *call);
+int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
+int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
+void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
 /* frame.c */
-starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
+void starcat_list_columns(starcat_call *call);
+starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
                              const starcat_camera *camera, const starcat_options *options,
                              const starcat_frame *frame, starcat_workspace *work,
                              starcat_result *result);
@@ -222,16 +234,16 @@ starcat_status starcat_begin(starcat_call *call, const starcat_image *image,
 void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
                         starcat_workspace *work, starcat_result *result);
 #endif
-starcat_status starcat_end(starcat_call *call, const starcat_options *options,
+starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                            starcat_result *result);
 
 /* triangles.c, pyramids.c */
 typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], const real sides[3]);
-real starcat_side(const starcat_call *call, uint32_t i, uint32_t j);
-void starcat_each_triangle(starcat_call *call, starcat_look_up look_up);
-void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j);
+void starcat_search_triangles(starcat_call *call, starcat_look_up look_up);
+void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
                           uint32_t *stop);
-int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
-int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
+int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
+int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 
 #endif

@@ -36,7 +36,7 @@ static int choose_side(const starcat_call *call, const uint32_t triple[3], const
     if (sides[n] - error > image->longest_rad) {
       continue;
     }
-    starcat_rows_between(image, sides[n] - error, sides[n] + error, &start, &stop);
+    starcat_find_rows(image, sides[n] - error, sides[n] + error, &start, &stop);
     if (start > stop) {
       stop = start;
     }
@@ -51,7 +51,7 @@ static int choose_side(const starcat_call *call, const uint32_t triple[3], const
   return o->stop != UINT32_MAX;
 }
 
-static void describe(const starcat_call *call, const real side[3], real error, base *o) {
+static void describe_base(const starcat_call *call, const real side[3], real error, base *o) {
   const starcat_workspace *w = call->work;
   real normal[3];
   const real *a = w->body[o->corner[0]], *b = w->body[o->corner[1]], *c = w->body[o->corner[2]];
@@ -88,7 +88,7 @@ static void mark_partners(const starcat_image *image, const uint32_t range[2],
     partners[n] = 0;
   }
   for (uint32_t pair = range[0]; pair < range[1]; pair++) {
-    starcat_rows_of(image, pair, 2, rows);
+    starcat_read_rows(image, pair, 2, rows);
     partners[rows[0] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[1]) << (rows[0] % 32u);
     partners[rows[1] / 32u % STARCAT_MARKS] |= has_mark(marks, rows[0]) << (rows[1] % 32u);
   }
@@ -105,7 +105,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
   for (uint32_t n = 1; n < 3u; n++) {
     const real low = side[n] - MARGIN * error, high = side[n] + MARGIN * error;
     if (high <= image->longest_rad) {
-      starcat_rows_between(image, low, high, range[n], range[n] + 1);
+      starcat_find_rows(image, low, high, range[n], range[n] + 1);
       count += range[n][1] > range[n][0] ? range[n][1] - range[n][0] : 0u;
     }
   }
@@ -113,7 +113,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
   if (o->is_marked == 0) {
     return 1;
   }
-  if (!starcat_spend(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS)) {
+  if (!starcat_spend_steps(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS)) {
     return 0; /* before the work: there may be as many pairs as the image has */
   }
   for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
@@ -135,11 +135,11 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */
-static int complete(starcat_call *call, const base *o, const real first[3], const real second[3]) {
+static int complete_pyramid(starcat_call *call, const base *o, const real first[3], const real second[3]) {
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
-  if (!starcat_spend(call, STEPS_OF_THIRD)) {
+  if (!starcat_spend_steps(call, STEPS_OF_THIRD)) {
     return 1;
   }
   starcat_cross(first, second, normal);
@@ -153,7 +153,7 @@ static int complete(starcat_call *call, const base *o, const real first[3], cons
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] *= scale;
   }
-  uint32_t count = starcat_gather(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
+  uint32_t count = starcat_gather_stars(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
   if (call->own->steps_left == 0u) {
     return 1;
   }
@@ -166,9 +166,9 @@ static int complete(starcat_call *call, const base *o, const real first[3], cons
                              {found[n][0], found[n][1], found[n][2]}};
     if (starcat_is_between(starcat_chord_square(first, found[n]), o->low[1], o->high[1]) &&
         starcat_is_between(starcat_chord_square(second, found[n]), o->low[2], o->high[2]) &&
-        starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-      starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-      if (starcat_try(call, m, R(1.0)) != 0) {
+        starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+      starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
+      if (starcat_try_attitude(call, m, R(1.0)) != 0) {
         return 1;
       }
     }
@@ -188,39 +188,39 @@ static int try_stars(starcat_call *call, const base *o, const uint32_t rows[2]) 
   if ((may[0] | may[1]) == 0u) {
     return 0;
   }
-  starcat_star(call->image, rows[0], star[0]);
-  starcat_star(call->image, rows[1], star[1]);
+  starcat_read_star(call->image, rows[0], star[0]);
+  starcat_read_star(call->image, rows[1], star[1]);
   if (!starcat_is_between(starcat_chord_square(star[0], star[1]), o->low[0], o->high[0])) {
     return 0;
   }
   for (uint32_t n = 0; n < 2u; n++) {
-    if ((may[n] != 0u) && complete(call, o, star[n], star[1u - n])) {
+    if ((may[n] != 0u) && complete_pyramid(call, o, star[n], star[1u - n])) {
       return 1;
     }
   }
   return 0;
 }
 
-int starcat_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
+int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   const starcat_image *image = call->image;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   base o;
   if (!choose_side(call, triple, sides, error, &o)) {
     return 0;
   }
-  const real side[3] = {starcat_side(call, o.corner[0], o.corner[1]),
-                        starcat_side(call, o.corner[0], o.corner[2]),
-                        starcat_side(call, o.corner[1], o.corner[2])};
-  describe(call, side, error, &o);
+  const real side[3] = {starcat_measure_side(call, o.corner[0], o.corner[1]),
+                        starcat_measure_side(call, o.corner[0], o.corner[2]),
+                        starcat_measure_side(call, o.corner[1], o.corner[2])};
+  describe_base(call, side, error, &o);
   if (!mark_corners(call, &o, side, error)) {
     return 1;
   }
   for (uint32_t pair = o.start; pair < o.stop; pair++) {
     uint32_t rows[3];
-    if (!starcat_spend(call, 1)) {
+    if (!starcat_spend_steps(call, 1)) {
       return 1;
     }
-    starcat_rows_of(image, pair, 2, rows);
+    starcat_read_rows(image, pair, 2, rows);
     if ((rows[0] < image->n_stars) && (rows[1] < image->n_stars) && /* else a damaged image */
         try_stars(call, &o, rows)) {
       return 1;

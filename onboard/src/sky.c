@@ -52,7 +52,7 @@ static void gather_sectors(cap *query, uint32_t band, uint32_t first, uint32_t l
   }
   for (uint32_t row = offsets[first]; (row < stop) && (query->visited < query->limit); row++) {
     real icrs[3];
-    starcat_star(image, row, icrs);
+    starcat_read_star(image, row, icrs);
     query->visited++;
     if (icrs[0] * x + icrs[1] * y + icrs[2] * z >= query->cos_r) {
       if (count >= query->most) {
@@ -73,7 +73,7 @@ static void gather_sectors(cap *query, uint32_t band, uint32_t first, uint32_t l
  * little farther. Returns their number, or
  * most + 1 if there are more than `most`, or if the steps are used up: a step a band, and one a
  * star that is looked at. */
-uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
+uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
                         uint32_t most, uint32_t *rows, real (*icrs)[3]) {
   const starcat_image *image = call->image;
   const real x = centre[0], y = centre[1], z = centre[2];
@@ -103,5 +103,5 @@ uint32_t starcat_gather(const starcat_call *call, const real centre[3], real cos
       }
     }
   }
-  return starcat_spend(call, query.visited) ? query.count : most + 1u;
+  return starcat_spend_steps(call, query.visited) ? query.count : most + 1u;
 }

@@ -34,7 +34,7 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
   return i < j ? j * (j - 1u) / 2u + i : i * (i - 1u) / 2u + j;
 }
 
-real starcat_side(const starcat_call *call, uint32_t i, uint32_t j) {
+real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j) {
   const starcat_workspace *w = call->work;
   return call->own->is_crowded != 0u ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
                              : w->separation_rad[pair_of(i, j)];
@@ -59,12 +59,12 @@ static int is_well_shaped(const real sides[3], real least, real cosine) {
 }
 
 /* Look a triangle up if it is of this round. Returns 1 if the search can end. */
-static int take(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
+static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
   const uint32_t triple[3] = {i, j, k};
-  const real sides[3] = {starcat_side(call, j, k), starcat_side(call, i, k),
-                         starcat_side(call, i, j)};
+  const real sides[3] = {starcat_measure_side(call, j, k), starcat_measure_side(call, i, k),
+                         starcat_measure_side(call, i, j)};
   const int good = is_well_shaped(sides, s->least_side_rad, STARCAT_COS_MIN_ANGLE);
-  if (!starcat_spend(call, 1)) {
+  if (!starcat_spend_steps(call, 1)) {
     return 1;
   }
   if ((s->poor != 0) == (good != 0)) {
@@ -81,7 +81,7 @@ static int take(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t 
 }
 
 /* Separations of a centroid from all earlier ones. */
-static void separate(starcat_call *call, uint32_t k) {
+static void separate_centroid(starcat_call *call, uint32_t k) {
   starcat_workspace *w = call->work;
   for (uint32_t i = 0; i < k; i++) {
     w->separation_rad[pair_of(i, k)] =
@@ -90,14 +90,14 @@ static void separate(starcat_call *call, uint32_t k) {
 }
 
 /* Triangles by brightness: those whose faintest centroid is the brightest come first. */
-static int by_brightness(starcat_call *call, search *s) {
+static int search_by_brightness(starcat_call *call, search *s) {
   for (uint32_t k = 0; k < s->count; k++) {
     if (s->poor == 0) {
-      separate(call, k);
+      separate_centroid(call, k);
     }
     for (uint32_t j = 1; j < k; j++) {
       for (uint32_t i = 0; i < j; i++) {
-        if (take(call, s, i, j, k) != 0) {
+        if (take_triangle(call, s, i, j, k) != 0) {
           return 1;
         }
       }
@@ -108,13 +108,13 @@ static int by_brightness(starcat_call *call, search *s) {
 
 /* Whether pair a is to come before pair b: the closer one, else that of the earlier place. */
 static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
-  const real x = w->separation_rad[starcat_below(a, STARCAT_MOST_PAIRS)];
-  const real y = w->separation_rad[starcat_below(b, STARCAT_MOST_PAIRS)];
+  const real x = w->separation_rad[starcat_limit_place(a, STARCAT_MOST_PAIRS)];
+  const real y = w->separation_rad[starcat_limit_place(b, STARCAT_MOST_PAIRS)];
   return (x < y) || (!(y < x) && (a < b));
 }
 
 /* Restore the order of the heap of pairs below a place. */
-static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
+static void sift_heap(starcat_workspace *w, uint32_t top, uint32_t count) {
   const uint16_t moved = w->heap[top];
   uint32_t at = top, child = 2u * top + 1u;
   while (child < count) {
@@ -132,7 +132,7 @@ static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
 }
 
 /* All triangles whose longest side is that of a pair. */
-static int with_longest_side(starcat_call *call, search *s, uint16_t pair) {
+static int search_with_longest_side(starcat_call *call, search *s, uint16_t pair) {
   const starcat_workspace *w = call->work;
   uint32_t q = 1;
   while ((q + 1u) * q / 2u <= pair) {
@@ -143,7 +143,7 @@ static int with_longest_side(starcat_call *call, search *s, uint16_t pair) {
     if ((r != p) && (r != q) && is_closer(w, (uint16_t)pair_of(r, p), pair) &&
         is_closer(w, (uint16_t)pair_of(r, q), pair)) {
       const uint32_t i = r < p ? r : p, k = r > q ? r : q;
-      if (take(call, s, i, p + q + r - i - k, k) != 0) {
+      if (take_triangle(call, s, i, p + q + r - i - k, k) != 0) {
         return 1;
       }
     }
@@ -153,30 +153,30 @@ static int with_longest_side(starcat_call *call, search *s, uint16_t pair) {
 
 /* Triangles by their longest side, the shortest first: the most fields hold these whole. The
  * pairs are sorted no further than they are needed. */
-static int by_longest_side(starcat_call *call, search *s) {
+static int search_by_longest_side(starcat_call *call, search *s) {
   starcat_workspace *w = call->work;
   const uint32_t pairs = s->count * (s->count - 1u) / 2u;
   uint32_t count = pairs;
   if (s->poor == 0) {
     for (uint32_t k = 1; k < s->count; k++) {
-      separate(call, k);
+      separate_centroid(call, k);
     }
   }
   for (uint32_t n = 0; n < count; n++) {
     w->heap[n] = (uint16_t)n;
   }
   for (uint32_t n = count / 2u; n > 0u; n--) {
-    sift(w, n - 1u, count);
+    sift_heap(w, n - 1u, count);
   }
-  if (!starcat_spend(call, 2u * count)) {
+  if (!starcat_spend_steps(call, 2u * count)) {
     return 1;
   }
   while (count > 0u) {
-    const uint16_t closest = (uint16_t)starcat_below(w->heap[0], pairs);
+    const uint16_t closest = (uint16_t)starcat_limit_place(w->heap[0], pairs);
     count--;
     w->heap[0] = w->heap[count];
-    sift(w, 0, count);
-    if (with_longest_side(call, s, closest) != 0) {
+    sift_heap(w, 0, count);
+    if (search_with_longest_side(call, s, closest) != 0) {
       return 1;
     }
   }
@@ -228,24 +228,24 @@ static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, ui
  * neighbours, then of every centroid the first and third nearest, the second and third, and so on.
  * A database holds the triangles of the brightest stars of its fields; in one place of a crowded
  * frame most are of the same few stars. */
-static int by_neighbours(starcat_call *call, search *s) {
+static int search_by_neighbours(starcat_call *call, search *s) {
   const starcat_workspace *w = call->work;
   uint32_t most = 0;
   for (uint32_t i = 0; i < s->count; i++) {
     most = list_neighbours(call, i, s->count);
-    if (!starcat_spend(call, s->count)) {
+    if (!starcat_spend_steps(call, s->count)) {
       return 1;
     }
   }
   for (uint32_t second = 1; second < most; second++) {
     for (uint32_t first = 0; first < second; first++) {
       for (uint32_t i = 0; i < s->count; i++) {
-        const uint32_t a = starcat_below(w->neighbour[i][first], s->count);
-        const uint32_t b = starcat_below(w->neighbour[i][second], s->count);
+        const uint32_t a = starcat_limit_place(w->neighbour[i][first], s->count);
+        const uint32_t b = starcat_limit_place(w->neighbour[i][second], s->count);
         const uint32_t low = a < b ? a : b, high = a < b ? b : a;
         if (!is_earlier(w, a, i, b, first, second, a < i) &&
             !is_earlier(w, b, i, a, first, second, b < i) &&
-            (take(call, s, i < low ? i : low, i < low ? low : (i < high ? i : high),
+            (take_triangle(call, s, i < low ? i : low, i < low ? low : (i < high ? i : high),
                   i < high ? high : i) != 0)) {
           return 1;
         }
@@ -255,14 +255,14 @@ static int by_neighbours(starcat_call *call, search *s) {
   return 0;
 }
 
-void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
+void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
   search s = {look_up, call->own->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
   s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
   s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   call->own->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (call->own->has_magnitudes == 0u);
   if (call->own->is_crowded != 0u) {
     s.count = s.count < STARCAT_SPREAD_CENTROIDS ? s.count : STARCAT_SPREAD_CENTROIDS;
-    (void)by_neighbours(call, &s);
+    (void)search_by_neighbours(call, &s);
     return;
   }
   if (s.count > STARCAT_MOST_CENTROIDS) {
@@ -271,14 +271,14 @@ void starcat_each_triangle(starcat_call *call, starcat_look_up look_up) {
   const uint32_t rounds = s.count <= STARCAT_FEW_CENTROIDS ? 2u : 1u;
   for (uint32_t n = 0; n < rounds; n++) {
     s.poor = n > 0u;
-    if ((call->own->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) != 0) {
+    if ((call->own->has_magnitudes != 0u ? search_by_brightness(call, &s) : search_by_longest_side(call, &s)) != 0) {
       return;
     }
   }
 }
 
 /* The rows of the features whose value is between two numbers, and few others. */
-void starcat_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
                           uint32_t *stop) {
   const real end = (real)(image->n_kvector - 1u);
   const real first = (low - image->kvector_intercept) / image->kvector_slope - R(0.001);
@@ -306,7 +306,7 @@ typedef struct {
 } sought;
 
 /* Put three numbers in order. */
-static void sort(real v[3]) {
+static void sort_sides(real v[3]) {
   const real less = starcat_smaller(v[0], v[1]), more = starcat_larger(v[0], v[1]), other = v[2];
   v[0] = starcat_smaller(less, other);
   v[1] = starcat_larger(less, starcat_smaller(more, other));
@@ -319,7 +319,7 @@ static void sort(real v[3]) {
 static void bound_shape(const starcat_call *call, sought *o) {
   const real shortest = R(1.0) - call->fov_error;
   real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
-  sort(a);
+  sort_sides(a);
   const real error = o->error + call->bend * a[2], narrowest = shortest - o->slack;
   const real angle = narrowest > R(0.01) ? (a[2] + error) / narrowest : HALF_TURN;
   const real widest = angle < HALF_TURN ? angle : HALF_TURN;
@@ -335,7 +335,7 @@ static void bound_shape(const starcat_call *call, sought *o) {
   o->most[2] = ABOVE * most * most;
 }
 
-static void observe(const starcat_call *call, const uint32_t triple[3], const real sides[3],
+static void observe_triangle(const starcat_call *call, const uint32_t triple[3], const real sides[3],
                     sought *o) {
   const starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
@@ -352,8 +352,8 @@ static void observe(const starcat_call *call, const uint32_t triple[3], const re
   }
   o->error = error;
   o->slack = error / starcat_smaller(starcat_smaller(sides[0], sides[1]), sides[2]);
-  sort(o->least);
-  sort(o->most);
+  sort_sides(o->least);
+  sort_sides(o->most);
   if (call->fov_error > R(0.0)) {
     bound_shape(call, o);
   }
@@ -365,7 +365,7 @@ static void observe(const starcat_call *call, const uint32_t triple[3], const re
  * any. */
 static int may_fit(const sought *o, const real chords[3], int has_scale) {
   real c[3] = {chords[0], chords[1], chords[2]};
-  sort(c);
+  sort_sides(c);
   const real unit = has_scale ? c[2] : R(1.0);
   return starcat_is_between(c[2], o->least[2], o->most[2]) &&
          starcat_is_between(c[0], o->least[0] * unit, o->most[0] * unit) &&
@@ -373,7 +373,7 @@ static int may_fit(const sought *o, const real chords[3], int has_scale) {
 }
 
 /* Directions as a camera with a multiple of the focal length sees them. */
-static void scale_to(real body[3][3], real focal) {
+static void scale_directions(real body[3][3], real focal) {
   for (uint32_t n = 0; n < 3u; n++) {
     real *b = body[n];
     b[2] *= focal;
@@ -384,7 +384,7 @@ static void scale_to(real body[3][3], real focal) {
   }
 }
 
-static real around(real v[3][3]) {
+static real circumference(real v[3][3]) {
   return starcat_chord_square(v[0], v[1]) + starcat_chord_square(v[1], v[2]) +
          starcat_chord_square(v[2], v[0]);
 }
@@ -392,14 +392,14 @@ static real around(real v[3][3]) {
 /* The focal length with which three centroids are as far apart as their stars; the centroids are
  * changed to that. Twice, because angles are no tangents. */
 static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]) {
-  const real shortest = R(1.0) - call->fov_error, apart = around(icrs);
+  const real shortest = R(1.0) - call->fov_error, apart = circumference(icrs);
   real focal = R(1.0);
   for (uint32_t n = 0; n < 2u; n++) {
     const real before = focal;
-    focal *= STARCAT_SQRT(around(body) / apart);
+    focal *= STARCAT_SQRT(circumference(body) / apart);
     focal = focal < shortest ? shortest : focal;
     focal = focal * shortest > R(1.0) ? R(1.0) / shortest : focal;
-    scale_to(body, focal / before);
+    scale_directions(body, focal / before);
   }
   return focal;
 }
@@ -419,11 +419,11 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   if (call->fov_error > R(0.0)) {
     focal = fit_scale(call, body, icrs);
   }
-  if (!starcat_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+  if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  starcat_refine(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-  return starcat_try(call, m, focal);
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
+  return starcat_try_attitude(call, m, focal);
 }
 
 /* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
@@ -457,17 +457,17 @@ static int is_same(const sought *o, const real chords[3], const uint8_t order[3]
 }
 
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
-static int compare(starcat_call *call, const sought *o, uint32_t feature) {
+static int compare_feature(starcat_call *call, const sought *o, uint32_t feature) {
   static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
                                        {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
   uint32_t rows[3];
   real stars[3][3], normal[3], chords[3];
-  starcat_rows_of(call->image, feature, 3, rows);
+  starcat_read_rows(call->image, feature, 3, rows);
   for (uint32_t n = 0; n < 3u; n++) {
     if (rows[n] >= call->image->n_stars) { /* a damaged image */
       return 0;
     }
-    starcat_star(call->image, rows[n], stars[n]);
+    starcat_read_star(call->image, rows[n], stars[n]);
   }
   chords[0] = starcat_chord_square(stars[1], stars[2]);
   chords[1] = starcat_chord_square(stars[0], stars[2]);
@@ -496,7 +496,7 @@ static int compare(starcat_call *call, const sought *o, uint32_t feature) {
 }
 
 /* Area and circumradius of a plane triangle and the errors that those of its sides cause. */
-static void features_of(const real sides[3], real error, real *area, real *area_error,
+static void compute_features(const real sides[3], real error, real *area, real *area_error,
                         real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
@@ -512,7 +512,7 @@ static void features_of(const real sides[3], real error, real *area, real *area_
   *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
 }
 
-static uint16_t quantised(real radius, real quantum) {
+static uint16_t quantise_radius(real radius, real quantum) {
   const real scaled = radius / quantum;
   if (!(scaled > R(0.0))) {
     return 0;
@@ -530,22 +530,22 @@ static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
 }
 
 /* Compare the triangles of stars of some areas and circumradii. Returns 1 if the search can end. */
-static int look_up(starcat_call *call, const sought *o, const real area[2], const real radius[2]) {
+static int look_up_features(starcat_call *call, const sought *o, const real area[2], const real radius[2]) {
   const starcat_image *image = call->image;
   const real quantum = image->radius_quantum_rad;
-  const uint16_t low = quantised(radius[0] - quantum, quantum);
-  const uint16_t width = (uint16_t)(quantised(radius[1] + R(2.0) * quantum, quantum) - low);
+  const uint16_t low = quantise_radius(radius[0] - quantum, quantum);
+  const uint16_t width = (uint16_t)(quantise_radius(radius[1] + R(2.0) * quantum, quantum) - low);
   uint32_t start, stop;
-  starcat_rows_between(image, area[0], area[1], &start, &stop);
+  starcat_find_rows(image, area[0], area[1], &start, &stop);
   for (uint32_t row = start; row < stop; row += BLOCK) {
     const uint32_t count = stop - row < BLOCK ? stop - row : BLOCK;
-    if (!starcat_spend(call, count)) {
+    if (!starcat_spend_steps(call, count)) {
       return 1;
     }
     if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
       for (uint32_t n = 0; n < count; n++) {
         if (((uint16_t)(image->radii[row + n] - low) <= width) &&
-            (!starcat_spend(call, STEPS_OF_SIDES) || compare(call, o, row + n))) {
+            (!starcat_spend_steps(call, STEPS_OF_SIDES) || compare_feature(call, o, row + n))) {
           return 1;
         }
       }
@@ -577,7 +577,7 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
     part[1] = part[1] < end ? part[1] : end;
     radii[0] = STARCAT_SQRT(part[0] / (shape + shape_error));
     radii[1] = thinnest > R(0.0) ? STARCAT_SQRT(part[1] / thinnest) : R(1e3);
-    if (!starcat_spend(call, 1) || (look_up(call, o, part, radii) != 0)) {
+    if (!starcat_spend_steps(call, 1) || (look_up_features(call, o, part, radii) != 0)) {
       return 1;
     }
     part[0] = part[1];
@@ -586,16 +586,16 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
 }
 
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
-int starcat_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
+int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   real area, area_error, radius, radius_error;
   sought o;
-  features_of(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
+  compute_features(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
               &radius_error);
-  observe(call, triple, sides, &o);
+  observe_triangle(call, triple, sides, &o);
   if (call->fov_error > R(0.0)) {
     return look_up_similar(call, &o, area, area_error, radius);
   }
   const real areas[2] = {area - area_error, area + area_error};
   const real radii[2] = {radius - radius_error, radius + radius_error};
-  return look_up(call, &o, areas, radii);
+  return look_up_features(call, &o, areas, radii);
 }

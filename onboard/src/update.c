@@ -1,4 +1,4 @@
-/* Two places for images: pieces, parity, patches. What is a check block follows from the size of an
+/* Two slots for images: pieces, parity, patches. What is a check block follows from the size of an
  * image alone, as its header may be what is damaged or not there yet.
  *
  * SPDX-License-Identifier: MIT
@@ -17,12 +17,12 @@ typedef struct {
   uint32_t blocks, data, groups; /* blocks; those of data; groups with a block of parity each */
 } blocks_of_image;
 
-static uint32_t u32_of(const uint8_t *bytes, size_t offset) {
+static uint32_t read_number(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
 /* The blocks of an image of so many bytes; 0 if none has so many. */
-static int lay_out(uint8_t *bytes, size_t size, blocks_of_image *image) {
+static int lay_out_blocks(uint8_t *bytes, size_t size, blocks_of_image *image) {
   if ((size % STARCAT_BLOCK_BYTES != 0u) || (size < 2u * STARCAT_BLOCK_BYTES) ||
       (size / STARCAT_BLOCK_BYTES >= 1048576u)) {
     return 0;
@@ -35,23 +35,23 @@ static int lay_out(uint8_t *bytes, size_t size, blocks_of_image *image) {
   return 1;
 }
 
-static uint8_t *block_at(const blocks_of_image *image, uint32_t block) {
+static uint8_t *find_block(const blocks_of_image *image, uint32_t block) {
   return image->bytes + (size_t)block * STARCAT_BLOCK_BYTES;
 }
 
-static int is_sound(const blocks_of_image *image, uint32_t block) {
-  return starcat_block_is_sound(image->bytes, image->data * STARCAT_BLOCK_BYTES, block);
+static int is_data_block_sound(const blocks_of_image *image, uint32_t block) {
+  return starcat_is_block_sound(image->bytes, image->data * STARCAT_BLOCK_BYTES, block);
 }
 
-size_t starcat_parity_bytes(size_t size) {
+size_t starcat_count_parity_bytes(size_t size) {
   blocks_of_image image;
-  return lay_out(NULL, size, &image) ? (size_t)image.groups * STARCAT_BLOCK_BYTES : 0u;
+  return lay_out_blocks(NULL, size, &image) ? (size_t)image.groups * STARCAT_BLOCK_BYTES : 0u;
 }
 
 /* Part of a block as the others of its group and their parity have it: the sum of them all is 0.
  * Groups are every so many blocks, so that a burst of damage meets each but once. The block of
  * parity comes behind those of the image, and is one of its group. */
-static void part_of(const blocks_of_image *image, uint32_t block, uint32_t at,
+static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
                     uint8_t part[CHUNK]) {
   const uint32_t group =
       block < image->blocks ? block % image->groups : block - image->blocks;
@@ -61,7 +61,7 @@ static void part_of(const blocks_of_image *image, uint32_t block, uint32_t at,
   for (uint32_t other = group; other < image->blocks + image->groups; other += image->groups) {
     const uint32_t member = other < image->blocks ? other : image->blocks + group;
     if (member != block) {
-      const uint8_t *bytes = block_at(image, member) + at;
+      const uint8_t *bytes = find_block(image, member) + at;
       for (uint32_t k = 0; k < CHUNK; k++) {
         part[k] = (uint8_t)(part[k] ^ bytes[k]);
       }
@@ -76,28 +76,28 @@ static int would_be_sound(const blocks_of_image *image, uint32_t block) {
   uint8_t *bytes = (uint8_t *)part;
   uint32_t crc = 0;
   for (uint32_t at = 0; at < STARCAT_BLOCK_BYTES; at += CHUNK) {
-    part_of(image, block, at, bytes);
-    crc = starcat_crc32(crc, bytes, at < STARCAT_BLOCK_BYTES - CHUNK ? CHUNK : last);
+    find_part(image, block, at, bytes);
+    crc = starcat_update_crc(crc, bytes, at < STARCAT_BLOCK_BYTES - CHUNK ? CHUNK : last);
   }
   if (block >= image->data) {
-    return crc == u32_of(bytes, CHUNK - 4u);
+    return crc == read_number(bytes, CHUNK - 4u);
   }
-  const uint8_t *check = block_at(image, image->data + block / STARCAT_CRCS_OF_BLOCK);
-  return crc == u32_of(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK));
+  const uint8_t *check = find_block(image, image->data + block / STARCAT_CRCS_OF_BLOCK);
+  return crc == read_number(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK));
 }
 
 static void write_block(const blocks_of_image *image, uint32_t block) {
   uint8_t part[CHUNK];
   for (uint32_t at = 0; at < STARCAT_BLOCK_BYTES; at += CHUNK) {
-    part_of(image, block, at, part);
-    uint8_t *bytes = block_at(image, block) + at;
+    find_part(image, block, at, part);
+    uint8_t *bytes = find_block(image, block) + at;
     for (uint32_t k = 0; k < CHUNK; k++) {
       bytes[k] = part[k];
     }
   }
 }
 
-starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended) {
+starcat_status starcat_mend_image(void *bytes, size_t size, uint32_t *n_mended) {
   blocks_of_image image;
   uint32_t left = 0;
   if ((bytes == NULL) || (n_mended == NULL)) {
@@ -107,12 +107,12 @@ starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended) {
   if (((uintptr_t)bytes & 7u) != 0u) {
     return STARCAT_E_ALIGNMENT;
   }
-  if (!lay_out(bytes, size, &image)) {
+  if (!lay_out_blocks(bytes, size, &image)) {
     return STARCAT_E_LAYOUT;
   }
   for (uint32_t n = 0; n < image.blocks; n++) {
     const uint32_t block = (n + image.data) % image.blocks; /* check blocks first */
-    if (!is_sound(&image, block)) {
+    if (!is_data_block_sound(&image, block)) {
       if (!would_be_sound(&image, block)) {
         left++;
       } else {
@@ -127,133 +127,133 @@ starcat_status starcat_mend(void *bytes, size_t size, uint32_t *n_mended) {
   for (uint32_t group = 0; group < image.groups; group++) {
     write_block(&image, image.blocks + group);
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
-static starcat_status check_places(const starcat_places *places) {
-  if ((places == NULL) || (places->bytes[0] == NULL) || (places->bytes[1] == NULL)) {
+static starcat_status check_slots(const starcat_slots *slots) {
+  if ((slots == NULL) || (slots->bytes[0] == NULL) || (slots->bytes[1] == NULL)) {
     return STARCAT_E_NULL;
   }
-  return places->active > 1u ? STARCAT_E_OPTIONS : STARCAT_IDENTIFIED;
+  return slots->active > 1u ? STARCAT_E_OPTIONS : STARCAT_OK;
 }
 
 /* Room for an image of so many bytes and its parity. */
-static starcat_status check_size(const starcat_places *places, size_t size) {
-  const size_t parity = starcat_parity_bytes(size);
+static starcat_status check_size(const starcat_slots *slots, size_t size) {
+  const size_t parity = starcat_count_parity_bytes(size);
   if (parity == 0u) {
     return STARCAT_E_LAYOUT;
   }
-  return (size > places->capacity) || (parity > places->capacity - size) ? STARCAT_E_SHORT
-                                                                         : STARCAT_IDENTIFIED;
+  return (size > slots->capacity) || (parity > slots->capacity - size) ? STARCAT_E_SHORT
+                                                                         : STARCAT_OK;
 }
 
-/* Mend the image of a place, write its parity, and open it. */
-static starcat_status use_place(const starcat_places *places, uint32_t place,
+/* Mend the image of a slot, write its parity, and open it. */
+static starcat_status use_slot(const starcat_slots *slots, uint32_t slot,
                                 starcat_image *image) {
   uint32_t n_mended = 0;
-  starcat_status status = check_size(places, places->size[place]);
-  if (status == STARCAT_IDENTIFIED) {
-    status = starcat_mend(places->bytes[place], places->size[place], &n_mended);
+  starcat_status status = check_size(slots, slots->size[slot]);
+  if (status == STARCAT_OK) {
+    status = starcat_mend_image(slots->bytes[slot], slots->size[slot], &n_mended);
   }
-  if (status == STARCAT_IDENTIFIED) {
-    status = starcat_open(image, places->bytes[place], places->size[place], STARCAT_SKIP_CRC);
+  if (status == STARCAT_OK) {
+    status = starcat_open_image(image, slots->bytes[slot], slots->size[slot], STARCAT_SKIP_CRC);
   }
   return status;
 }
 
-starcat_status starcat_start(starcat_places *places, starcat_image *image) {
-  starcat_status status = check_places(places);
-  if (status != STARCAT_IDENTIFIED) {
+starcat_status starcat_start_image(starcat_slots *slots, starcat_image *image) {
+  starcat_status status = check_slots(slots);
+  if (status != STARCAT_OK) {
     return status;
   }
   if (image == NULL) {
     return STARCAT_E_NULL;
   }
-  status = use_place(places, places->active, image);
-  if (status != STARCAT_IDENTIFIED) {
-    const uint32_t other = 1u - places->active;
-    if (use_place(places, other, image) == STARCAT_IDENTIFIED) {
-      places->active = other;
-      status = STARCAT_IDENTIFIED;
+  status = use_slot(slots, slots->active, image);
+  if (status != STARCAT_OK) {
+    const uint32_t other = 1u - slots->active;
+    if (use_slot(slots, other, image) == STARCAT_OK) {
+      slots->active = other;
+      status = STARCAT_OK;
     }
   }
   return status;
 }
 
-starcat_status starcat_receive(starcat_places *places, size_t size, uint32_t crc) {
-  starcat_status status = check_places(places);
-  if (status == STARCAT_IDENTIFIED) {
-    status = check_size(places, size);
+starcat_status starcat_receive_image(starcat_slots *slots, size_t size, uint32_t crc) {
+  starcat_status status = check_slots(slots);
+  if (status == STARCAT_OK) {
+    status = check_size(slots, size);
   }
-  if (status == STARCAT_IDENTIFIED) {
-    places->size[1u - places->active] = size;
-    places->coming_crc = crc;
+  if (status == STARCAT_OK) {
+    slots->size[1u - slots->active] = size;
+    slots->coming_crc = crc;
   }
   return status;
 }
 
-starcat_status starcat_put(starcat_places *places, size_t offset, const uint8_t *bytes,
+starcat_status starcat_put_piece(starcat_slots *slots, size_t offset, const uint8_t *bytes,
                            size_t count) {
-  const starcat_status status = check_places(places);
-  if (status != STARCAT_IDENTIFIED) {
+  const starcat_status status = check_slots(slots);
+  if (status != STARCAT_OK) {
     return status;
   }
   if (bytes == NULL) {
     return STARCAT_E_NULL;
   }
-  const uint32_t other = 1u - places->active;
-  if ((offset > places->size[other]) || (count > places->size[other] - offset)) {
+  const uint32_t other = 1u - slots->active;
+  if ((offset > slots->size[other]) || (count > slots->size[other] - offset)) {
     return STARCAT_E_SHORT;
   }
   for (size_t n = 0; n < count; n++) {
-    places->bytes[other][offset + n] = bytes[n];
+    slots->bytes[other][offset + n] = bytes[n];
   }
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
-starcat_status starcat_missing(const starcat_places *places, uint32_t first, uint32_t *block) {
+starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first, uint32_t *block) {
   blocks_of_image image;
-  const starcat_status status = check_places(places);
-  if (status != STARCAT_IDENTIFIED) {
+  const starcat_status status = check_slots(slots);
+  if (status != STARCAT_OK) {
     return status;
   }
   if (block == NULL) {
     return STARCAT_E_NULL;
   }
-  const uint32_t other = 1u - places->active;
-  if (!lay_out(places->bytes[other], places->size[other], &image)) {
+  const uint32_t other = 1u - slots->active;
+  if (!lay_out_blocks(slots->bytes[other], slots->size[other], &image)) {
     return STARCAT_E_LAYOUT;
   }
   for (uint32_t n = image.data; n < image.blocks; n++) {
-    const uint8_t *check = block_at(&image, n);
-    if (!starcat_is_sound(check) || ((places->coming_crc != 0u) &&
-                                     (u32_of(check, STARCAT_WHOLE_AT) != places->coming_crc))) {
+    const uint8_t *check = find_block(&image, n);
+    if (!starcat_is_check_block_sound(check) || ((slots->coming_crc != 0u) &&
+                                     (read_number(check, STARCAT_WHOLE_AT) != slots->coming_crc))) {
       *block = n;
-      return STARCAT_E_CRC;
+      return STARCAT_INCOMPLETE;
     }
   }
   for (uint32_t n = first; n < image.data; n++) {
-    if (!is_sound(&image, n)) {
+    if (!is_data_block_sound(&image, n)) {
       *block = n;
-      return STARCAT_E_CRC;
+      return STARCAT_INCOMPLETE;
     }
   }
   *block = image.blocks;
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
-starcat_status starcat_switch(starcat_places *places, starcat_image *image) {
+starcat_status starcat_switch_image(starcat_slots *slots, starcat_image *image) {
   uint32_t block = 0;
-  starcat_status status = starcat_missing(places, 0, &block);
-  if ((status == STARCAT_IDENTIFIED) && (image == NULL)) {
+  starcat_status status = starcat_find_missing_block(slots, 0, &block);
+  if ((status == STARCAT_OK) && (image == NULL)) {
     status = STARCAT_E_NULL;
   }
-  if (status == STARCAT_IDENTIFIED) {
-    status = use_place(places, 1u - places->active, image);
+  if (status == STARCAT_OK) {
+    status = use_slot(slots, 1u - slots->active, image);
   }
-  if (status == STARCAT_IDENTIFIED) {
-    places->active = 1u - places->active;
-    places->coming_crc = 0;
+  if (status == STARCAT_OK) {
+    slots->active = 1u - slots->active;
+    slots->coming_crc = 0;
   }
   return status;
 }
@@ -275,7 +275,7 @@ typedef struct {
 #define ZEROS 6u
 
 /* The next number, seven bits a byte, the lowest first; 0 beyond the end of the patch. */
-static uint32_t next_number(patching *patch) {
+static uint32_t take_number(patching *patch) {
   uint32_t number = 0, bits = 0, byte = 0x80;
   while ((byte >= 0x80u) && (bits < 32u) && (patch->next < patch->end)) {
     byte = *patch->next;
@@ -287,13 +287,13 @@ static uint32_t next_number(patching *patch) {
 }
 
 /* The next number that may be below 0, whose lowest bit says so. */
-static uint32_t next_difference(patching *patch) {
-  const uint32_t number = next_number(patch);
+static uint32_t take_difference(patching *patch) {
+  const uint32_t number = take_number(patch);
   return (number >> 1) ^ (0u - (number & 1u));
 }
 
 /* The row of a star of the old image in the new one. */
-static uint32_t renumbered(const patching *patch, uint32_t row) {
+static uint32_t renumber_row(const patching *patch, uint32_t row) {
   uint32_t low = 0, high = patch->n_runs;
   while (low < high) {
     const uint32_t middle = low + (high - low) / 2u;
@@ -306,22 +306,22 @@ static uint32_t renumbered(const patching *patch, uint32_t row) {
   return low == 0u ? row : row + patch->runs[2u * low - 1u];
 }
 
-static void renumber(patching *patch, uint32_t count, uint32_t width) {
+static void renumber_features(patching *patch, uint32_t count, uint32_t width) {
   for (uint32_t n = 0; n < count; n++) {
     const uint8_t *from = patch->old + patch->old_at + (size_t)n * width;
     uint8_t *to = patch->made + patch->made_at + (size_t)n * width;
     if (width == 2u) {
       *(uint16_t *)(void *)to =
-          (uint16_t)renumbered(patch, *(const uint16_t *)(const void *)from);
+          (uint16_t)renumber_row(patch, *(const uint16_t *)(const void *)from);
     } else {
-      *(uint32_t *)(void *)to = renumbered(patch, *(const uint32_t *)(const void *)from);
+      *(uint32_t *)(void *)to = renumber_row(patch, *(const uint32_t *)(const void *)from);
     }
   }
 }
 
 /* Numbers that differ from the old ones by a shift, which itself changes from one to the next by
  * the numbers of the patch; after a 0 comes how many more do not change it. */
-static void add(patching *patch, uint32_t count, uint32_t width) {
+static void add_differences(patching *patch, uint32_t count, uint32_t width) {
   uint32_t shift = 0, same = 0;
   for (uint32_t n = 0; n < count; n++) {
     const uint8_t *from = patch->old + patch->old_at + (size_t)n * width;
@@ -329,9 +329,9 @@ static void add(patching *patch, uint32_t count, uint32_t width) {
     if (same > 0u) {
       same--;
     } else {
-      const uint32_t change = next_difference(patch);
+      const uint32_t change = take_difference(patch);
       shift += change;
-      same = change == 0u ? next_number(patch) : 0u;
+      same = change == 0u ? take_number(patch) : 0u;
     }
     if (width == 2u) {
       *(uint16_t *)(void *)to = (uint16_t)(*(const uint16_t *)(const void *)from + shift);
@@ -341,7 +341,7 @@ static void add(patching *patch, uint32_t count, uint32_t width) {
   }
 }
 
-static void copy(patching *patch, const uint8_t *from, uint32_t count) {
+static void copy_bytes(patching *patch, const uint8_t *from, uint32_t count) {
   for (uint32_t n = 0; n < count; n++) {
     patch->made[patch->made_at + n] = from == NULL ? 0u : from[n];
   }
@@ -350,7 +350,7 @@ static void copy(patching *patch, const uint8_t *from, uint32_t count) {
 /* Carry out the next step of a patch; 0 if it cannot be. */
 static int apply_step(patching *patch) {
   static const uint8_t width_of[8] = {1, 1, 2, 4, 2, 4, 1, 0};
-  const uint32_t token = next_number(patch), kind = token & 7u, count = token >> 3;
+  const uint32_t token = take_number(patch), kind = token & 7u, count = token >> 3;
   const uint32_t width = width_of[kind], room = patch->made_bytes - patch->made_at;
   if ((width == 0u) || (count == 0u) || (count > room / width)) {
     return 0;
@@ -360,22 +360,22 @@ static int apply_step(patching *patch) {
     if (bytes > (size_t)(patch->end - patch->next)) {
       return 0;
     }
-    copy(patch, patch->next, bytes);
+    copy_bytes(patch, patch->next, bytes);
     patch->next += bytes;
   } else if (kind == ZEROS) {
-    copy(patch, NULL, bytes);
+    copy_bytes(patch, NULL, bytes);
   } else {
-    patch->old_at += next_difference(patch);
+    patch->old_at += take_difference(patch);
     if ((patch->old_at > patch->old_bytes) || (bytes > patch->old_bytes - patch->old_at) ||
         ((patch->old_at | patch->made_at) % width != 0u)) {
       return 0;
     }
     if (kind == COPY) {
-      copy(patch, patch->old + patch->old_at, bytes);
+      copy_bytes(patch, patch->old + patch->old_at, bytes);
     } else if (kind < ADD_16) {
-      renumber(patch, count, width);
+      renumber_features(patch, count, width);
     } else {
-      add(patch, count, width);
+      add_differences(patch, count, width);
     }
     patch->old_at += bytes;
   }
@@ -384,11 +384,11 @@ static int apply_step(patching *patch) {
 }
 
 /* Check that a patch is for an image, and find its parts. */
-static starcat_status begin_patch(const starcat_places *places, const uint8_t *bytes, size_t size,
+static starcat_status begin_patch(const starcat_slots *slots, const uint8_t *bytes, size_t size,
                                   patching *patch) {
   const char magic[8] = "STARPAT";
-  const uint8_t *old = places->bytes[places->active];
-  const size_t old_bytes = places->size[places->active];
+  const uint8_t *old = slots->bytes[slots->active];
+  const size_t old_bytes = slots->size[slots->active];
   if (size < PATCH_HEADER_BYTES) {
     return STARCAT_E_SHORT;
   }
@@ -397,14 +397,14 @@ static starcat_status begin_patch(const starcat_places *places, const uint8_t *b
       return STARCAT_E_MAGIC;
     }
   }
-  if (u32_of(bytes, 8) != STARCAT_BYTE_ORDER) {
+  if (read_number(bytes, 8) != STARCAT_BYTE_ORDER) {
     return STARCAT_E_BYTE_ORDER;
   }
-  const uint32_t n_runs = u32_of(bytes, 32), patch_bytes = u32_of(bytes, 36);
-  if ((check_size(places, old_bytes) != STARCAT_IDENTIFIED) || (u32_of(bytes, 12) != 1u) ||
-      (u32_of(bytes, 16) != old_bytes) ||
-      (u32_of(bytes, 20) !=
-       u32_of(old, old_bytes - STARCAT_BLOCK_BYTES + STARCAT_WHOLE_AT))) {
+  const uint32_t n_runs = read_number(bytes, 32), patch_bytes = read_number(bytes, 36);
+  if ((check_size(slots, old_bytes) != STARCAT_OK) || (read_number(bytes, 12) != 1u) ||
+      (read_number(bytes, 16) != old_bytes) ||
+      (read_number(bytes, 20) !=
+       read_number(old, old_bytes - STARCAT_BLOCK_BYTES + STARCAT_WHOLE_AT))) {
     return STARCAT_E_VERSION;
   }
   if (patch_bytes > size) {
@@ -421,17 +421,17 @@ static starcat_status begin_patch(const starcat_places *places, const uint8_t *b
   patch->old = old;
   patch->old_bytes = (uint32_t)old_bytes;
   patch->old_at = 0;
-  patch->made = places->bytes[1u - places->active];
-  patch->made_bytes = u32_of(bytes, 24);
+  patch->made = slots->bytes[1u - slots->active];
+  patch->made_bytes = read_number(bytes, 24);
   patch->made_at = 0;
-  return STARCAT_IDENTIFIED;
+  return STARCAT_OK;
 }
 
-starcat_status starcat_patch(starcat_places *places, const void *patch, size_t size) {
+starcat_status starcat_apply_patch(starcat_slots *slots, const void *patch, size_t size) {
   patching work;
   uint32_t block = 0;
-  starcat_status status = check_places(places);
-  if (status != STARCAT_IDENTIFIED) {
+  starcat_status status = check_slots(slots);
+  if (status != STARCAT_OK) {
     return status;
   }
   if (patch == NULL) {
@@ -440,11 +440,11 @@ starcat_status starcat_patch(starcat_places *places, const void *patch, size_t s
   if (((uintptr_t)patch & 3u) != 0u) {
     return STARCAT_E_ALIGNMENT;
   }
-  status = begin_patch(places, patch, size, &work);
-  if (status == STARCAT_IDENTIFIED) {
-    status = starcat_receive(places, work.made_bytes, u32_of(patch, 28));
+  status = begin_patch(slots, patch, size, &work);
+  if (status == STARCAT_OK) {
+    status = starcat_receive_image(slots, work.made_bytes, read_number(patch, 28));
   }
-  if (status != STARCAT_IDENTIFIED) {
+  if (status != STARCAT_OK) {
     return status;
   }
   while (work.made_at < work.made_bytes) {
@@ -452,5 +452,6 @@ starcat_status starcat_patch(starcat_places *places, const void *patch, size_t s
       return STARCAT_E_LAYOUT;
     }
   }
-  return starcat_missing(places, 0, &block);
+  status = starcat_find_missing_block(slots, 0, &block);
+  return status == STARCAT_INCOMPLETE ? STARCAT_E_CRC : status; /* what the patch made is damaged */
 }

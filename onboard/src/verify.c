@@ -8,20 +8,10 @@
 #define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
 
-/* Take steps from what is left of the budget. Returns 0 if it is used up. */
-int starcat_spend(const starcat_call *call, uint32_t steps) {
-  if (steps >= call->own->steps_left) {
-    call->own->steps_left = 0;
-    return 0;
-  }
-  call->own->steps_left -= steps;
-  return 1;
-}
-
 /* Whether a centroid may be a star, by their magnitudes. */
-int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
+int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
-  const int16_t stored = call->image->magnitudes[starcat_below(row, call->image->n_stars)];
+  const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
   if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN) ||
       !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
     return 1;
@@ -31,7 +21,7 @@ int starcat_compatible(const starcat_call *call, uint32_t centroid, uint32_t row
 }
 
 /* Put the stars around the field on the detector; keep those within a margin of it. */
-void starcat_project(const starcat_call *call, const real m[9], real margin_px) {
+void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px) {
   starcat_workspace *w = call->work;
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
   const real most_x = x0 + margin_px, most_y = y0 + margin_px;
@@ -39,7 +29,7 @@ void starcat_project(const starcat_call *call, const real m[9], real margin_px) 
   for (uint32_t j = 0; j < call->own->n_near; j++) {
     real body[3], x, y;
     starcat_turn(m, w->near_icrs[j], body);
-    if (starcat_pixel(&call->camera, body, &x, &y) != 0) {
+    if (starcat_find_pixel(&call->camera, body, &x, &y) != 0) {
       const real dx = x - x0, dy = y - y0;
       w->x_of[count] = x;
       w->y_of[count] = y;
@@ -50,48 +40,19 @@ void starcat_project(const starcat_call *call, const real m[9], real margin_px) 
   call->own->n_within = count;
 }
 
-/* The column of the detector that a place is in; the first or the last one outside of it. */
-static uint32_t column_of(const starcat_call *call, real x_px) {
-  const real scaled = x_px * call->columns_per_px;
-  if (!(scaled > R(0.0))) {
-    return 0;
-  }
-  return scaled < (real)STARCAT_COLUMNS ? (uint32_t)scaled : STARCAT_COLUMNS - 1u;
-}
-
-/* List the centroids by the column of the detector that they are in. */
-void starcat_list_columns(starcat_call *call) {
-  starcat_workspace *w = call->work;
-  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
-  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
-    w->column[n] = 0;
-  }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    w->column[column_of(call, w->x[i])]++;
-  }
-  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
-    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
-  }
-  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
-    const uint32_t n = column_of(call, w->x[i - 1u]);
-    w->column[n]--;
-    w->in_column[starcat_below(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
-  }
-}
-
 /* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
  * them is the nearest to it, and to which it is the nearest so far. */
 static void match_star(const starcat_call *call, uint32_t k, real reach_px, real reach) {
   starcat_workspace *w = call->work;
   const real x = w->x_of[k], y = w->y_of[k];
-  const uint32_t stop = w->column[column_of(call, x + reach_px) + 1u];
+  const uint32_t stop = w->column[starcat_find_column(call, x + reach_px) + 1u];
   w->nearest[k] = UINT16_MAX;
-  for (uint32_t n = w->column[column_of(call, x - reach_px)];
+  for (uint32_t n = w->column[starcat_find_column(call, x - reach_px)];
        (n < stop) && (n < STARCAT_MAX_CENTROIDS); n++) {
-    const uint32_t i = starcat_below(w->in_column[n], STARCAT_MAX_CENTROIDS);
+    const uint32_t i = starcat_limit_place(w->in_column[n], STARCAT_MAX_CENTROIDS);
     const real dx = w->x[i] - x, dy = w->y[i] - y;
     const real square = dx * dx + dy * dy;
-    if ((square <= reach) && starcat_compatible(call, i, w->near_row[starcat_near(w, k)])) {
+    if ((square <= reach) && starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
       if ((w->match[i] < 0) || (square < w->match_square[i])) {
         w->match_square[i] = square;
         w->match[i] = (int16_t)k;
@@ -107,7 +68,7 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
 
 /* Match centroids and stars that are the nearest to each other, within reach. Returns how many
  * do. */
-static uint32_t match(const starcat_call *call, real reach_px) {
+static uint32_t match_stars(const starcat_call *call, real reach_px) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -117,7 +78,7 @@ static uint32_t match(const starcat_call *call, real reach_px) {
     match_star(call, k, reach_px, reach_px * reach_px);
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
-    if ((w->match[i] >= 0) && (w->nearest[starcat_match(w, i)] != i)) {
+    if ((w->match[i] >= 0) && (w->nearest[starcat_find_match(w, i)] != i)) {
       w->match[i] = -1;
     }
     matched += (uint32_t)(w->match[i] >= 0);
@@ -130,7 +91,7 @@ static int is_as_before(const starcat_call *call) {
   starcat_workspace *w = call->work;
   int same = 1;
   for (uint32_t i = 0; i < call->own->count; i++) {
-    const int16_t star = (int16_t)(w->match[i] >= 0 ? w->within[starcat_match(w, i)] : -1);
+    const int16_t star = (int16_t)(w->match[i] >= 0 ? w->within[starcat_find_match(w, i)] : -1);
     same &= w->before[i] == star;
     w->before[i] = star;
   }
@@ -139,7 +100,7 @@ static int is_as_before(const starcat_call *call) {
 
 /* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
  * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
-static void refine(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
+static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
                    const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
@@ -157,9 +118,9 @@ static void refine(starcat_call *call, real m[9], const uint16_t *of, const real
         turn[k] += moved[k];
       }
       shrink += b[2] * b[2] * starcat_dot(b, left) - b[2] * left[2];
-      starcat_inform(&h, b);
+      starcat_add_information(&h, b);
     }
-    if (starcat_solve(h.angles, h.with_scale, along, unused) != 0) {
+    if (starcat_solve_symmetric(h.angles, h.with_scale, along, unused) != 0) {
       const real of_scale = h.scale - starcat_dot(h.with_scale, along);
       const real excess = shrink - starcat_dot(along, turn);
       if (starcat_absolute(excess) < of_scale) {
@@ -178,7 +139,7 @@ static void refine(starcat_call *call, real m[9], const uint16_t *of, const real
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  starcat_refine(m, &body[0][0], icrs, which, NULL, n, 4);
+  starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
 /* Refine on all matches. */
@@ -188,12 +149,12 @@ static void refine_matched(starcat_call *call, real m[9]) {
   uint32_t n = 0;
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
-      which[n] = (uint16_t)starcat_near(w, starcat_match(w, i));
+      which[n] = (uint16_t)starcat_find_near(w, starcat_find_match(w, i));
       of[n] = (uint16_t)i;
       n++;
     }
   }
-  refine(call, m, of, &w->near_icrs[0][0], which, n);
+  refine_pairs(call, m, of, &w->near_icrs[0][0], which, n);
 }
 
 /* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
@@ -208,7 +169,7 @@ static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
  * is used up. */
-static int gather(const starcat_call *call, const real m[9]) {
+static int gather_field(const starcat_call *call, const real m[9]) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
   if (call->fov_error > R(0.0)) {
@@ -216,16 +177,16 @@ static int gather(const starcat_call *call, const real m[9]) {
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
   }
-  call->own->n_near = starcat_gather(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
+  call->own->n_near = starcat_gather_stars(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
   return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
 /* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
  * around the field are too many or the budget is used up. */
-static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
+static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
-  if (!gather(call, m)) {
+  if (!gather_field(call, m)) {
     return 0;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -234,12 +195,12 @@ static uint32_t fit(starcat_call *call, real m[9], const reaches *r) {
   for (uint32_t n = 0; n < r->count + STARCAT_REFINEMENTS; n++) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
-    starcat_project(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
-    if (!starcat_spend(call, call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
+    starcat_project_stars(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
+    if (!starcat_spend_steps(call, call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
       return 0;
     }
-    matched = match(call, factor * call->reach_px);
-    if (!starcat_spend(call, STEPS_OF_MATCH * matched)) {
+    matched = match_stars(call, factor * call->reach_px);
+    if (!starcat_spend_steps(call, STEPS_OF_MATCH * matched)) {
       return 0;
     }
     if ((matched < STARCAT_MIN_STARS) || (is_as_before(call) && is_final)) {
@@ -258,16 +219,16 @@ static int spend_on_bound(const starcat_call *call) {
   if (call->mag_reach > R(0.0)) {
     steps += call->own->count * call->own->n_within + (call->own->count + call->own->n_within) * most;
   }
-  return starcat_spend(call, steps);
+  return starcat_spend_steps(call, steps);
 }
 
-static void withhold(starcat_agreement *found, uint32_t reason) {
+static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->withheld = reason;
   found->log_chance = R(0.0);
 }
 
 /* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
-static void judge(const starcat_call *call, const real m[9], uint32_t matched, real factor,
+static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
                   starcat_agreement *found) {
   starcat_workspace *w = call->work;
   real square_px = R(0.0), square_rad = R(0.0);
@@ -292,7 +253,7 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
   for (uint32_t i = 0; i < call->own->count; i++) {
     found->star[i] = STARCAT_NO_STAR;
     if (w->match[i] >= 0) {
-      const uint32_t j = starcat_near(w, starcat_match(w, i));
+      const uint32_t j = starcat_find_near(w, starcat_find_match(w, i));
       real body[3];
       starcat_turn(m, w->near_icrs[j], body);
       square_rad += starcat_chord_square(call->body[i], body);
@@ -304,12 +265,12 @@ static void judge(const starcat_call *call, const real m[9], uint32_t matched, r
   found->log_bound = starcat_log_chance(call, square_px, matched);
   found->log_chance = found->log_bound;
   if (found->log_bound < R(0.0)) {
-    starcat_weigh(call, m, factor * call->tolerance_rad, found);
+    starcat_weigh_agreement(call, m, factor * call->tolerance_rad, found);
     if ((found->share < STARCAT_MIN_SHARE) &&
         ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
-      withhold(found, STARCAT_REASON_SHARE);
+      withhold_agreement(found, STARCAT_REASON_SHARE);
     } else if (starcat_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
-      withhold(found, STARCAT_REASON_SCALE);
+      withhold_agreement(found, STARCAT_REASON_SCALE);
     }
   }
 }
@@ -324,7 +285,7 @@ static uint32_t find_rivals(const starcat_call *call) {
     uint32_t of = call->own->count;
     for (uint32_t k = 0; (k < call->own->count) && (w->match[i] < 0); k++) {
       if (w->match[k] >= 0) {
-        const uint32_t star = starcat_match(w, k);
+        const uint32_t star = starcat_find_match(w, k);
         const real dx = w->x[i] - w->x_of[star], dy = w->y[i] - w->y_of[star];
         const real square = dx * dx + dy * dy;
         if (square < least) {
@@ -333,7 +294,7 @@ static uint32_t find_rivals(const starcat_call *call) {
         }
       }
     }
-    if ((of < call->own->count) && starcat_compatible(call, i, w->near_row[starcat_near(w, starcat_match(w, of))])) {
+    if ((of < call->own->count) && starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, starcat_find_match(w, of))])) {
       w->rival[n] = (uint16_t)i;
       w->rival_of[n] = (uint16_t)of;
       n++;
@@ -351,16 +312,16 @@ static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, rea
   for (uint32_t i = 0; i < call->own->count; i++) {
     const uint32_t owner = i == rival ? centroid : i;
     if ((i != centroid) && (w->found.star[owner] >= 0)) {
-      starcat_star(call->image, starcat_below((uint32_t)w->found.star[owner], call->image->n_stars), icrs[n]);
+      starcat_read_star(call->image, starcat_limit_place((uint32_t)w->found.star[owner], call->image->n_stars), icrs[n]);
       of[n] = (uint16_t)i;
       n++;
     }
   }
-  refine(call, m, of, &icrs[0][0], NULL, n);
+  refine_pairs(call, m, of, &icrs[0][0], NULL, n);
 }
 
 /* Begin again from the attitude and the focal length of an agreement. */
-static void begin_at(starcat_call *call, const starcat_agreement *from, real m[9]) {
+static void restore_agreement(starcat_call *call, const starcat_agreement *from, real m[9]) {
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = from->matrix[k];
   }
@@ -375,12 +336,12 @@ static void try_rivals(starcat_call *call) {
   const uint32_t count = find_rivals(call);
   for (uint32_t n = 0; n < count; n++) {
     real m[9];
-    if (!starcat_spend(call, STEPS_OF_MATCH * w->found.n_matched)) {
+    if (!starcat_spend_steps(call, STEPS_OF_MATCH * w->found.n_matched)) {
       return;
     }
-    begin_at(call, &w->found, m);
-    fit_rival(call, w->rival[n], starcat_below(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
-    judge(call, m, fit(call, m, &AS_GIVEN), R(1.0), &w->wider);
+    restore_agreement(call, &w->found, m);
+    fit_rival(call, w->rival[n], starcat_limit_place(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
+    judge_fit(call, m, fit_matches(call, m, &AS_GIVEN), R(1.0), &w->wider);
     /* The fit may lead back to where it began, but for rounding. */
     if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
       w->found = w->wider;
@@ -420,8 +381,8 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
     if ((nearer[k] >= STARCAT_MIN_STARS) &&
         ((real)nearer[k] >= STARCAT_OVER_CHANCE * r.last * r.last * (real)count)) {
       real m[9];
-      begin_at(call, &w->found, m);
-      judge(call, m, fit(call, m, &r), r.last, &w->wider);
+      restore_agreement(call, &w->found, m);
+      judge_fit(call, m, fit_matches(call, m, &r), r.last, &w->wider);
       if (is_better(&w->wider, &w->found) != 0) {
         w->found = w->wider;
       }
@@ -435,21 +396,21 @@ static void try_other_scales(starcat_call *call) {
   const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                                       call->camera.half_height * call->camera.half_height);
   real m[9];
-  begin_at(call, &w->found, m);
+  restore_agreement(call, &w->found, m);
   starcat_allow_scales(call, STARCAT_OTHER_SCALES);
-  judge(call, m, fit(call, m, &ROUGH), R(1.0), &w->wider);
+  judge_fit(call, m, fit_matches(call, m, &ROUGH), R(1.0), &w->wider);
   starcat_allow_scales(call, R(0.0));
   const real moved = corner_px * (call->focal - R(1.0));
   starcat_set_focal(call, R(1.0));
   if ((w->wider.log_bound < w->found.log_bound) &&
       ((moved > call->tolerance_px) || (-moved > call->tolerance_px))) {
-    withhold(&w->found, STARCAT_REASON_SCALE);
+    withhold_agreement(&w->found, STARCAT_REASON_SCALE);
   }
 }
 
 /* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
  * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
-int starcat_try(starcat_call *call, const real m[9], real focal) {
+int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
@@ -460,11 +421,11 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
     attitude[k] = m[k];
   }
   call->own->n_tried++;
-  if (!starcat_spend(call, STEPS_OF_TRY)) {
+  if (!starcat_spend_steps(call, STEPS_OF_TRY)) {
     return 1;
   }
   starcat_set_focal(call, focal);
-  judge(call, attitude, fit(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
+  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
   const uint32_t count = found->n_matched;
   count_nearer(call, count, nearer);
   if (found->log_chance < R(0.0)) {
@@ -476,8 +437,8 @@ int starcat_try(starcat_call *call, const real m[9], real focal) {
   if ((found->n_matched >= STARCAT_MIN_STARS) && (found->share < STARCAT_SURE_SHARE)) {
     /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
      * edge of a cluster may have spoilt an attitude that is nearly right. */
-    begin_at(call, found, attitude);
-    judge(call, attitude, fit(call, attitude, &WIDER), R(1.0), &w->wider);
+    restore_agreement(call, found, attitude);
+    judge_fit(call, attitude, fit_matches(call, attitude, &WIDER), R(1.0), &w->wider);
     if (w->wider.log_chance < found->log_chance) {
       *found = w->wider;
     }

@@ -15,37 +15,9 @@
 #endif
 #define FAR_MAGNITUDE R(1e30) /* of a star whose own is not known, which is counted apart */
 
-/* Logarithm of a factorial, from 16 on by Stirling's series. */
-real starcat_log_factorial(uint32_t n) {
-  static const real table[16] = {
-      R(0.0),                  R(0.0),                  R(0.69314718055994530942),
-      R(1.7917594692280550008), R(3.1780538303479456197), R(4.7874917427820459943),
-      R(6.5792512120101009951), R(8.5251613610654143002), R(10.604602902745250228),
-      R(12.801827480081469611), R(15.104412573075515295), R(17.502307845873885839),
-      R(19.987214495661886150), R(22.552163853123422886), R(25.191221182738681500),
-      R(27.899271383840891566)};
-  if (n < 16u) {
-    return table[n];
-  }
-  const real x = (real)n, inverse = R(1.0) / x, square = inverse * inverse;
-  return (x + R(0.5)) * STARCAT_LOG(x) - x + R(0.91893853320467274178) +
-         inverse * (R(1.0 / 12.0) - square * (R(1.0 / 360.0) - square * R(1.0 / 1260.0)));
-}
-
-/* Exponential of a number from -1 to 20, without another function of libm. */
-real starcat_exponential(real x) {
-  const real y = x * R(1.0 / 256.0);
-  real power = R(1.0) + y * (R(1.0) + y * (R(0.5) + y * (R(1.0 / 6.0) +
-                                                        y * (R(1.0 / 24.0) + y * R(1.0 / 120.0)))));
-  for (uint32_t n = 0; n < 8u; n++) {
-    power *= power;
-  }
-  return power;
-}
-
 /* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
  * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
-static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
+static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
                    uint32_t most) {
   const int is_tight = bound >= 2u;
   real *sums = w->sums[bound];
@@ -86,7 +58,7 @@ static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers
 }
 
 /* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
-static real filled(uint32_t others, uint32_t n) {
+static real log_filled(uint32_t others, uint32_t n) {
   return (real)(others - n) / (real)others * starcat_log_factorial(others) -
          starcat_log_factorial(others - n);
 }
@@ -102,7 +74,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n) {
       logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
                   (real)n * w->log_largest[bound];
       if (bound >= 2u) {
-        logarithm += filled(bound == 2u ? call->own->n_within : call->own->count, n);
+        logarithm += log_filled(bound == 2u ? call->own->n_within : call->own->count, n);
       }
     }
     least = logarithm < least ? logarithm : least;
@@ -117,7 +89,7 @@ static void count_compatible(const starcat_call *call) {
   const real reach = call->mag_reach;
   uint16_t unknown = 0;
   for (uint32_t j = 0; j < call->own->n_within; j++) {
-    const int16_t stored = call->image->magnitudes[starcat_below(w->near_row[starcat_near(w, j)], call->image->n_stars)];
+    const int16_t stored = call->image->magnitudes[starcat_limit_place(w->near_row[starcat_find_near(w, j)], call->image->n_stars)];
     const int is_known = stored != INT16_MIN;
     w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
     w->nearest[j] = is_known ? 0u : (uint16_t)call->own->count;
@@ -152,9 +124,9 @@ void starcat_count_ways(const starcat_call *call, uint32_t most) {
   }
   if (call->mag_reach > R(0.0)) {
     count_compatible(call);
-    add_up(w, 0, w->compatible, call->own->count, most);
-    add_up(w, 1, w->nearest, stars, most);
-    add_up(w, 2, w->compatible, call->own->count, most);
-    add_up(w, 3, w->nearest, stars, most);
+    sum_polynomials(w, 0, w->compatible, call->own->count, most);
+    sum_polynomials(w, 1, w->nearest, stars, most);
+    sum_polynomials(w, 2, w->compatible, call->own->count, most);
+    sum_polynomials(w, 3, w->nearest, stars, most);
   }
 }

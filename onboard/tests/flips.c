@@ -1,4 +1,4 @@
-/* Flips one bit of an image after the other, and counts those that starcat_scrub does not find or
+/* Flips one bit of an image after the other, and counts those that starcat_scrub_image does not find or
  * whose block it does not name.
  *
  *   flips IMAGE COUNT
@@ -22,7 +22,7 @@ int main(int argc, char **argv) {
   uint8_t *bytes = malloc(size);
   rewind(file);
   if ((bytes == NULL) || (fread(bytes, 1, size, file) != size) ||
-      (starcat_scrub(bytes, size, 0, 0, &bad) != STARCAT_IDENTIFIED)) {
+      (starcat_scrub_image(bytes, size, 0, 0, &bad) != STARCAT_OK)) {
     (void)fprintf(stderr, "%s: not a sound image\n", argv[1]);
     return 2;
   }
@@ -31,7 +31,7 @@ int main(int argc, char **argv) {
     const size_t at = (size_t)(sky_uniform(&state) * (double)size);
     const uint8_t bit = (uint8_t)(1u << (unsigned)(8.0 * sky_uniform(&state)));
     bytes[at] = (uint8_t)(bytes[at] ^ bit);
-    missed += (uint32_t)((starcat_scrub(bytes, size, 0, 0, &bad) >= 0) || (bad != at / 4096u));
+    missed += (uint32_t)((starcat_scrub_image(bytes, size, 0, 0, &bad) >= 0) || (bad != at / 4096u));
     bytes[at] = (uint8_t)(bytes[at] ^ bit);
   }
   (void)printf("%d flips, %u missed\n", count, (unsigned)missed);

@@ -49,11 +49,11 @@ int main(int argc, char **argv) {
     FILE *file = create(argv[1], names[n]);
     (void)fwrite(words, 1, size, file);
     (void)fclose(file);
-    if (starcat_open(&image, words, size, 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&image, words, size, 0) != STARCAT_OK) {
       return 1;
     }
   }
-  starcat_camera_of(&image, &camera);
+  starcat_get_camera(&image, &camera);
   FILE *frames = create(argv[1], "frames.txt"), *first = create(argv[1], "frame.txt");
   for (int n = 0; n < atoi(argv[2]); n++) {
     sky_frame frame;

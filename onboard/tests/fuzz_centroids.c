@@ -36,7 +36,7 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
       abort();
     }
     memcpy(exact, words, size);
-    if (starcat_open(&images[n], exact, size, 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&images[n], exact, size, 0) != STARCAT_OK) {
       abort();
     }
   }
@@ -109,8 +109,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   starcat_camera camera;
   starcat_options options;
   sky_frame truth;
-  starcat_camera_of(image, &camera);
-  starcat_default_options(&options);
+  starcat_get_camera(image, &camera);
+  starcat_set_default_options(&options);
   sky_look(image, &camera, &seed, 0.2, sky == 2u ? STARCAT_MAX_CENTROIDS : SKY_SPOTS,
            fuzz_number(&bytes, 1) % 4u, &truth);
   change_camera(&bytes, &camera);
@@ -134,16 +134,16 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   const starcat_frame frame = {count, x, y, (change & 128u) != 0u ? NULL : magnitudes,
                                (count & 2u) != 0u ? y : NULL};
   fuzz_check(image, &options, &frame,
-             starcat_identify(image, &camera, &options, &frame, &work, &result), &result);
+             starcat_identify_frame(image, &camera, &options, &frame, &work, &result), &result);
   fuzz_check(image, &options, &frame,
-             starcat_track(image, &camera, &options, &frame, q, uncertainty_rad, &work, &result),
+             starcat_track_frame(image, &camera, &options, &frame, q, uncertainty_rad, &work, &result),
              &result);
   starcat_real(*vectors)[3] = malloc((size_t)(count / 3u + 1u) * sizeof *vectors);
   if ((vectors != NULL) && (x != NULL) && (y != NULL)) {
     for (uint32_t n = 0; n < count / 3u; n++) {
       memcpy(vectors[n], x + 3u * n, sizeof vectors[n]);
     }
-    (void)starcat_attitude((const starcat_real(*)[3])vectors, (const starcat_real(*)[3])vectors,
+    (void)starcat_fit_attitude((const starcat_real(*)[3])vectors, (const starcat_real(*)[3])vectors,
                            count / 3u, q);
   }
   free(vectors);

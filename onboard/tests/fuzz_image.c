@@ -25,11 +25,11 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
   for (uint32_t n = 0; n < 2u; n++) {
     const sky_recipe recipe = {n + 1u, n == 0u ? 2u : 4u, 150, 0.5, 8};
     sizes[n] = sky_image(&recipe, (uint8_t *)sound[n]);
-    if (starcat_open(&image, sound[n], sizes[n], 0) != STARCAT_IDENTIFIED) {
+    if (starcat_open_image(&image, sound[n], sizes[n], 0) != STARCAT_OK) {
       abort();
     }
   }
-  starcat_camera_of(&image, &camera_of_sound);
+  starcat_get_camera(&image, &camera_of_sound);
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     sky_look(&image, &camera_of_sound, &state, 0.2, SKY_SPOTS, n, &frames[n]);
   }
@@ -64,16 +64,16 @@ static uint8_t *make_image(fuzz_bytes *bytes, size_t *size) {
 
 static void use(const starcat_image *image, const starcat_camera *camera) {
   starcat_options options;
-  starcat_default_options(&options);
+  starcat_set_default_options(&options);
   options.max_steps = 20000;
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const sky_frame *f = &frames[n];
     const starcat_frame frame = {f->count, f->x, f->y, n == 0u ? NULL : f->magnitudes, NULL};
     options.noise_mag = (starcat_real)(n == 0u ? 0.0 : 0.3);
     fuzz_check(image, &options, &frame,
-               starcat_identify(image, camera, &options, &frame, &work, &result), &result);
+               starcat_identify_frame(image, camera, &options, &frame, &work, &result), &result);
     fuzz_check(image, &options, &frame,
-               starcat_track(image, camera, &options, &frame, f->q_body_from_icrs,
+               starcat_track_frame(image, camera, &options, &frame, f->q_body_from_icrs,
                              (starcat_real)0.02, &work, &result),
                &result);
   }
@@ -87,10 +87,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   traps_on();
   uint8_t *made = make_image(&bytes, &size);
   if (made != NULL) {
-    (void)starcat_open(&image, made, size, 0);
-    (void)starcat_scrub(made, size, 1, 3, &bad);
-    if (starcat_open(&image, made, size, STARCAT_SKIP_CRC) == STARCAT_IDENTIFIED) {
-      starcat_camera_of(&image, &camera);
+    (void)starcat_open_image(&image, made, size, 0);
+    (void)starcat_scrub_image(made, size, 1, 3, &bad);
+    if (starcat_open_image(&image, made, size, STARCAT_SKIP_CRC) == STARCAT_OK) {
+      starcat_get_camera(&image, &camera);
       use(&image, &camera);
       use(&image, &camera_of_sound);
     }

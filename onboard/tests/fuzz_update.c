@@ -1,4 +1,4 @@
-/* libFuzzer: two places and what comes by radio: pieces, sizes, patches, damage, in any order.
+/* libFuzzer: two slots and what comes by radio: pieces, sizes, patches, damage, in any order.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -23,7 +23,7 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
 
 /* A patch from the image in use to one of the same size: its head is sound but for a few bytes, and
  * its steps are the fuzzer's. */
-static void apply(starcat_places *places, fuzz_bytes *bytes) {
+static void apply(starcat_slots *slots, fuzz_bytes *bytes) {
   const size_t count = fuzz_number(bytes, 2) % 2048u, size = 40u + count;
   const uint32_t words[8] = {0x01020304u, 1, (uint32_t)sound_size, 0, (uint32_t)sound_size, 0,
                              fuzz_number(bytes, 1) % 8u, (uint32_t)size};
@@ -36,72 +36,72 @@ static void apply(starcat_places *places, fuzz_bytes *bytes) {
     for (uint32_t n = fuzz_number(bytes, 1) % 4u; n > 0u; n--) {
       patch[fuzz_number(bytes, 1) % 40u] = (uint8_t)fuzz_number(bytes, 1);
     }
-    (void)starcat_patch(places, patch, size);
+    (void)starcat_apply_patch(slots, patch, size);
     free(patch);
   }
 }
 
-static void step(starcat_places *places, starcat_image *image, fuzz_bytes *bytes) {
+static void step(starcat_slots *slots, starcat_image *image, fuzz_bytes *bytes) {
   const size_t at = fuzz_number(bytes, 3), count = fuzz_number(bytes, 2);
   uint8_t piece[64];
   uint32_t block, n_mended;
   switch (fuzz_number(bytes, 1) % 8u) {
     case 0:
-      (void)starcat_receive(places, fuzz_number(bytes, 1) % 32u * BLOCK, (uint32_t)count % 2u);
+      (void)starcat_receive_image(slots, fuzz_number(bytes, 1) % 32u * BLOCK, (uint32_t)count % 2u);
       break;
     case 1:
-      (void)starcat_receive(places, sound_size, 0);
-      (void)starcat_put(places, at % sound_size / BLOCK * BLOCK,
+      (void)starcat_receive_image(slots, sound_size, 0);
+      (void)starcat_put_piece(slots, at % sound_size / BLOCK * BLOCK,
                         (const uint8_t *)sound + at % sound_size / BLOCK * BLOCK, count);
       break;
     case 2:
       fuzz_take(bytes, piece, sizeof piece);
-      (void)starcat_put(places, at, piece, count % (sizeof piece + 1u));
+      (void)starcat_put_piece(slots, at, piece, count % (sizeof piece + 1u));
       break;
     case 3:
-      (void)starcat_switch(places, image);
+      (void)starcat_switch_image(slots, image);
       break;
     case 4:
-      places->bytes[count % 2u][at % places->capacity] ^= (uint8_t)(1u << (at % 8u));
+      slots->bytes[count % 2u][at % slots->capacity] ^= (uint8_t)(1u << (at % 8u));
       break;
     case 5:
-      (void)starcat_mend(places->bytes[places->active], places->size[places->active], &n_mended);
+      (void)starcat_mend_image(slots->bytes[slots->active], slots->size[slots->active], &n_mended);
       break;
     case 6:
-      apply(places, bytes);
+      apply(slots, bytes);
       break;
     default:
-      (void)starcat_start(places, image);
+      (void)starcat_start_image(slots, image);
       break;
   }
-  (void)starcat_missing(places, (uint32_t)at, &block);
+  (void)starcat_find_missing_block(slots, (uint32_t)at, &block);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   fuzz_bytes bytes = {data, size};
   starcat_image image;
-  const size_t capacity = sound_size + starcat_parity_bytes(sound_size);
-  starcat_places places = {{malloc(capacity), malloc(capacity)}, capacity, {sound_size, 0}, 0, 0};
+  const size_t capacity = sound_size + starcat_count_parity_bytes(sound_size);
+  starcat_slots slots = {{malloc(capacity), malloc(capacity)}, capacity, {sound_size, 0}, 0, 0};
   traps_on();
-  if ((places.bytes[0] != NULL) && (places.bytes[1] != NULL)) {
-    memcpy(places.bytes[0], sound, sound_size);
-    memset(places.bytes[1], 0, capacity);
-    if (starcat_start(&places, &image) != STARCAT_IDENTIFIED) {
+  if ((slots.bytes[0] != NULL) && (slots.bytes[1] != NULL)) {
+    memcpy(slots.bytes[0], sound, sound_size);
+    memset(slots.bytes[1], 0, capacity);
+    if (starcat_start_image(&slots, &image) != STARCAT_OK) {
       abort();
     }
     for (uint32_t n = 0; (n < 16u) && (bytes.left > 0u); n++) {
-      step(&places, &image, &bytes);
+      step(&slots, &image, &bytes);
     }
     /* Whatever came, the image that is opened is a whole one. */
     uint32_t bad;
-    if ((starcat_start(&places, &image) == STARCAT_IDENTIFIED) &&
-        (starcat_scrub(places.bytes[places.active], places.size[places.active], 0, 0, &bad) !=
-         STARCAT_IDENTIFIED)) {
+    if ((starcat_start_image(&slots, &image) == STARCAT_OK) &&
+        (starcat_scrub_image(slots.bytes[slots.active], slots.size[slots.active], 0, 0, &bad) !=
+         STARCAT_OK)) {
       abort();
     }
   }
-  free(places.bytes[0]);
-  free(places.bytes[1]);
+  free(slots.bytes[0]);
+  free(slots.bytes[1]);
   traps_off();
   return 0;
 }

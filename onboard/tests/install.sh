@@ -11,7 +11,7 @@ cat >"$out/app/main.c" <<'END'
 #include <stdio.h>
 int main(void) {
   starcat_options options;
-  starcat_default_options(&options); /* links to no library of other limits */
+  starcat_set_default_options(&options); /* links to no library of other limits */
   printf("%s %d %d %d\n", starcat_version(), (int)STARCAT_MAX_CENTROIDS, (int)STARCAT_MAX_STARS,
          (int)sizeof(starcat_real));
   return starcat_version_number() == STARCAT_VERSION_NUMBER ? 0 : 1;

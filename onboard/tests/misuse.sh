@@ -15,11 +15,11 @@ int main(void) {
   starcat_options options;
   const starcat_frame frame = {0, 0, 0, 0, 0};
   static const starcat_real q[4] = {0, 0, 0, 1};
-  (void)starcat_open(&image, 0, 0, 0);
-  starcat_camera_of(&image, &camera);
-  starcat_default_options(&options);
-  (void)starcat_track(&image, &camera, &options, &frame, q, (starcat_real)0.01, &work, &result);
-  return (int)starcat_identify(&image, &camera, &options, &frame, &work, &result);
+  (void)starcat_open_image(&image, 0, 0, 0);
+  starcat_get_camera(&image, &camera);
+  starcat_set_default_options(&options);
+  (void)starcat_track_frame(&image, &camera, &options, &frame, q, (starcat_real)0.01, &work, &result);
+  return (int)starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
 }
 END
 fail() { echo "misuse: $1"; exit 1; }
@@ -32,7 +32,7 @@ for wrong in "-DSTARCAT_SINGLE 64_192_float" "-DSTARCAT_MAX_CENTROIDS=128 128_19
   "-DSTARCAT_MAX_STARS=400 64_400_double"; do
   set -- $wrong
   ! links "$1" || fail "a caller with $1 links"
-  for name in open camera_of default_options identify track; do
+  for name in open_image get_camera set_default_options identify_frame track_frame; do
     grep -q "undefined.*starcat_${name}_$2" "$out/said" || fail "$1: starcat_${name}_$2 is not missed"
   done
 done

@@ -53,13 +53,13 @@ int main(int argc, char **argv) {
   const int repeats = argc > 4 ? atoi(argv[4]) : 1;
   void *bytes = read_whole(argv[1], &size);
   char *text = read_whole(argv[2], &unused);
-  const starcat_status opened = starcat_open(&image, bytes, size, 0);
-  if ((text == NULL) || (opened != STARCAT_IDENTIFIED)) {
+  const starcat_status opened = starcat_open_image(&image, bytes, size, 0);
+  if ((text == NULL) || (opened != STARCAT_OK)) {
     (void)fprintf(stderr, "cannot open: %d\n", (int)opened);
     return 2;
   }
-  starcat_camera_of(&image, &camera);
-  starcat_default_options(&options);
+  starcat_get_camera(&image, &camera);
+  starcat_set_default_options(&options);
   for (char *at = text; strspn(at, " \r\n") < strlen(at);) {
     const uint32_t count = (uint32_t)strtoul(at, &at, 10);
     const starcat_real prior[4] = {number(&at), number(&at), number(&at), number(&at)};
@@ -71,9 +71,9 @@ int main(int argc, char **argv) {
       magnitudes[i] = number(&at);
     }
     for (int n = 0; n < repeats; n++) {
-      status = is_tracked ? starcat_track(&image, &camera, &options, &frame, prior, PRIOR_RAD,
+      status = is_tracked ? starcat_track_frame(&image, &camera, &options, &frame, prior, PRIOR_RAD,
                                           &work, &result)
-                          : starcat_identify(&image, &camera, &options, &frame, &work, &result);
+                          : starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
     }
     (void)printf("%d %u %u %u", (int)status, (unsigned)result.n_matched, (unsigned)result.n_tried,
                  (unsigned)result.steps);

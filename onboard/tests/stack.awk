@@ -8,7 +8,7 @@
 /^edge:/ {
   match($0, /sourcename: "[^"]*"/); from = plain(substr($0, RSTART + 13, RLENGTH - 14))
   match($0, /targetname: "[^"]*"/); to = plain(substr($0, RSTART + 13, RLENGTH - 14))
-  if (to == "__indirect_call") { calls[from] = calls[from] " starcat_triangle starcat_pyramid" }
+  if (to == "__indirect_call") { calls[from] = calls[from] " starcat_look_up_triangle starcat_look_up_pyramid" }
   else { calls[from] = calls[from] " " to }
 }
 function plain(name) { sub(/_[0-9]+_[0-9]+_(double|float)$/, "", name); return name }
@@ -25,7 +25,7 @@ function deepest(name,    n, i, list, most, below) {
   return done[name] = own[name] + most
 }
 END {
-  n = split("starcat_identify starcat_track starcat_open starcat_scrub starcat_attitude", entry, " ")
+  n = split("starcat_identify_frame starcat_track_frame starcat_open_image starcat_scrub_image starcat_fit_attitude", entry, " ")
   for (i = 1; i <= n; i++) {
     bytes = deepest(entry[i])
     if (!(entry[i] in own) || bytes > 8192) failed = 1

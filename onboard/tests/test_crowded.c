@@ -18,12 +18,12 @@ static uint8_t is_taken[SPOTS][SPOTS][SPOTS];
 
 static starcat_status identify(const unit_sky *of) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
-  return starcat_identify(&of->image, &of->camera, &of->options, &frame, &unit_work, &unit_result);
+  return starcat_identify_frame(&of->image, &of->camera, &of->options, &frame, &unit_work, &unit_result);
 }
 
 static starcat_status begin(const unit_sky *of) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
-  return starcat_begin(&call, &of->image, &of->camera, &of->options, &frame, &unit_work,
+  return starcat_begin_call(&call, &of->image, &of->camera, &of->options, &frame, &unit_work,
                        &unit_result);
 }
 
@@ -72,11 +72,11 @@ static void check_each_once(void) {
   uint64_t state = 61;
   uint32_t expected = 0, missing = 0;
   sky_look(&sky.image, &sky.camera, &state, 0.0, SPOTS, SPOTS - 1u, &truth);
-  CHECK_IS(begin(&sky), STARCAT_IDENTIFIED);
+  CHECK_IS(begin(&sky), STARCAT_OK);
   CHECK_IS(call.own->count, SPOTS);
   n_taken = n_again = 0;
   memset(is_taken, 0, sizeof is_taken);
-  starcat_each_triangle(&call, count_taken);
+  starcat_search_triangles(&call, count_taken);
   for (uint32_t k = 0; k < SPOTS; k++) {
     for (uint32_t j = 0; j < k; j++) {
       for (uint32_t i = 0; i < j; i++) {
@@ -103,14 +103,14 @@ static void check_most_taken(void) {
     truth.x[k] = (starcat_real)(256.0 + radius_px * cos(angle));
     truth.y[k] = (starcat_real)(256.0 + radius_px * sin(angle));
   }
-  CHECK_IS(begin(&sky), STARCAT_IDENTIFIED);
+  CHECK_IS(begin(&sky), STARCAT_OK);
   n_taken = 0;
-  starcat_each_triangle(&call, count_taken);
+  starcat_search_triangles(&call, count_taken);
   CHECK_IS(n_taken, MOST_TAKEN);
   sky.options.max_steps = 10000000; /* of which it takes six million */
   CHECK_IS(identify(&sky), STARCAT_NO_MATCH);
   CHECK(unit_result.reason != (uint32_t)STARCAT_REASON_STEPS);
-  starcat_default_options(&sky.options);
+  starcat_set_default_options(&sky.options);
 }
 
 /* Crowded frames most of whose spots are false. */
@@ -136,28 +136,28 @@ static void check_nearer(void) {
   for (uint32_t n = 0; n < 40u; n++) {
     starcat_real m[9];
     sky_look(&sky.image, &sky.camera, &state, 0.05, STARCAT_MAX_CENTROIDS, 50u, &truth);
-    CHECK_IS(begin(&sky), STARCAT_IDENTIFIED);
+    CHECK_IS(begin(&sky), STARCAT_OK);
     for (uint32_t k = 0; k < 9u; k++) {
       m[k] = (starcat_real)truth.matrix[k];
     }
-    if (starcat_try(&call, m, (starcat_real)1.0) != 0) {
-      CHECK_IS(starcat_end(&call, &sky.options, &unit_result), STARCAT_IDENTIFIED);
+    if (starcat_try_attitude(&call, m, (starcat_real)1.0) != 0) {
+      CHECK_IS(starcat_end_call(&call, &sky.options, &unit_result), STARCAT_IDENTIFIED);
       certain++;
       wrong += unit_wrong_stars(&truth);
     }
   }
   CHECK(certain >= 36u);
   CHECK(wrong < 10u);
-  starcat_default_options(&sky.options);
+  starcat_set_default_options(&sky.options);
 }
 
 void test_crowded(void) {
   const sky_recipe recipe = {1, 2, 700, 0.17, 9};
   sky.bytes = (uint8_t *)sky.words;
   sky.size = sky_image(&recipe, sky.bytes);
-  CHECK_IS(starcat_open(&sky.image, sky.bytes, sky.size, 0), STARCAT_IDENTIFIED);
-  starcat_camera_of(&sky.image, &sky.camera);
-  starcat_default_options(&sky.options);
+  CHECK_IS(starcat_open_image(&sky.image, sky.bytes, sky.size, 0), STARCAT_OK);
+  starcat_get_camera(&sky.image, &sky.camera);
+  starcat_set_default_options(&sky.options);
   check_each_once();
   check_most_taken();
   check_stars();

@@ -10,30 +10,30 @@
 #define PRIOR_RAD ((starcat_real)0.01)
 
 static starcat_status identify(const unit_sky *sky, const starcat_frame *frame) {
-  return starcat_identify(&sky->image, &sky->camera, &sky->options, frame, &unit_work,
+  return starcat_identify_frame(&sky->image, &sky->camera, &sky->options, frame, &unit_work,
                           &unit_result);
 }
 
 static starcat_status track(const unit_sky *sky, const starcat_frame *frame,
                             const starcat_real q[4], starcat_real uncertainty_rad) {
-  return starcat_track(&sky->image, &sky->camera, &sky->options, frame, q, uncertainty_rad,
+  return starcat_track_frame(&sky->image, &sky->camera, &sky->options, frame, q, uncertainty_rad,
                        &unit_work, &unit_result);
 }
 
 static void check_nulls(const starcat_frame *frame, const starcat_real q[4]) {
   const unit_sky *s = &unit_scratch;
   starcat_frame without = *frame;
-  CHECK_IS(starcat_identify(NULL, &s->camera, &s->options, frame, &unit_work, &unit_result),
+  CHECK_IS(starcat_identify_frame(NULL, &s->camera, &s->options, frame, &unit_work, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify(&s->image, NULL, &s->options, frame, &unit_work, &unit_result),
+  CHECK_IS(starcat_identify_frame(&s->image, NULL, &s->options, frame, &unit_work, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify(&s->image, &s->camera, NULL, frame, &unit_work, &unit_result),
+  CHECK_IS(starcat_identify_frame(&s->image, &s->camera, NULL, frame, &unit_work, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify(&s->image, &s->camera, &s->options, NULL, &unit_work, &unit_result),
+  CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, NULL, &unit_work, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify(&s->image, &s->camera, &s->options, frame, NULL, &unit_result),
+  CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, frame, NULL, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify(&s->image, &s->camera, &s->options, frame, &unit_work, NULL),
+  CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, frame, &unit_work, NULL),
            STARCAT_E_NULL);
   CHECK_IS(track(s, NULL, q, PRIOR_RAD), STARCAT_E_NULL);
   CHECK_IS(track(s, frame, NULL, PRIOR_RAD), STARCAT_E_NULL);
@@ -81,7 +81,7 @@ static void check_options(const starcat_frame *frame, const starcat_real q[4]) {
   o->max_steps = 0;
   CHECK_IS(identify(&unit_scratch, frame), STARCAT_E_OPTIONS);
   CHECK_IS(track(&unit_scratch, frame, q, PRIOR_RAD), STARCAT_E_OPTIONS);
-  starcat_default_options(o);
+  starcat_set_default_options(o);
 }
 
 /* Every number of a camera out of its range, above and below. */
@@ -103,7 +103,7 @@ static void check_cameras(const starcat_frame *frame, const starcat_real q[4]) {
   c->k1 = (starcat_real)-3.0;
   c->fold_radius = (starcat_real)(1.0 / 3.0);
   CHECK_IS(identify(&unit_scratch, frame), STARCAT_E_CAMERA);
-  starcat_camera_of(&unit_scratch.image, c);
+  starcat_get_camera(&unit_scratch.image, c);
 }
 
 static void check_priors(const starcat_frame *frame, const starcat_real q[4]) {
@@ -123,7 +123,7 @@ static void check_priors(const starcat_frame *frame, const starcat_real q[4]) {
   /* A camera of 160 degrees and a prior of 20: stars behind the camera would have to be sought. */
   unit_scratch.camera.focal_length_px = (starcat_real)64.0;
   CHECK_IS(track(&unit_scratch, frame, q, (starcat_real)0.34), STARCAT_E_OPTIONS);
-  starcat_camera_of(&unit_scratch.image, &unit_scratch.camera);
+  starcat_get_camera(&unit_scratch.image, &unit_scratch.camera);
 }
 
 void test_errors(void) {
@@ -331,6 +331,6 @@ void test_budget(void) {
     unit_copy(skies[n % 2u]);
     check_budgets(&unit_scratch, &truth, (n & 2u) != 0u, (n & 4u) != 0u);
   }
-  starcat_default_options(&unit_scratch.options);
+  starcat_set_default_options(&unit_scratch.options);
   CHECK_IS(unit_scratch.options.max_steps, 4000000);
 }

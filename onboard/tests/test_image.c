@@ -1,4 +1,4 @@
-/* Opening images and finding damage in them: each error code of starcat_open and starcat_scrub.
+/* Opening images and finding damage in them: each error code of starcat_open_image and starcat_scrub_image.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -7,7 +7,7 @@
 #include "unit.h"
 
 static starcat_status open_scratch(uint32_t flags) {
-  return starcat_open(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, flags);
+  return starcat_open_image(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, flags);
 }
 
 /* Change a number of a sound image, and put it back. */
@@ -37,7 +37,7 @@ static starcat_status start_with(size_t at, uint32_t value) {
   memcpy(&sound, unit_scratch.bytes + at, 4);
   memcpy(unit_scratch.bytes + at, &value, 4);
   const starcat_status status = open_scratch(0);
-  CHECK_IS(starcat_scrub(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad), status);
+  CHECK_IS(starcat_scrub_image(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad), status);
   CHECK_IS(bad, 0); /* the header is in the first block */
   memcpy(unit_scratch.bytes + at, &sound, 4);
   return status;
@@ -52,14 +52,14 @@ static uint32_t header(size_t at) {
 static void check_starts(void) {
   const uint32_t data = header(24), total = header(20);
   uint8_t *bytes = unit_scratch.bytes;
-  CHECK_IS(starcat_open(NULL, bytes, unit_scratch.size, 0), STARCAT_E_NULL);
-  CHECK_IS(starcat_open(&unit_scratch.image, NULL, unit_scratch.size, 0), STARCAT_E_NULL);
-  CHECK_IS(starcat_open(&unit_scratch.image, bytes + 4, unit_scratch.size - 4u, 0),
+  CHECK_IS(starcat_open_image(NULL, bytes, unit_scratch.size, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, NULL, unit_scratch.size, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes + 4, unit_scratch.size - 4u, 0),
            STARCAT_E_ALIGNMENT);
-  CHECK_IS(starcat_open(&unit_scratch.image, bytes, 0, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_open(&unit_scratch.image, bytes, 511, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_open(&unit_scratch.image, bytes, 512, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_open(&unit_scratch.image, bytes, unit_scratch.size - 1u, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 0, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 511, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 512, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, unit_scratch.size - 1u, 0), STARCAT_E_SHORT);
   CHECK_IS(start_with(0, 0), STARCAT_E_MAGIC);
   CHECK_IS(start_with(4, header(4) ^ 0x01010101u), STARCAT_E_MAGIC);
   CHECK_IS(start_with(8, 0), STARCAT_E_MAGIC);
@@ -72,7 +72,7 @@ static void check_starts(void) {
   CHECK_IS(start_with(24, data - 4096u), STARCAT_E_LAYOUT);
   CHECK_IS(start_with(20, total + 4096u), STARCAT_E_SHORT);
   CHECK_IS(start_with(20, total - 4096u), STARCAT_E_LAYOUT);
-  CHECK_IS(open_scratch(0), STARCAT_IDENTIFIED);
+  CHECK_IS(open_scratch(0), STARCAT_OK);
 }
 
 static void check_numbers(void) {
@@ -84,7 +84,7 @@ static void check_numbers(void) {
   CHECK_IS(with_u32(52, 65536), STARCAT_E_LAYOUT);
   CHECK_IS(with_u32(40, 1), STARCAT_E_LAYOUT);
   CHECK_IS(with_u32(56, STARCAT_MAX_STARS + 1u), STARCAT_E_CAPACITY);
-  CHECK_IS(with_u32(56, STARCAT_MAX_STARS), STARCAT_IDENTIFIED);
+  CHECK_IS(with_u32(56, STARCAT_MAX_STARS), STARCAT_OK);
   CHECK_IS(with_f64(96, 0.0), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, nan), STARCAT_E_LAYOUT);
   CHECK_IS(with_f64(96, 1e-300), STARCAT_E_LAYOUT);
@@ -116,9 +116,9 @@ static void check_sections(uint32_t n_sections) {
   }
   /* A kind of a later minor version is passed over. */
   CHECK_IS(with_u32(60, n_sections + 1u), STARCAT_E_LAYOUT);
-  CHECK_IS(unit_open_with(260u + 16u * n_sections, 512), STARCAT_IDENTIFIED);
-  CHECK_IS(unit_open_with(256u + 16u * n_sections, 77), STARCAT_IDENTIFIED);
-  CHECK_IS(unit_open_with(60, n_sections + 1u), STARCAT_IDENTIFIED);
+  CHECK_IS(unit_open_with(260u + 16u * n_sections, 512), STARCAT_OK);
+  CHECK_IS(unit_open_with(256u + 16u * n_sections, 77), STARCAT_OK);
+  CHECK_IS(unit_open_with(60, n_sections + 1u), STARCAT_OK);
 }
 
 void test_open(void) {
@@ -152,7 +152,7 @@ static int is_found(size_t bit) {
   uint8_t *byte = unit_scratch.bytes + bit / 8u;
   *byte = (uint8_t)(*byte ^ (1u << (bit % 8u)));
   const starcat_status status =
-      starcat_scrub(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad);
+      starcat_scrub_image(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad);
   const starcat_status opened = open_scratch(0);
   *byte = (uint8_t)(*byte ^ (1u << (bit % 8u)));
   return (status < 0) && (opened == status) && (bad == bit / 8u / 4096u);
@@ -165,22 +165,22 @@ static void check_parts(void) {
   uint8_t *bytes = unit_scratch.bytes;
   bytes[4096] ^= 1u;
   bytes[2u * 4096u] ^= 1u;
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, 0, 1, &bad), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, 1, 1, &bad), STARCAT_E_CRC);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 0, 1, &bad), STARCAT_OK);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 1, 1, &bad), STARCAT_E_CRC);
   CHECK_IS(bad, 1);
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, 2, UINT32_MAX, &bad), STARCAT_E_CRC);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 2, UINT32_MAX, &bad), STARCAT_E_CRC);
   CHECK_IS(bad, 2);
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, 3, 0, &bad), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, blocks, 5, &bad), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, UINT32_MAX, 5, &bad), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 3, 0, &bad), STARCAT_OK);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, blocks, 5, &bad), STARCAT_OK);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, UINT32_MAX, 5, &bad), STARCAT_OK);
   /* Who asks for no CRC gets none. */
-  CHECK_IS(open_scratch(STARCAT_SKIP_CRC), STARCAT_IDENTIFIED);
+  CHECK_IS(open_scratch(STARCAT_SKIP_CRC), STARCAT_OK);
   CHECK_IS(open_scratch(0), STARCAT_E_CRC);
   /* A damaged check block is named itself, not the blocks that it was to check. */
   bytes[4096] ^= 1u;
   bytes[2u * 4096u] ^= 1u;
   bytes[unit_scratch.size - 4096u] ^= 1u;
-  CHECK_IS(starcat_scrub(bytes, unit_scratch.size, 0, 0, &bad), STARCAT_E_CRC);
+  CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 0, 0, &bad), STARCAT_E_CRC);
   CHECK_IS(bad, blocks - 1u);
   bytes[unit_scratch.size - 4096u] ^= 1u;
 }
@@ -189,11 +189,11 @@ void test_scrub(void) {
   uint32_t bad = 0, missed = 0;
   uint64_t state = 1;
   unit_copy(&unit_pyramid);
-  CHECK_IS(starcat_scrub(unit_scratch.bytes, unit_scratch.size, 0, 0, NULL), STARCAT_E_NULL);
-  CHECK_IS(starcat_scrub(NULL, unit_scratch.size, 0, 0, &bad), STARCAT_E_NULL);
-  CHECK_IS(starcat_scrub(unit_scratch.bytes, 100, 0, 0, &bad), STARCAT_E_SHORT);
-  CHECK_IS(starcat_scrub(unit_scratch.bytes + 1, 512, 0, 0, &bad), STARCAT_E_ALIGNMENT);
-  CHECK_IS(starcat_scrub(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_scrub_image(unit_scratch.bytes, unit_scratch.size, 0, 0, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_scrub_image(NULL, unit_scratch.size, 0, 0, &bad), STARCAT_E_NULL);
+  CHECK_IS(starcat_scrub_image(unit_scratch.bytes, 100, 0, 0, &bad), STARCAT_E_SHORT);
+  CHECK_IS(starcat_scrub_image(unit_scratch.bytes + 1, 512, 0, 0, &bad), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_scrub_image(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad), STARCAT_OK);
   check_parts();
   for (uint32_t n = 0; n < 64u; n++) { /* sizes and version */
     missed += (uint32_t)!is_found(n * 8u + 1u);
@@ -213,10 +213,10 @@ static void use_scratch(void) {
     const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes,
                                  NULL};
     unit_scratch.options.max_steps = 20000;
-    (void)starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
+    (void)starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                            &unit_work, &unit_result);
     CHECK(unit_result.steps <= 20000u);
-    (void)starcat_track(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
+    (void)starcat_track_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                         truth.q_body_from_icrs, (starcat_real)0.01, &unit_work, &unit_result);
     CHECK(unit_result.steps <= 20000u);
   }
@@ -233,7 +233,7 @@ void test_damaged(void) {
         const uint32_t at = header(260u + 16u * (size_t)section);
         memset(unit_scratch.bytes + at, fillings[value], header(264u + 16u * (size_t)section));
         CHECK_IS(open_scratch(0), STARCAT_E_CRC);
-        CHECK_IS(open_scratch(STARCAT_SKIP_CRC), STARCAT_IDENTIFIED);
+        CHECK_IS(open_scratch(STARCAT_SKIP_CRC), STARCAT_OK);
         use_scratch();
       }
     }

@@ -12,7 +12,7 @@ static starcat_call call;
 
 static starcat_status track(const unit_sky *sky, starcat_real uncertainty_rad) {
   const starcat_frame frame = unit_frame_of(&truth);
-  return starcat_track(&sky->image, &sky->camera, &sky->options, &frame, truth.q_body_from_icrs,
+  return starcat_track_frame(&sky->image, &sky->camera, &sky->options, &frame, truth.q_body_from_icrs,
                        uncertainty_rad, &unit_work, &unit_result);
 }
 
@@ -21,33 +21,33 @@ static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t
   sky_look(&sky->image, &sky->camera, &seed, 0.2, n_spots, n_false, &truth);
   CHECK_IS(unit_identify(sky, &truth), STARCAT_IDENTIFIED);
   const starcat_frame frame = unit_frame_of(&truth);
-  CHECK_IS(starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+  CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                          &unit_result),
-           STARCAT_IDENTIFIED);
+           STARCAT_OK);
 }
 
 /* Directions that determine no attitude. */
 static void check_degenerate(void) {
   const starcat_real zero[6] = {0}, v[3] = {1, 2, 3};
   starcat_real x[3], inverse[6], m[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
-  CHECK(!starcat_solve(zero, v, x, inverse));
-  starcat_refine(m, v, v, NULL, NULL, 0, 4);
+  CHECK(!starcat_solve_symmetric(zero, v, x, inverse));
+  starcat_refine_attitude(m, v, v, NULL, NULL, 0, 4);
   CHECK(m[0] == (starcat_real)1.0);
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(starcat_try(&call, unit_result.matrix, (starcat_real)1.0));
+  CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
   const uint32_t n = unit_work.best.n_matched;
   CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
   starcat_agreement weighed = unit_work.best;
   weighed.residual_rad = (starcat_real)0.0;
   call.own->n_within++; /* one more star than was matched, so that a share is worked out */
   unit_work.within[call.own->n_within - 1u] = unit_work.within[0];
-  starcat_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  starcat_weigh_agreement(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
   CHECK((weighed.share > (starcat_real)0.5) && (weighed.is_firm != 0u));
   for (uint32_t i = 0; i < call.own->count; i++) {
     unit_work.match[i] = -1;
   }
   CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
-  starcat_weigh(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
+  starcat_weigh_agreement(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
   CHECK((weighed.share <= (starcat_real)0.0) && (weighed.is_firm == 0u));
 }
 
@@ -68,8 +68,8 @@ static void check_coincident(void) {
       memcpy(unit_work.body, body, sizeof body);
       call.own->steps_left = 1000000;
       memcpy(unit_work.body[t[1]], unit_work.body[t[0]], sizeof body[0]);
-      CHECK_IS(starcat_triangle(&call, t, sides), 0);
-      CHECK_IS(starcat_triangle(&call, t, line), 0);
+      CHECK_IS(starcat_look_up_triangle(&call, t, sides), 0);
+      CHECK_IS(starcat_look_up_triangle(&call, t, line), 0);
     }
   }
   CHECK_IS(call.own->n_tried, 0);
@@ -85,14 +85,14 @@ static void check_too_near(void) {
   unit_copy(&unit_pyramid);
   begin(&unit_scratch, 4, SKY_SPOTS, 0);
   memcpy(&at, unit_scratch.bytes + 256u + 4u, 4);
-  starcat_rows_of(&unit_scratch.image, 0, 2, rows + 1);
+  starcat_read_rows(&unit_scratch.image, 0, 2, rows + 1);
   rows[0] = rows[1] == 0u ? rows[2] + 1u : rows[1] - 1u;
   const int32_t *place = unit_scratch.image.directions + 3u * (size_t)rows[0];
   for (uint32_t n = 0; n < 3u; n++) {
     const int32_t near[3] = {place[0] + steps[n][0], place[1] + steps[n][1], place[2]};
     memcpy(unit_scratch.bytes + at + 12u * (size_t)rows[n], near, 12);
     starcat_real *body = unit_work.body[n];
-    starcat_star(&unit_scratch.image, rows[n], body);
+    starcat_read_star(&unit_scratch.image, rows[n], body);
     const starcat_real length = STARCAT_SQRT(starcat_dot(body, body));
     for (uint32_t k = 0; k < 3u; k++) {
       body[k] /= length;
@@ -105,7 +105,7 @@ static void check_too_near(void) {
   }
   unit_scratch.image.kvector_slope = (starcat_real)1e5; /* every side is that of the first pairs */
   call.tolerance_rad = (starcat_real)2e-8;
-  CHECK_IS(starcat_pyramid(&call, triple, sides), 0);
+  CHECK_IS(starcat_look_up_pyramid(&call, triple, sides), 0);
   CHECK_IS(call.own->n_tried, 0);
 }
 #endif
@@ -186,7 +186,7 @@ static void check_bounds_of_shapes(void) {
                                    (starcat_real)size[2]};
     call.tolerance_rad = (starcat_real)errors[n / 4u];
     call.own->steps_left = 20000;
-    const int has_ended = starcat_triangle(&call, triple, sides);
+    const int has_ended = starcat_look_up_triangle(&call, triple, sides);
     CHECK((has_ended == 0) || (call.own->steps_left == 0u) ||
           (unit_work.best.log_chance <= call.log_certain));
   }
@@ -204,7 +204,7 @@ static void check_bounds_of_shapes(void) {
     }
     call.own->steps_left = 1000000;
     unit_matrix_of(&truth, m);
-    (void)starcat_try(&call, m, (starcat_real)1.0);
+    (void)starcat_try_attitude(&call, m, (starcat_real)1.0);
     CHECK(unit_work.found.star[0] >= 0);
     CHECK_IS(unit_work.found.star[SKY_SPOTS - 1u], -1);
   }
@@ -228,7 +228,7 @@ static void check_spread(void) {
     for (uint32_t steps = 100; steps < 10000000u; steps *= 3u) {
       unit_scratch.options.max_steps = steps;
       const starcat_status status =
-          starcat_identify(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
+          starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
                            &unit_work, &unit_result);
       CHECK((status != STARCAT_IDENTIFIED) || ((n < 6u) && (unit_wrong_stars(&truth) <= 1u)));
     }
@@ -334,10 +334,10 @@ static void check_second_rows(void) {
 static void check_wide(void) {
   uint32_t start = 7, stop = 7;
   uint64_t seed = 4;
-  starcat_rows_between(&unit_triangle.image, (starcat_real)-9.0, (starcat_real)-8.0, &start, &stop);
+  starcat_find_rows(&unit_triangle.image, (starcat_real)-9.0, (starcat_real)-8.0, &start, &stop);
   CHECK_IS(start, 0);
   CHECK_IS(stop, 0);
-  starcat_rows_between(&unit_triangle.image, (starcat_real)8.0, (starcat_real)9.0, &start, &stop);
+  starcat_find_rows(&unit_triangle.image, (starcat_real)8.0, (starcat_real)9.0, &start, &stop);
   CHECK_IS(start, unit_triangle.image.n_features);
   CHECK_IS(stop, unit_triangle.image.n_features);
   const unit_sky *skies[3] = {&unit_pyramid, &unit_triangle, &unit_crowded};
@@ -375,7 +375,7 @@ static void check_noises(void) {
  * number of all ways. */
 static void check_ways(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
-  CHECK(starcat_try(&call, unit_result.matrix, (starcat_real)1.0));
+  CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
   call.mag_reach = (starcat_real)100.0;
   starcat_count_ways(&call, 5);
   const double all = (double)unit_work.log_ways[5];
@@ -410,7 +410,7 @@ static void check_priors(void) {
   CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_CAPACITY);
   unit_scratch.options.max_steps = 10;
   CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_BUDGET);
-  starcat_default_options(&unit_scratch.options);
+  starcat_set_default_options(&unit_scratch.options);
   unit_scratch.options.noise_mag = (starcat_real)0.1;
   for (uint32_t n = 0; n < 10u; n++) {
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, 30, 0, &truth);
@@ -438,10 +438,10 @@ static void check_cap(const double centre[3], double cosine, double sine, uint32
   const starcat_real margin = (starcat_real)IF_SINGLE(7e-7, 2e-9);
   uint32_t within = 0, beside = 0, missing = 0;
   call.own->steps_left = 1000000;
-  const uint32_t count = starcat_gather(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
+  const uint32_t count = starcat_gather_stars(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real star[3];
-    starcat_star(call.image, row, star);
+    starcat_read_star(call.image, row, star);
     const starcat_real nearness = starcat_dot(star, c);
     beside += (uint32_t)((nearness >= cos_r - margin) && (nearness < cos_r));
     if (nearness >= cos_r) {
@@ -461,13 +461,13 @@ static void check_narrow_caps(void) {
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real centre[3], icrs[8][3];
     uint32_t rows[8];
-    starcat_star(call.image, row, centre);
+    starcat_read_star(call.image, row, centre);
     const starcat_real length = STARCAT_SQRT(starcat_dot(centre, centre));
     for (uint32_t k = 0; k < 3u; k++) {
       centre[k] /= length;
     }
     call.own->steps_left = 1000000;
-    const uint32_t count = starcat_gather(&call, centre, (starcat_real)(1.0 - 5e-13),
+    const uint32_t count = starcat_gather_stars(&call, centre, (starcat_real)(1.0 - 5e-13),
                                           (starcat_real)1e-6, 8, rows, icrs);
     missing += (uint32_t)!is_listed(rows, count, row);
   }
@@ -544,9 +544,9 @@ static void check_clusters(void) {
       }
     }
     const starcat_frame frame = unit_frame_of(&truth);
-    CHECK_IS(starcat_begin(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
+    CHECK_IS(starcat_begin_call(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
                            &frame, &unit_work, &unit_result),
-             STARCAT_IDENTIFIED);
+             STARCAT_OK);
     unit_matrix_of(&truth, m);
     for (uint32_t k = 0; k < 3u; k++) { /* turned by up to five reaches about y, and about z */
       const starcat_real turn = (starcat_real)(0.0025 * (n / 10u % 8u));
@@ -556,7 +556,7 @@ static void check_clusters(void) {
       m[3u + k] = y - roll * x;
       m[6u + k] = z - turn * x;
     }
-    certain += (uint32_t)starcat_try(&call, m, (starcat_real)1.0);
+    certain += (uint32_t)starcat_try_attitude(&call, m, (starcat_real)1.0);
     for (uint32_t k = 0; (unit_work.best.log_chance < (starcat_real)0.0) && (k < call.own->count);
          k++) {
       const int32_t star = unit_work.best.star[k];
@@ -565,7 +565,7 @@ static void check_clusters(void) {
     }
     unit_work.found.n_matched = 6;
     unit_work.found.residual_rad = (starcat_real)0.1;
-    starcat_weigh(&call, m, call.tolerance_rad, &unit_work.found);
+    starcat_weigh_agreement(&call, m, call.tolerance_rad, &unit_work.found);
   }
   CHECK((certain > 40u) && (certain < 240u));
   CHECK(wrong < 4u);

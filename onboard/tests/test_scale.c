@@ -10,7 +10,7 @@ static starcat_call call;
 
 static starcat_status begin(const unit_sky *sky) {
   const starcat_frame frame = unit_frame_of(&truth);
-  return starcat_begin(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+  return starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                        &unit_result);
 }
 
@@ -59,7 +59,7 @@ static void check_lens(void) {
                         (unit_wrong_stars(&truth) == 0u));
   }
   CHECK(found >= 19u);
-  CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
+  CHECK_IS(begin(&unit_scratch), STARCAT_OK);
   starcat_set_focal(&call, (starcat_real)1.05);
   CHECK(call.focal == (starcat_real)1.05);
   CHECK(call.body == unit_work.scaled);
@@ -67,7 +67,7 @@ static void check_lens(void) {
   CHECK(call.focal == (starcat_real)1.0);
   CHECK(call.body == unit_work.body);
   CHECK(call.camera.given.focal_length_px == unit_scratch.camera.focal_length_px);
-  CHECK(starcat_pixel(&call.camera, unit_work.body[0], &x, &y));
+  CHECK(starcat_find_pixel(&call.camera, unit_work.body[0], &x, &y));
   CHECK_NEAR(x, unit_work.x[0], 1e-3);
   CHECK_NEAR(y, unit_work.y[0], 1e-3);
 }
@@ -134,7 +134,7 @@ static void check_near(void) {
     starcat_real m[9];
     sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.1, SKY_SPOTS, 0, &truth);
     unit_matrix_of(&truth, m);
-    CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
+    CHECK_IS(begin(&unit_scratch), STARCAT_OK);
     const double size = n == 0u ? 0.0 : IF_SINGLE(1e-4, 1e-8) * sky_uniform(&state);
     const double x = 0.3 * sky_uniform(&state), y = n == 0u ? 0.0 : 0.3 * sky_uniform(&state);
     for (uint32_t i = 0; i < call.own->count; i++) {
@@ -144,7 +144,7 @@ static void check_near(void) {
       unit_work.body[i][1] = (starcat_real)(scale * v);
       unit_work.body[i][2] = (starcat_real)scale;
     }
-    (void)starcat_try(&call, m, (starcat_real)1.0);
+    (void)starcat_try_attitude(&call, m, (starcat_real)1.0);
     const starcat_real bound = unit_work.best.log_bound, focal = unit_work.best.focal;
     CHECK(bound - bound == (starcat_real)0.0);
     CHECK((focal >= (starcat_real)0.6999) && (focal <= (starcat_real)1.4287));
@@ -198,10 +198,10 @@ static void check_corners(void) {
     unit_scratch.camera.focal_length_px =
         unit_crowded.camera.focal_length_px * (starcat_real)scales[n % 4u];
     unit_matrix_of(&truth, m);
-    CHECK_IS(begin(&unit_scratch), STARCAT_IDENTIFIED);
-    (void)starcat_try(&call, m, (starcat_real)1.0);
-    (void)starcat_try(&call, other, (starcat_real)0.96);
-    if (starcat_end(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED) {
+    CHECK_IS(begin(&unit_scratch), STARCAT_OK);
+    (void)starcat_try_attitude(&call, m, (starcat_real)1.0);
+    (void)starcat_try_attitude(&call, other, (starcat_real)0.96);
+    if (starcat_end_call(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED) {
       for (uint32_t k = 0; k < truth.count; k++) {
         wrong += (uint32_t)((unit_result.star[k] >= 0) && (truth.star[k] >= 0) &&
                             (unit_result.star[k] != truth.star[k]));

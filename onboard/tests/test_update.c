@@ -12,7 +12,7 @@
 #define CAPACITY (SKY_MOST_BYTES / BLOCK * BLOCK)
 
 static uint64_t words[2][CAPACITY / 8u], patch_words[CAPACITY / 8u];
-static starcat_places places;
+static starcat_slots slots;
 static starcat_image image;
 static uint32_t block, n_mended;
 
@@ -22,22 +22,22 @@ static uint32_t crc_of(const unit_sky *sky) {
   return crc;
 }
 
-/* Two places with the triangles' sky in use and nothing in the other one. */
+/* Two slots with the triangles' sky in use and nothing in the other one. */
 static void begin(void) {
   memset(words, 0, sizeof words);
-  memset(&places, 0, sizeof places);
-  places.bytes[0] = (uint8_t *)words[0];
-  places.bytes[1] = (uint8_t *)words[1];
-  places.capacity = sizeof words[0];
-  places.size[0] = unit_triangle.size;
+  memset(&slots, 0, sizeof slots);
+  slots.bytes[0] = (uint8_t *)words[0];
+  slots.bytes[1] = (uint8_t *)words[1];
+  slots.capacity = sizeof words[0];
+  slots.size[0] = unit_triangle.size;
   memcpy(words[0], unit_triangle.bytes, unit_triangle.size);
-  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
 }
 
 static void send(const unit_sky *sky, size_t from, size_t until, size_t most) {
   for (size_t at = from; at < until; at += most) {
     const size_t count = until - at < most ? until - at : most;
-    CHECK_IS(starcat_put(&places, at, sky->bytes + at, count), STARCAT_IDENTIFIED);
+    CHECK_IS(starcat_put_piece(&slots, at, sky->bytes + at, count), STARCAT_OK);
   }
 }
 
@@ -45,124 +45,124 @@ static void test_pieces(void) {
   const unit_sky *sky = &unit_pyramid;
   const uint32_t n_blocks = (uint32_t)(sky->size / BLOCK);
   begin();
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_LAYOUT); /* nothing is awaited */
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_LAYOUT);
-  CHECK_IS(starcat_receive(&places, sky->size, crc_of(sky)), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_E_LAYOUT); /* nothing is awaited */
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_receive_image(&slots, sky->size, crc_of(sky)), STARCAT_OK);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
   CHECK_IS(block, n_blocks - 1u); /* checks come first */
   send(sky, sky->size - BLOCK, sky->size, 700);
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
   CHECK_IS(block, 0);
   send(sky, 0, 3u * BLOCK + 100u, 1000);
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
   CHECK_IS(block, 3);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
-  CHECK_IS(places.active, 0);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE);
+  CHECK_IS(slots.active, 0);
   /* The computer starts anew with what it kept; the transfer goes on with what is missing. */
-  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
-  CHECK(image.bytes == places.bytes[0]);
-  for (uint32_t n = 0; n < n_blocks && starcat_missing(&places, n, &block) == STARCAT_E_CRC; n++) {
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
+  CHECK(image.bytes == slots.bytes[0]);
+  for (uint32_t n = 0; n < n_blocks && starcat_find_missing_block(&slots, n, &block) == STARCAT_INCOMPLETE; n++) {
     send(sky, (size_t)block * BLOCK, ((size_t)block + 1u) * BLOCK, 1);
     n = block;
   }
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_OK);
   CHECK_IS(block, n_blocks);
-  CHECK_IS(starcat_switch(&places, NULL), STARCAT_E_NULL);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
-  CHECK_IS(places.active, 1);
-  CHECK_IS(places.coming_crc, 0);
+  CHECK_IS(starcat_switch_image(&slots, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
+  CHECK_IS(slots.active, 1);
+  CHECK_IS(slots.coming_crc, 0);
   CHECK(memcmp(image.bytes, sky->bytes, sky->size) == 0);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED); /* falls back */
-  CHECK(image.bytes == places.bytes[0]);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK); /* falls back */
+  CHECK(image.bytes == slots.bytes[0]);
   /* What is there is whole, but not what is awaited: the image before of the same size. */
-  CHECK_IS(starcat_receive(&places, sky->size, crc_of(sky) ^ 1u), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_E_CRC);
+  CHECK_IS(starcat_receive_image(&slots, sky->size, crc_of(sky) ^ 1u), STARCAT_OK);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
   CHECK_IS(block, n_blocks - 1u);
-  CHECK_IS(starcat_receive(&places, sky->size, 0), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_missing(&places, 0, &block), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_receive_image(&slots, sky->size, 0), STARCAT_OK);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_OK);
 }
 
 static void check_update_errors(void) {
   const uint8_t byte = 0;
   begin();
-  CHECK_IS(starcat_start(NULL, &image), STARCAT_E_NULL);
-  CHECK_IS(starcat_start(&places, NULL), STARCAT_E_NULL);
-  CHECK_IS(starcat_put(NULL, 0, &byte, 1), STARCAT_E_NULL);
-  CHECK_IS(starcat_put(&places, 0, NULL, 1), STARCAT_E_NULL);
-  CHECK_IS(starcat_put(&places, 0, &byte, 1), STARCAT_E_SHORT);
-  CHECK_IS(starcat_put(&places, 1, &byte, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_missing(NULL, 0, &block), STARCAT_E_NULL);
-  CHECK_IS(starcat_missing(&places, 0, NULL), STARCAT_E_NULL);
-  CHECK_IS(starcat_mend(NULL, BLOCK, &n_mended), STARCAT_E_NULL);
-  CHECK_IS(starcat_mend(words, 2u * BLOCK, NULL), STARCAT_E_NULL);
-  CHECK_IS(starcat_mend((uint8_t *)words + 4, 2u * BLOCK, &n_mended), STARCAT_E_ALIGNMENT);
-  CHECK_IS(starcat_mend(words, BLOCK, &n_mended), STARCAT_E_LAYOUT);
-  CHECK_IS(starcat_mend(words, 2u * BLOCK + 8u, &n_mended), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_start_image(NULL, &image), STARCAT_E_NULL);
+  CHECK_IS(starcat_start_image(&slots, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_put_piece(NULL, 0, &byte, 1), STARCAT_E_NULL);
+  CHECK_IS(starcat_put_piece(&slots, 0, NULL, 1), STARCAT_E_NULL);
+  CHECK_IS(starcat_put_piece(&slots, 0, &byte, 1), STARCAT_E_SHORT);
+  CHECK_IS(starcat_put_piece(&slots, 1, &byte, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_find_missing_block(NULL, 0, &block), STARCAT_E_NULL);
+  CHECK_IS(starcat_find_missing_block(&slots, 0, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend_image(NULL, BLOCK, &n_mended), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend_image(words, 2u * BLOCK, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend_image((uint8_t *)words + 4, 2u * BLOCK, &n_mended), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_mend_image(words, BLOCK, &n_mended), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_mend_image(words, 2u * BLOCK + 8u, &n_mended), STARCAT_E_LAYOUT);
   if (sizeof(size_t) > 4u) {
-    CHECK_IS(starcat_parity_bytes((size_t)BLOCK * 1048575u), (size_t)BLOCK * 32768u);
-    CHECK_IS(starcat_parity_bytes((size_t)BLOCK * 1048576u), 0);
+    CHECK_IS(starcat_count_parity_bytes((size_t)BLOCK * 1048575u), (size_t)BLOCK * 32768u);
+    CHECK_IS(starcat_count_parity_bytes((size_t)BLOCK * 1048576u), 0);
   }
-  CHECK_IS(starcat_parity_bytes(33u * BLOCK), 2u * BLOCK);
-  CHECK_IS(starcat_receive(NULL, BLOCK, 0), STARCAT_E_NULL);
-  CHECK_IS(starcat_receive(&places, BLOCK - 1u, 0), STARCAT_E_LAYOUT);
-  CHECK_IS(starcat_receive(&places, places.capacity, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_receive(&places, places.capacity + BLOCK, 0), STARCAT_E_SHORT);
-  places.active = 2;
-  CHECK_IS(starcat_start(&places, &image), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_count_parity_bytes(33u * BLOCK), 2u * BLOCK);
+  CHECK_IS(starcat_receive_image(NULL, BLOCK, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_receive_image(&slots, BLOCK - 1u, 0), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_receive_image(&slots, slots.capacity, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_receive_image(&slots, slots.capacity + BLOCK, 0), STARCAT_E_SHORT);
+  slots.active = 2;
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_OPTIONS);
   for (uint32_t n = 0; n < 2u; n++) {
     begin();
-    places.bytes[n] = NULL;
-    CHECK_IS(starcat_start(&places, &image), STARCAT_E_NULL);
+    slots.bytes[n] = NULL;
+    CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_NULL);
   }
 }
 
-/* An image of another sky is in the other place, and was in use before. */
+/* An image of another sky is in the other slot, and was in use before. */
 static void fill_both(void) {
   begin();
-  CHECK_IS(starcat_receive(&places, unit_pyramid.size, 0), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_receive_image(&slots, unit_pyramid.size, 0), STARCAT_OK);
   send(&unit_pyramid, 0, unit_pyramid.size, BLOCK);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
 }
 
-static void damage(uint32_t place, uint32_t first, uint32_t count) {
+static void damage(uint32_t slot, uint32_t first, uint32_t count) {
   for (uint32_t n = 0; n < count; n++) {
-    places.bytes[place][(size_t)(first + n) * BLOCK + (size_t)(977u * n % BLOCK)] ^= 0x10u;
+    slots.bytes[slot][(size_t)(first + n) * BLOCK + (size_t)(977u * n % BLOCK)] ^= 0x10u;
   }
 }
 
 static void test_parity(void) {
   const uint32_t n_blocks = (uint32_t)(unit_triangle.size / BLOCK);
-  const uint32_t groups = (uint32_t)(starcat_parity_bytes(unit_triangle.size) / BLOCK);
+  const uint32_t groups = (uint32_t)(starcat_count_parity_bytes(unit_triangle.size) / BLOCK);
   fill_both();
   for (uint32_t n = 0; n < n_blocks + groups; n++) { /* any one block, also of parity */
     damage(0, n, 1);
-    CHECK_IS(starcat_mend(places.bytes[0], places.size[0], &n_mended), STARCAT_IDENTIFIED);
+    CHECK_IS(starcat_mend_image(slots.bytes[0], slots.size[0], &n_mended), STARCAT_OK);
     CHECK_IS(n_mended, n < n_blocks ? 1 : 0);
-    CHECK(memcmp(places.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
+    CHECK(memcmp(slots.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
   }
   damage(0, 0, groups); /* as many at once as there are groups, if they are neighbours */
-  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED);
-  CHECK_IS(places.active, 0);
-  CHECK(memcmp(places.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
+  CHECK_IS(slots.active, 0);
+  CHECK(memcmp(slots.bytes[0], unit_triangle.bytes, unit_triangle.size) == 0);
   damage(0, 0, groups + 1u);
-  CHECK_IS(starcat_mend(places.bytes[0], places.size[0], &n_mended), STARCAT_E_CRC);
+  CHECK_IS(starcat_mend_image(slots.bytes[0], slots.size[0], &n_mended), STARCAT_E_CRC);
   CHECK_IS(n_mended, groups - 1u);
-  CHECK_IS(starcat_start(&places, &image), STARCAT_IDENTIFIED); /* falls back by itself */
-  CHECK_IS(places.active, 1);
-  CHECK(image.bytes == places.bytes[1]);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK); /* falls back by itself */
+  CHECK_IS(slots.active, 1);
+  CHECK(image.bytes == slots.bytes[1]);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE);
   damage(1, 0, n_blocks);
-  CHECK_IS(starcat_start(&places, &image), STARCAT_E_CRC);
-  CHECK_IS(places.active, 1);
-  /* A place that is larger than the image that is in it. */
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_CRC);
+  CHECK_IS(slots.active, 1);
+  /* A slot that is larger than the image that is in it. */
   begin();
-  places.size[0] += BLOCK;
-  CHECK_IS(starcat_start(&places, &image), STARCAT_E_CRC);
+  slots.size[0] += BLOCK;
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_CRC);
   begin();
   memcpy(words[0], &(uint32_t){0}, 4); /* sound blocks, but no image */
   sky_seal((uint8_t *)words[0]);
-  CHECK_IS(starcat_start(&places, &image), STARCAT_E_MAGIC);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_MAGIC);
 }
 
 /* A patch, written step by step. */
@@ -205,7 +205,7 @@ static void begin_patch(void) {
   memcpy(patch_words, "STARPAT", 8);
   put_word(8, 0x01020304u);
   put_word(12, 1);
-  put_word(16, (uint32_t)places.size[places.active]);
+  put_word(16, (uint32_t)slots.size[slots.active]);
   put_word(20, crc_of(&unit_triangle));
   put_word(24, (uint32_t)unit_scratch.size);
   put_word(28, crc_of(&unit_scratch));
@@ -216,7 +216,7 @@ static void begin_patch(void) {
 
 static starcat_status apply(void) {
   put_word(36, (uint32_t)patch.size);
-  return starcat_patch(&places, patch_words, patch.size);
+  return starcat_apply_patch(&slots, patch_words, patch.size);
 }
 
 static uint32_t number_at(size_t at) {
@@ -284,19 +284,19 @@ static void patch_all(void) {
 static void check_steps(void) {
   begin();
   patch_all();
-  CHECK_IS(apply(), STARCAT_IDENTIFIED);
-  CHECK(memcmp(places.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
-  CHECK(image.bytes == places.bytes[1]);
+  CHECK_IS(apply(), STARCAT_OK);
+  CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
+  CHECK(image.bytes == slots.bytes[1]);
   CHECK_IS(apply(), STARCAT_E_VERSION); /* it is not for the image that it made */
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_IDENTIFIED);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
   damage(0, 1, 1);
   CHECK_IS(apply(), STARCAT_E_CRC); /* of a damaged image comes a damaged one */
-  CHECK_IS(starcat_switch(&places, &image), STARCAT_E_CRC);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE);
   /* Rows of four bytes, and a step back. */
   begin();
   memcpy(words[0], unit_pyramid.bytes, unit_pyramid.size);
-  places.size[0] = unit_pyramid.size;
+  slots.size[0] = unit_pyramid.size;
   unit_copy(&unit_pyramid);
   uint32_t bytes;
   const size_t rows = section(8, &bytes);
@@ -317,7 +317,7 @@ static void check_steps(void) {
   const uint32_t last = row[bytes / 4u - 1u];
   row[bytes / 4u - 1u] = row[bytes / 4u - 2u];
   row[bytes / 4u - 2u] = last;
-  CHECK(memcmp(places.bytes[1], unit_scratch.bytes, rows + bytes) == 0);
+  CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, rows + bytes) == 0);
 }
 
 /* A patch of one step that cannot be. */
@@ -349,11 +349,11 @@ static void check_refused(void) {
     put_byte(0xffu); /* a number that does not end */
   }
   CHECK_IS(apply(), STARCAT_E_LAYOUT);
-  CHECK_IS(starcat_patch(NULL, patch_words, patch.size), STARCAT_E_NULL);
-  CHECK_IS(starcat_patch(&places, NULL, patch.size), STARCAT_E_NULL);
-  CHECK_IS(starcat_patch(&places, (uint8_t *)patch_words + 2, patch.size), STARCAT_E_ALIGNMENT);
-  CHECK_IS(starcat_patch(&places, patch_words, 39), STARCAT_E_SHORT);
-  CHECK_IS(starcat_patch(&places, patch_words, patch.size - 1u), STARCAT_E_SHORT);
+  CHECK_IS(starcat_apply_patch(NULL, patch_words, patch.size), STARCAT_E_NULL);
+  CHECK_IS(starcat_apply_patch(&slots, NULL, patch.size), STARCAT_E_NULL);
+  CHECK_IS(starcat_apply_patch(&slots, (uint8_t *)patch_words + 2, patch.size), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_apply_patch(&slots, patch_words, 39), STARCAT_E_SHORT);
+  CHECK_IS(starcat_apply_patch(&slots, patch_words, patch.size - 1u), STARCAT_E_SHORT);
   static const struct {
     size_t at;
     uint32_t value;
@@ -367,10 +367,10 @@ static void check_refused(void) {
     begin_patch();
     put_word(36, (uint32_t)patch.size);
     put_word(headers[n].at, headers[n].value);
-    CHECK_IS(starcat_patch(&places, patch_words, patch.size), headers[n].status);
+    CHECK_IS(starcat_apply_patch(&slots, patch_words, patch.size), headers[n].status);
   }
   begin_patch();
-  places.size[0] = 0;
+  slots.size[0] = 0;
   CHECK_IS(apply(), STARCAT_E_VERSION); /* no image is in use */
 }
 

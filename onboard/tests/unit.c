@@ -14,9 +14,9 @@ starcat_workspace unit_work;
 starcat_result unit_result;
 
 static void open_sky(unit_sky *sky) {
-  CHECK_IS(starcat_open(&sky->image, sky->bytes, sky->size, 0), STARCAT_IDENTIFIED);
-  starcat_camera_of(&sky->image, &sky->camera);
-  starcat_default_options(&sky->options);
+  CHECK_IS(starcat_open_image(&sky->image, sky->bytes, sky->size, 0), STARCAT_OK);
+  starcat_get_camera(&sky->image, &sky->camera);
+  starcat_set_default_options(&sky->options);
 }
 
 static void make_sky(unit_sky *sky, const sky_recipe *recipe) {
@@ -34,7 +34,7 @@ void unit_copy(const unit_sky *from) {
 starcat_status unit_open_with(size_t at, uint32_t value) {
   memcpy(unit_scratch.bytes + at, &value, 4);
   sky_seal(unit_scratch.bytes);
-  return starcat_open(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, 0);
+  return starcat_open_image(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, 0);
 }
 
 starcat_frame unit_frame_of(const sky_frame *truth) {
@@ -44,7 +44,7 @@ starcat_frame unit_frame_of(const sky_frame *truth) {
 
 starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth) {
   const starcat_frame frame = unit_frame_of(truth);
-  return starcat_identify(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+  return starcat_identify_frame(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                           &unit_result);
 }
 

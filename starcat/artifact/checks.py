@@ -16,13 +16,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_attributes
-from starcat.artifact.other_catalogs import counterpart_problems, motion_problems
 from starcat.artifact.writer import content_sha256
 from starcat.errors import SchemaError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
+from starcat.products.table import PRODUCTS
 from starcat.storage.hdf5 import own_dataset
-from starcat.storage.product_table import indices_of
 from starcat.storage.schema import ProductSchema
 
 UNIT_TOLERANCE = 1e-14
@@ -141,16 +140,11 @@ def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
         yield f"separation_rad of row {row} is not that of its stars"
 
 
-def counterparts_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where counterparts contradict each other or their stars."""
-    if held.schema.product == "crossmatch" and held.stars is not None:
-        yield from counterpart_problems(held.table, held.stars)
-
-
-def motions_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where what is said of motions contradicts itself or the stars."""
-    if held.schema.product == "motions" and held.stars is not None:
-        yield from motion_problems(held.table, held.stars)
+def content_agrees_with_the_stars(held: HeldProduct) -> Iterator[str]:
+    """Yield where a product contradicts itself or the stars, as its module says."""
+    kind = PRODUCTS.get(held.schema.product)
+    if kind is not None and kind.problems is not None and held.stars is not None:
+        yield from kind.problems(held.table, held.stars)
 
 
 TABLE_CHECKS: tuple[Check, ...] = (
@@ -163,8 +157,7 @@ TABLE_CHECKS: tuple[Check, ...] = (
 REFERENCE_CHECKS: tuple[Check, ...] = (
     star_rows_exist,
     separations_are_those_of_the_stars,
-    counterparts_are_those_of_the_stars,
-    motions_are_those_of_the_stars,
+    content_agrees_with_the_stars,
 )
 """The checks where the stars are known; each needs what the one before it found sound."""
 
@@ -222,7 +215,8 @@ def index_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
     """Yield where the indices of a product do not fit its rows."""
-    for name in indices_of(schema.product):
+    kind = PRODUCTS.get(schema.product)
+    for name in kind.layout.indices if kind else ():
         if name not in group:
             yield f"{group.name}/{name} is missing"
         elif name == "kvector_counts":

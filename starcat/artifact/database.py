@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import SchemaError
 from starcat.products.index import Index
-from starcat.storage.product_table import indices_of
+from starcat.products.table import PRODUCTS
 from starcat.storage.schema import ProductSchema, SchemaColumn
 
 LAYOUT_VERSION = "1.0.0"
@@ -39,7 +39,7 @@ def write_product(
     file: h5py.File, table: pa.Table, schema: ProductSchema, index: Index, star_count: int
 ) -> None:
     """Write a product as a group of contiguous datasets."""
-    expected = indices_of(schema.product)
+    expected = PRODUCTS[schema.product].layout.indices
     if set(index.datasets) != set(expected):
         raise SchemaError(
             f"{schema.product}: indices {', '.join(index.datasets) or 'none'} found; expected "

@@ -27,9 +27,9 @@ from starcat.artifact.checks import (
     root_problems,
 )
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
-from starcat.artifact.other_catalogs import COUNTS, joined_problems
 from starcat.artifact.reader import Artifact
 from starcat.errors import ProductError, StarcatError, no_database
+from starcat.products.table import PRODUCTS
 from starcat.specs.epoch import middle_of
 from starcat.stars.star_table import directions_of
 from starcat.stars.verdict import Reason
@@ -269,8 +269,12 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                     f"{source['source']}: rejected {listed}, but the product rejected holds "
                     f"{held_rows}"
                 )
-        if source["role"] in COUNTS and source["role"] in held:
-            yield from joined_problems(source["role"], held[source["role"]].table, source)
+        kind = PRODUCTS.get(source["role"])
+        if kind is not None and kind.joined is not None and kind.name in held:
+            count_of, have = kind.joined
+            name, joined = source["source"], source.get("joined")
+            if (found := count_of(held[kind.name].table, name)) != joined:
+                yield f"{name}: {joined} stars {have}, but the product {kind.name} holds {found}"
         elif source["role"] == "motions" and "motions" not in products:
             yield f"{source['source']}: motions are from it, but there is no product motions"
     for product, facts in products.items():

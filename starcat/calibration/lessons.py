@@ -17,7 +17,7 @@ from starcat.artifact.manifest import manifest_digest
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.calibration.answers import SkyStars, read_answers
 from starcat.calibration.learn import FAMILY, MIN_FRAMES, Distrusted, Lesson, learn
-from starcat.specs.build_spec import Observed
+from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
 from starcat.specs.reading import what_is_wrong
 from starcat.stars.star_table import directions_of, floats_of

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask
@@ -23,8 +22,8 @@ from starcat.catalog.readers.records import Records
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import Selection
-from starcat.specs.doubtful_stars import Doubles
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.ruleset import Selection
 from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Reason
 
@@ -188,12 +187,3 @@ def join_pairs(stars: pa.Table, table: PairTable, doubles: Doubles) -> tuple[pa.
         "is_flagged_double": flagged,
     }
     return with_columns(stars, columns), len(np.unique(star))
-
-
-def is_joined(stars: pa.Table, doubles: Doubles) -> Mask:
-    """Return which stars a joined source says to be close doubles."""
-    found = np.zeros(len(stars), dtype=bool)
-    for source in doubles.join:
-        named = pc.match_substring(stars["double_flag"], f"{source}:")
-        found |= pc.fill_null(named, False).to_numpy()
-    return found

@@ -22,6 +22,7 @@ from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
 from starcat.stars.verdict import Reason, Verdicts, rejected_path
 from starcat.storage.parquet import write_table
@@ -124,7 +125,7 @@ def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str,
     }
     if beyond_read_limit:
         counted[Reason.beyond_read_limit.name] = beyond_read_limit
-    return {reason.name: counted[reason.name] for reason in Reason if reason.name in counted}
+    return {name: counted[name] for name in ALL_REASONS if name in counted}
 
 
 def ingest(

@@ -6,9 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.arrays import Mask
 from starcat.errors import BuildError
-from starcat.specs.build_spec import Observed
+from starcat.selection.rules.distrust import Observed
 from starcat.stars.star_table import floats_of, with_columns
 
 SOURCE = "observed"
@@ -58,9 +57,3 @@ def _check_numbers(stars: pa.Table, observed: Observed) -> None:
             f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are the "
             "star_id of no star of the catalog; learn from frames of a database of this catalog"
         )
-
-
-def is_distrusted(stars: pa.Table, observed: Observed) -> Mask:
-    """Return which stars the spec says to distrust."""
-    wanted = np.array(observed.reject, dtype=np.int64)
-    return np.isin(stars["star_id"].to_numpy(), wanted)

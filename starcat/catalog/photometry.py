@@ -68,9 +68,3 @@ def _blend_message(band: str) -> str:
         f"unknown band {band!r} of 2mass; use J, H, Ks, (J+H)/2 or a weighted sum whose weights "
         "add up to 1, such as 0.6*J+0.4*H"
     )
-
-
-def combined_magnitude(mags: Array) -> float:
-    """Return the magnitude of several stars seen as one."""
-    brightest = float(np.min(mags))
-    return float(brightest - 2.5 * np.log10(np.sum(10.0 ** (-0.4 * (mags - brightest)))))

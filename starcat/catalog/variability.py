@@ -26,7 +26,7 @@ from starcat.catalog.readers.records import Records
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import Selection
+from starcat.selection.ruleset import Selection
 from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Reason
 

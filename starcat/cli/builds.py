@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,7 @@ from starcat.cli.console import (
     print_things,
     progress_bars,
     say,
+    show,
     warn,
 )
 from starcat.cli.options import (
@@ -63,12 +64,18 @@ def build(
             min=0.1, help="GiB; refuse a build that needs more. Default: the free memory."
         ),
     ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Only say what each stage would do, and read.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Build a guide-star database, check it, and prove that it identifies its own fields.
 
     Example: starcat build --preset gaia-12deg -o dist
     """
+    if explain:
+        _explain(chosen_spec(spec, preset, changes), inputs_by_source(inputs, maps=sources), json)
+        return
     if context.obj is not None:
         _build_remotely(context, chosen_spec(spec, preset, changes), output, as_json=json)
         return
@@ -91,6 +98,25 @@ def build(
                 _print_contents(error.built)
         raise
     print_built(built, as_json=json)
+
+
+def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: bool) -> None:
+    """Print what the stages of a build would do."""
+    from starcat.pipeline.stages import explain as explained
+
+    stages = explained(spec, inputs)
+    rows = [
+        (each.title, each.does or "nothing", "\n".join(map(" ".join, _given(each.reads))))
+        for each in stages
+    ]
+    title = f"{spec.name} {spec.version}"
+    columns = ("stage", "does", "reads")
+    show(as_json, [each.as_dict() for each in stages], print_table, title, columns, rows)
+
+
+def _given(reads: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:
+    """Return each source with the names of the files that were given for it."""
+    return [(name, *(Path(path).name or path for path in paths)) for name, paths in reads.items()]
 
 
 def _build_remotely(

@@ -123,7 +123,7 @@ def ingest(
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         expect_parquet(output)
-        read = _read_to_file([source, *(merge or [])], given, output, workers=workers, **how)
+        read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
         print_ingested(read, output, as_json=json)
         return
     from starcat.store.ingest import ingest_to_store
@@ -139,17 +139,23 @@ def ingest(
 
 
 def _read_to_file(
-    names: Sequence[str], given: Mapping[str, Sequence[Path]], output: Path, **how: Any
+    names: Sequence[str],
+    given: Mapping[str, Sequence[Path]],
+    output: Path,
+    workers: int,
+    **how: Any,
 ) -> Ingested:
     """Read catalogs, merged where there are several, into a Parquet file."""
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
-    from starcat.pipeline.merged import read_merged
-    from starcat.specs.product_sections import Crossmatch
+    from starcat.pipeline.reading import merged_catalog, read_all
+    from starcat.products.crossmatch import Crossmatch
 
     paths = {name: locate(name, given) for name in names}
     with progress_bars() as progress:
-        read = read_merged(names, paths, Crossmatch(), **how, progress=progress)
+        catalogs = read_all(names, paths, workers=workers, **how, progress=progress)
+        progress("merge", 0, None)
+        read = merged_catalog(catalogs, Crossmatch(), workers)
         write_star_tables(read, output)
     return read
 
@@ -186,7 +192,7 @@ def crossmatch(
     """
     from starcat.exchange.formats import expect_parquet
     from starcat.pipeline.counterparts import match_files
-    from starcat.specs.product_sections import Crossmatch
+    from starcat.products.crossmatch import Crossmatch
 
     expect_parquet(output)
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))

@@ -10,9 +10,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter
+
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 from starcat.errors import QueryError
-from starcat.query.gallery import gallery, guessed, macros, named_query
+from starcat.query.gallery import Macro, gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
 
 if TYPE_CHECKING:
@@ -186,8 +188,7 @@ def print_macros(*, as_json: bool) -> None:
     """Print the macros, each with an example."""
     listed = sorted(macros(), key=lambda m: (m.is_table, m.name))
     if as_json:
-        facts = ("name", "arguments", "is_table", "help", "example")
-        print_json([{fact: getattr(macro, fact) for fact in facts} for macro in listed])
+        print_json(TypeAdapter(list[Macro]).dump_python(listed))
         return
     for macro in listed:
         after = "FROM " if macro.is_table else ""

@@ -249,7 +249,7 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
                 "rejected": dict(found.rejected),
                 "total_bytes": found.total_bytes,
                 "build_seconds": round(found.build_seconds, 2),
-                "refusals": list(found.refusals),
+                "refusals": list(map(str, found.refusals)),
                 "warnings": list(found.warnings),
             }
         )
@@ -269,5 +269,5 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
         "the stars are as the build will have them"
     )
     warn(found.warnings)
-    for text in found.refusals:
-        say(f"the build will be refused: {text}")
+    for error in found.refusals:
+        say(f"the build will be refused: {error}")

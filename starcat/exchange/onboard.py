@@ -31,7 +31,7 @@ from starcat.onboard.signature import (
     signature_problems,
 )
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.products.boresights import FieldStars
+from starcat.products.tiling import FieldStars
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file

@@ -120,7 +120,8 @@ class _Batch:
     def result(self) -> BatchResult:
         """Return it as Python has it; a frame that the library did not take is a no_match."""
         found = self.records
-        attitudes = np.where(found["status"][:, None] == 0, found["q_body_from_icrs"], np.nan)
+        has_attitude = found["status"][:, None] == _onboard.lib.STARCAT_IDENTIFIED
+        attitudes = np.where(has_attitude, found["q_body_from_icrs"], np.nan)
         status = [STATUSES.get(code, "no_match") for code in self.codes]
         return BatchResult(status, found["seconds"].copy(), attitudes, self._answer)
 
@@ -154,8 +155,8 @@ class CEngine:
         words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
         words.view(np.uint8)[: len(data)] = np.frombuffer(data, dtype=np.uint8)
         self._words, self.image = words, ffi.new("starcat_image *")
-        status = lib.starcat_open(self.image, ffi.from_buffer(words), len(data), 0)
-        if status != 0:
+        status = lib.starcat_open_image(self.image, ffi.from_buffer(words), len(data), 0)
+        if status != lib.STARCAT_OK:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
                 f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
@@ -182,7 +183,7 @@ class Search:
         self._kept = engine, _camera(camera), _options(settings, fov_error)
         addresses = [engine.image, *self._kept[1:], engine.rows, engine.directions]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
-        self._one, self._null = _onboard.lib.starcat_one, _onboard.ffi.NULL
+        self._one, self._null = _onboard.lib.starcat_identify_one, _onboard.ffi.NULL
         self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
     def one(
@@ -246,7 +247,7 @@ class Search:
         def run(first: int) -> None:
             memory = _FREE.pop() if _FREE else _Memory()
             stop = min(first + CHUNK, count)
-            _onboard.lib.starcat_many(self._address, first, stop, *arrays, memory.address)
+            _onboard.lib.starcat_identify_many(self._address, first, stop, *arrays, memory.address)
             _FREE.append(memory)
 
         parts = range(0, count, CHUNK)

@@ -1,7 +1,7 @@
 """The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
 
 Only what a method needs is opened. Datasets are not read but mapped; every one is checked against
-the product table when the database is opened, because an index that leads out of its table would
+its layout when the database is opened, because an index that leads out of its table would
 end in an error far from its cause. A database may come from anywhere, so nothing that leads out of
 its file is followed (`starcat.storage.hdf5`).
 """
@@ -35,15 +35,8 @@ from starcat.errors import (
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.onboard.reading import OnboardImage, read_image
+from starcat.products.layouts import LARGEST, LAYOUTS, MAY_BE_UNKNOWN, RANGES, SMALLEST, Numbers
 from starcat.storage.hdf5 import own_dataset, own_group
-from starcat.storage.product_table import (
-    LARGEST,
-    MAY_BE_UNKNOWN,
-    PRODUCTS,
-    RANGES,
-    SMALLEST,
-    Numbers,
-)
 from starcat.storage.regular_files import check_regular_file, read_regular_file
 
 Made = TypeVar("Made")
@@ -182,7 +175,7 @@ def open_image(path: Path) -> Database:
 def products_in(artifact: Path) -> tuple[str, ...]:
     """Return the names of the products that an artifact's database holds, sorted."""
     with _readable(_database_file(artifact)) as file:
-        return tuple(sorted(name for name in file if name in PRODUCTS))
+        return tuple(sorted(name for name in file if name in LAYOUTS))
 
 
 def _database_file(artifact: Path) -> Path:
@@ -252,7 +245,7 @@ def _product(
     file: h5py.File, mapped: mmap.mmap, name: str, path: Path, star_count: int | None = None
 ) -> ProductArrays:
     """Return a product, its indices checked against its rows and the stars."""
-    if name not in file or name not in PRODUCTS:
+    if name not in file or name not in LAYOUTS:
         raise ProductError(
             f"{path}: has no product {name!r}; set 'products.{name}.enabled = true' in its spec "
             f"and build it again, or choose a method that works with {', '.join(sorted(file))}",
@@ -271,7 +264,7 @@ def _product(
         for key, value in group.attrs.items()
         if isinstance(value, (int, float, np.number))
     }
-    layout = PRODUCTS[name]
+    layout = LAYOUTS[name]
     arrays: dict[str, NDArray[Any]] = {}
     for key in layout.datasets:
         if key not in group:
@@ -305,8 +298,8 @@ def _check_version(found: str, newest: int, product: str, path: Path) -> None:
 def check_product(
     name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, star_count: int
 ) -> None:
-    """Check that a product is as the product table says; `ProductError` names what is not."""
-    layout = PRODUCTS[name]
+    """Check that a product is as its layout says; `ProductError` names what is not."""
+    layout = LAYOUTS[name]
     checks = _Checks(name, arrays, star_count)
     rows = len(arrays[layout.columns[0]])
     for attribute in (*layout.numbers, *(("kvector_intercept", "kvector_slope") * layout.kvector)):

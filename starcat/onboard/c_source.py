@@ -26,7 +26,7 @@ def c_header(name: str, size_bytes: int) -> str:
     symbol = c_symbol(name)
     guard = f"{symbol.upper()}_H"
     return f"""\
-/* The onboard image {name}: starcat_open(&image, {symbol}, sizeof {symbol}, 0). */
+/* The onboard image {name}: starcat_open_image(&image, {symbol}, sizeof {symbol}, 0). */
 #ifndef {guard}
 #define {guard}
 

@@ -20,7 +20,7 @@ from starcat.geometry.sphere import separation
 from starcat.onboard.grid import grid_for
 from starcat.onboard.image import Contents, longest_pair_rad
 from starcat.onboard.layout import Sizes
-from starcat.products.boresights import FieldStars
+from starcat.products.tiling import FieldStars
 
 LEAST_SHARE = {"triangle": 1.0 / 3.0, "pyramid": 0.5}
 """Of the sightings of all triangles, or of the longest pair's length, so much is left at least."""

@@ -1,10 +1,11 @@
 """What a build will cost, before it makes anything: rows, files, memory and time.
 
-Rows are those of `starcat.pipeline.counts`. The database stores numbers as they are, so its size
-is a sum. Parquet files are compressed: what a value then takes was measured on skies of 200 to
-170,000 stars and fields of 2 to 25 deg, and is right within a fifth. The size of a table at hand
-is found by writing it, or a part of it, to nowhere. Nothing depends on the machine but the memory
-that it has left. Times are those of a processor of 2020 that does nothing else.
+Each product counts its rows and knows what they cost (`starcat.products.kind`). The database
+stores numbers as they are, so its size is a sum. Parquet files are compressed: what a value then
+takes was measured on skies of 200 to 170,000 stars and fields of 2 to 25 deg, and is right within a
+fifth. The size of a table at hand is found by writing it, or a part of it, to nowhere. Nothing
+depends on the machine but the memory that it has left. Times are those of a processor of 2020 that
+does nothing else.
 """
 
 from __future__ import annotations
@@ -20,50 +21,26 @@ import pyarrow.compute as pc
 from starcat.artifact.database import stored_dtype
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
 from starcat.errors import BuildError
-from starcat.pipeline.counts import Extent, LevelExtent, count_levels, count_products
 from starcat.pipeline.log import available_memory_bytes
-from starcat.pipeline.recipes import ProductInputs, boresight_product
-from starcat.products.boresights import FieldStars
+from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
+from starcat.products.kind import Extent, ProductInputs, RowCost
+from starcat.products.table import PRODUCTS
+from starcat.products.tiling import FieldStars
+from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
-from starcat.storage.product_table import indices_of
 from starcat.storage.schema import product_schema
 
 GIB, MB = 2**30, 1e6
 
-
-@dataclass(frozen=True)
-class Row:
-    """What a row of a product costs."""
-
-    held_bytes: float  # while the other products are made and written
-    working_bytes: float  # beside that, while it is made itself
-    micros: float  # microseconds to make, write and check it
-
-
-ROWS: Mapping[str, Row] = {
-    "pairs": Row(28.0, 110.0, 1.3),
-    "triangles": Row(34.0, 50.0, 2.6),
-    "neighbours": Row(44.0, 50.0, 2.4),
-    "hausdorff_angular": Row(24.0, 40.0, 0.9),
-    "hausdorff_l2": Row(24.0, 60.0, 1.2),
-    "grid": Row(16.0, 60.0, 1.2),
-    "radial": Row(12.0, 60.0, 1.2),
-    "levels": Row(24.0, 60.0, 0.6),
-}
-"""Measured with numpy 2 on products of 0.5 to 6 million rows: of patterns a neighbour is one, of
-levels a triangle."""
-
-RECORD = Row(0.0, 32.0, 0.15)
+RECORD = RowCost(0.0, 32.0, 0.15)
 """A triangle of one field, before those that several fields have are made one."""
 
-FIELD_STAR = Row(8.0, 60.0, 0.6)
+FIELD_STAR = RowCost(8.0, 60.0, 0.6)
 """A star in a field of the tiling."""
 
-FIELD = Row(300.0, 1200.0, 40.0)
+FIELD = RowCost(300.0, 1200.0, 40.0)
 """A field of the tiling, with its line and its dot in the report."""
 
 BASE_BYTES = 320.0e6
@@ -76,24 +53,6 @@ FRAME_SECONDS, BASE_SECONDS = 0.002, 3.0
 
 ROW_GROUP_BYTES = 350.0
 """What each row group but the first adds to the end of a Parquet file."""
-
-STAR_ROW_IN_ORDER = 2.3
-"""Bytes of a row of the star table, ascending and each once."""
-
-PAIR_SEPARATION = 5.2
-"""Bytes of a float64 of a table that is sorted by it."""
-
-TRIANGLE_SHAPE = 9.0
-"""Bytes of a triangle beside its stars: area, sides, angles and how many fields have it."""
-
-NEIGHBOUR = 22.1
-"""Bytes of a neighbour with its angle and separations."""
-
-SEPARATION_OF_STAR = 8.1
-"""Bytes of a neighbour with one separation or ratio, ascending within each star."""
-
-COUNTERPART = 75.0
-"""Bytes of a row of the product ``crossmatch``."""
 
 DATASET_BYTES = 835.0
 """A dataset of the database, beside its values: its name, place and attributes."""
@@ -162,61 +121,59 @@ def whole_cost(
     ``rejected_bytes`` is the size of the file of rejected records, ``base_bytes`` memory that is
     taken already, ``others`` are products at hand, such as ``motions``.
     """
-    inputs = ProductInputs(directions_of(stars), fields, spec)
-    extents, levels = count_products(inputs), None
-    if spec.products.levels.enabled:
-        levels = count_levels(inputs.directions, floats_of(stars, "mag"), spec)
-    cost = product_cost(inputs, base_bytes, extents, levels)
-    boresights = boresight_product(fields, spec.boresights.brightest).table
-    longest = pc.max(pc.binary_length(stars["designation"])).as_py() or 1
-    listed = pc.sum(pc.list_value_length(boresights["brightest"])).as_py() or 0
-    stored = {"boresights": Extent(float(len(boresights)), float(listed)), **extents}
-    tables = {"stars": table_bytes(stars), "boresights": table_bytes(boresights)}
-    tables |= product_files(extents, levels, len(stars), spec)
+    inputs = product_inputs(stars, fields, spec)
+    extents = count_products(inputs)
+    tables = {"stars": table_bytes(stars)}
+    for name in recipe_names(inputs):
+        if PRODUCTS[name].section is None:
+            tables[name] = table_bytes(make_product(name, inputs).table)
+    tables |= product_files(inputs, extents)
     tables |= {product.name: table_bytes(product.table) for product in others}
     tables["rejected"] = rejected_bytes
-    rows = dict(cost.rows)
-    wanted = spec.products.crossmatch
-    if wanted.enabled:
-        rows["crossmatch"] = len(stars) * len(wanted.catalogs)
-        tables["crossmatch"] = round(_empty_file("crossmatch") + COUNTERPART * rows["crossmatch"])
     files = {f"{name}.parquet": count for name, count in tables.items()}
-    files["database.h5"] = database_bytes(stored, levels, len(stars), spec, longest)
-    files["report"] = round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * len(boresights))
-    return replace(cost, rows=rows, files=files)
+    longest = pc.max(pc.binary_length(stars["designation"])).as_py() or 1
+    files["database.h5"] = database_bytes(extents, len(stars), longest)
+    files["report"] = round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * len(fields.count))
+    return replace(product_cost(inputs, spec, base_bytes, extents), files=files)
+
+
+def count_products(inputs: ProductInputs) -> dict[str, Extent]:
+    """Count the rows of the products that are asked for, as far as guide stars tell."""
+    return {
+        name: kind.count(inputs, inputs.wanted.get(name))
+        for name, kind in PRODUCTS.items()
+        if kind.count is not None and kind.is_wanted(inputs)
+    }
 
 
 def product_cost(
     inputs: ProductInputs,
+    spec: BuildSpec,
     base_bytes: float,
     extents: Mapping[str, Extent] | None = None,
-    levels: LevelExtent | None = None,
 ) -> Cost:
     """Estimate what products cost in memory and time; without extents they are counted."""
     extents = count_products(inputs) if extents is None else extents
-    spec, fields = inputs.spec, inputs.fields
-    rows = {name: extent.rows for name, extent in extents.items()}
-    work = {name: extent.reached for name, extent in extents.items()}
-    records = sum(extent.records for extent in extents.values())
-    if levels is not None:
-        rows["levels"], work["levels"] = float(levels.levels), levels.triangles
-        records += levels.records
-    parts = [(ROWS[name], count) for name, count in work.items()]
+    fields = inputs.fields
+    costs = {name: cost for name in extents if (cost := PRODUCTS[name].cost) is not None}
+    parts = [(row, extents[name].reached) for name, row in costs.items()]
     parts += [
         (FIELD, float(len(fields.count))),
         (FIELD_STAR, float(len(fields.star_index))),
-        (RECORD, records),
+        (RECORD, sum(extent.records for extent in extents.values())),
     ]
-    held = {name: count * ROWS[name].held_bytes for name, count in work.items()}
     working = max((row.working_bytes * count for row, count in parts), default=0.0)
     memory = base_bytes + working + sum(row.held_bytes * count for row, count in parts)
     seconds = 1e-6 * sum(row.micros * count for row, count in parts)
     seconds += BASE_SECONDS + 3.0 * FRAME_SECONDS * spec.self_test.frames
-    saved = {name: held[name] + work[name] * ROWS[name].working_bytes for name in work}
+    saved = {
+        name: extents[name].reached * (row.held_bytes + row.working_bytes)
+        for name, row in costs.items()
+    }
     return Cost(
         len(inputs.directions),
         len(fields.count),
-        {name: round(count) for name, count in rows.items()},
+        {name: round(extents[name].rows) for name in inputs.wanted},
         {name: round(count) for name, count in saved.items()},
         round(memory),
         seconds,
@@ -231,13 +188,15 @@ def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = Non
     if limit is None or cost.memory_bytes <= limit:
         return
     largest = max(cost.bytes, key=lambda name: cost.bytes[name], default="")
-    key = f"products.{largest}.enabled = false"
+    key, saves = "selection.max_stars_per_field", f"products.{largest}.enabled = false"
     if largest in ("", "triangles"):
-        key = f"a smaller boresights.brightest than {spec.boresights.brightest}"
+        key = "boresights.brightest"
+        saves = f"a smaller boresights.brightest than {spec.boresights.brightest}"
     raise BuildError(
         f"{spec.name}: the build would take about {cost.memory_bytes / GIB:.1f} GiB of memory, "
-        f"more than {whose}, {limit / GIB:.1f} GiB; {key} saves most, and fewer stars "
-        "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything"
+        f"more than {whose}, {limit / GIB:.1f} GiB; {saves} saves most, and fewer stars "
+        "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything",
+        key=key,
     )
 
 
@@ -262,20 +221,14 @@ def table_bytes(table: pa.Table, rows: int | None = None) -> int:
     return round(one + some * max(0, count - 1) / max(1, sum(len(part) - 1 for part in parts)))
 
 
-def product_files(
-    extents: Mapping[str, Extent], levels: LevelExtent | None, stars: int, spec: BuildSpec
-) -> dict[str, int]:
-    """Return about how large the Parquet files of products will be."""
+def product_files(inputs: ProductInputs, extents: Mapping[str, Extent]) -> dict[str, int]:
+    """Return about how large the Parquet files of the products with a section will be."""
     found = {}
-    for name, extent in extents.items():
+    for name, section in inputs.wanted.items():
+        extent = extents[name]
         groups = max(0.0, np.ceil(extent.rows / ROW_GROUP_ROWS) - 1.0)
-        values = _values_bytes(name, extent, stars, spec)
+        values = PRODUCTS[name].values_bytes(extent, len(inputs.directions), section)
         found[name] = round(_empty_file(name) + ROW_GROUP_BYTES * groups + values)
-    if levels is not None:
-        # Triangles go by their stars, so that many of a star take less each.
-        each = 3.0 * max(1.0, levels.triangles / max(1, levels.stars)) ** -0.27
-        listed = STAR_ROW_IN_ORDER * levels.stars
-        found["levels"] = round(_empty_file("levels") + listed + each * levels.triangles)
     return found
 
 
@@ -284,71 +237,22 @@ def _empty_file(product: str) -> int:
     return parquet_bytes(product_schema(product).arrow_schema.empty_table())
 
 
-def _star_row(stars: float) -> float:
-    """Return the bytes of a row of the star table in no order."""
-    return float(1.3 * np.log2(max(stars, 2.0)) / 8.0)
-
-
-def _values_bytes(name: str, extent: Extent, stars: int, spec: BuildSpec) -> float:
-    """Return what the columns of a product take, compressed."""
-    rows = extent.rows
-    if name == "pairs":
-        return rows * (2.0 * _star_row(stars) + PAIR_SEPARATION)
-    if name == "triangles":
-        return rows * (3.0 * _star_row(stars) + TRIANGLE_SHAPE)
-    if name in ("neighbours", "hausdorff_angular", "hausdorff_l2"):
-        # Rows of a star are side by side: its number is written about once.
-        each = NEIGHBOUR if name == "neighbours" else SEPARATION_OF_STAR
-        return min(2.1 * stars, 2.0 * rows) + rows * each
-    pattern = rows * (STAR_ROW_IN_ORDER + 1.9)
-    if name == "grid":
-        return pattern + 0.92 * extent.values * _star_row(spec.products.grid.cells_per_side**2)
-    share = extent.values / max(1.0, rows) / spec.products.radial.rings
-    return pattern + extent.values * (1.3 - 1.2 * min(share, 1.0))
-
-
-def database_bytes(
-    extents: Mapping[str, Extent],
-    levels: LevelExtent | None,
-    stars: int,
-    spec: BuildSpec,
-    designation_bytes: int = 28,
-) -> int:
+def database_bytes(extents: Mapping[str, Extent], stars: int, designation_bytes: int) -> int:
     """Return how large the HDF5 file of a build will be."""
     total, datasets = 0.0, 0
-    every = {"stars": Extent(float(stars)), **extents}
-    if levels is not None:
-        every["levels"] = Extent(float(levels.levels), levels.triangles)
-    for name, extent in every.items():
-        for column in product_schema(name).columns:
+    for name, extent in extents.items():
+        kind = PRODUCTS[name]
+        if not kind.in_database:
+            continue
+        for column in kind.schema.columns:
             if not column.in_database:
                 continue
             is_name = column.item_dtype == "string"
             dtype = stored_dtype(column, stars)
             width = designation_bytes if is_name else np.dtype(dtype).itemsize
-            values = extent.values
-            if name == "levels" and column.name == "stars" and levels is not None:
-                values = float(levels.stars)
             total += extent.rows * (8.0 if column.is_list else width)
-            total += values * width if column.is_list else 0.0
+            total += extent.lists[column.name] * width if column.is_list else 0.0
             datasets += 2 if column.is_list else 1
-        total += _index_bytes(name, extent, stars, spec)
-        datasets += len(indices_of(name))
+        total += kind.index_bytes(extent, stars)
+        datasets += len(kind.layout.indices)
     return round(total + DATASET_BYTES * datasets)
-
-
-def _index_bytes(name: str, extent: Extent, stars: int, spec: BuildSpec) -> float:
-    """Return what stands beside the columns of a product in the database."""
-    if name in ("pairs", "triangles"):
-        return 4.0 * extent.rows
-    if name == "neighbours":
-        wanted = spec.products.neighbours
-        radius_deg = wanted.radius_deg or spec.camera.half_field_deg
-        rings = np.ceil(radius_deg / wanted.separation_bin_deg)
-        bins = float(np.ceil(360.0 / wanted.angle_bin_deg) * rings)
-        return 8.0 * stars + 8.0 * bins + 4.0 * extent.rows
-    if name == "grid":
-        return 8.0 * spec.products.grid.cells_per_side**2 + 4.0 * extent.values
-    if name == "radial":
-        return 8.0 * spec.products.radial.rings + 4.0 * extent.values
-    return {"hausdorff_angular": 8.0, "hausdorff_l2": 16.0}.get(name, 0.0) * stars

@@ -6,7 +6,6 @@ a time; only rows that some star may be stay in memory.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,40 +16,29 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.other_catalogs import (
+from starcat.artifact.writer import Product
+from starcat.catalog.ingest import Ingested
+from starcat.catalog.source import map_of
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline.draft import Draft, Stage, stage
+from starcat.products.crossmatch import (
     NEEDED,
+    Crossmatch,
     counterparts_of,
     matched_stars,
     moving_stars,
     table_from_matches,
 )
-from starcat.artifact.writer import Product
-from starcat.catalog.ingest import Ingested
-from starcat.catalog.selection import Selected
-from starcat.catalog.source import map_of
-from starcat.catalog.source_files import locate
-from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
-from starcat.products.crossmatch import VERDICTS, candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
-from starcat.progress import Progress, no_progress
+from starcat.products.match_stars import VERDICTS, candidate_pairs, crossmatch
+from starcat.selection.merging import MERGED
+from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.product_sections import Crossmatch
 from starcat.stars.star_table import sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
-
-
-@dataclass(frozen=True)
-class Counterparts:
-    """The counterparts of a build's guide stars."""
-
-    # the crossmatch product; none where the spec does not ask for it
-    products: tuple[Product, ...] = ()
-    sources: tuple[SourceFacts, ...] = ()  # the catalogs they are of, as the manifest has them
-    notes: tuple[str, ...] = ()  # what a user should know of the inputs
 
 
 def model_from_spec(wanted: Crossmatch) -> MatchModel:
@@ -130,7 +118,7 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     entry elsewhere. Stars that were merged into a guide star are part of it.
     """
     guide_stars = selected.guide_stars.select(NEEDED)
-    apart = pc.not_equal(selected.rejected["reason"], Reason.merged.name)
+    apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
     rejected = selected.rejected.filter(apart)["star_id"].combine_chunks()
     others = stars.select(NEEDED).filter(pc.is_in(stars["star_id"], rejected))
     near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)
@@ -138,72 +126,57 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     return pa.concat_tables([guide_stars, rivals])
 
 
-def match_catalogs(
-    stars: pa.Table,
-    selected: Selected,
-    spec: BuildSpec,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> Counterparts:
-    """Find the counterparts of a build's guide stars in the catalogs of its spec."""
+def _crossmatch_plan(spec: BuildSpec) -> str | None:
     wanted = spec.products.crossmatch
-    if not wanted.enabled:
-        return Counterparts()
-    both = with_rivals(stars, selected, wanted.radius_arcsec * ARCSEC)
-    count = len(selected.guide_stars)
-    tables: list[pa.Table] = []
-    sources: list[SourceFacts] = []
-    notes: list[str] = []
+    return f"find counterparts in {', '.join(wanted.catalogs)}" if wanted.enabled else None
+
+
+@stage(
+    "product crossmatch",
+    "products",
+    _crossmatch_plan,
+    lambda spec: spec.products.crossmatch.catalogs if spec.products.crossmatch.enabled else (),
+)
+def find_counterparts(draft: Draft) -> None:
+    """Find the counterparts of guide stars in other catalogs."""
+    wanted, selected = draft.spec.products.crossmatch, draft.selected
+    both = with_rivals(draft.stars, selected, wanted.radius_arcsec * ARCSEC)
+    tables = []
     for name in wanted.catalogs:
-        facts, told, table = match_source(
-            name, "crossmatch", both, wanted, inputs, workers, progress
-        )
-        tables.append(table.filter(pc.less(table["star"], count)))
-        sources.append(replace(facts, joined=counterparts_of(tables[-1], name)))
-        notes += told
-    product = Product("crossmatch", _in_order(tables), in_database=False)
-    return Counterparts((product,), tuple(sources), tuple(notes))
+        matches = match_source(name, find_counterparts, both, draft)
+        tables.append(matches.filter(pc.less(matches["star"], len(selected.guide_stars))))
+        joined = counterparts_of(tables[-1], name)
+        draft.sources[-1] = replace(draft.sources[-1], joined=joined)
+    order = product_schema("crossmatch").order
+    table = sort_rows(pa.concat_tables(tables), order).combine_chunks()
+    draft.products.append(Product("crossmatch", table, in_database=False))
 
 
-def match_source(
-    name: str,
-    role: str,
-    stars: pa.Table,
-    wanted: Crossmatch,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int,
-    progress: Progress,
-) -> tuple[SourceFacts, tuple[str, ...], pa.Table]:
-    """Read a catalog and find the counterparts of stars in it.
+def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Table:
+    """Return the candidates for stars in a source, and add what was read to the draft.
 
-    Returns facts and notes of the catalog, and the candidates; the catalog itself does not stay,
-    as two of them need not fit into memory.
+    The catalog itself does not stay, as two of them need not fit into memory.
     """
-    stage = "motions" if role == "motions" else f"product {role}"
-    read, matches = read_and_match(name, stage, stars, wanted, inputs, workers, progress)
-    return source_facts(read, role), read.notes, matches
+    read, matches = read_and_match(name, by, stars, draft)
+    draft.sources.append(source_facts(read, by.title.removeprefix("product ")))
+    draft.note(by.name, *read.notes)
+    return matches
 
 
 def read_and_match(
-    name: str,
-    stage: str,
-    stars: pa.Table,
-    wanted: Crossmatch,
-    inputs: Mapping[str, Sequence[Path]],
-    workers: int,
-    progress: Progress,
+    name: str, by: Stage, stars: pa.Table, draft: Draft
 ) -> tuple[Ingested, pa.Table]:
-    """Return a catalog, read as far as it is matched, and the candidates for stars in it."""
+    """Return a source, read as far as the spec matches it, and the candidates for stars in it."""
+    wanted = draft.spec.products.crossmatch
     read = read_catalog(
         name,
-        locate(name, inputs),
+        draft.paths[name],
         read_limit_mag=wanted.read_limit_mag,
         neighbours=False,
-        workers=workers,
-        progress=progress,
+        workers=draft.workers,
+        progress=draft.progress,
     )
-    progress(stage, 0, None)
+    draft.progress(by.title, 0, None)
     return read, match_tables(stars, read.stars, wanted)[0]
 
 
@@ -212,12 +185,6 @@ def source_facts(read: Ingested, role: str) -> SourceFacts:
     rejected = read.rejected_by_reason
     counted = (read.rows_read, len(read.stars), rejected)
     return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
-
-
-def _in_order(tables: Sequence[pa.Table]) -> pa.Table:
-    """Return the rows of all catalogs as one product."""
-    order = product_schema("crossmatch").order
-    return sort_rows(pa.concat_tables(tables), order).combine_chunks()
 
 
 def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:

@@ -1,35 +1,36 @@
 """What a spec will give, without building it: guide stars, fields, files, time and memory.
 
-The stars are those of the build, chosen by the same functions from the same tables. What takes
-long is reading the catalogs; it depends on a few keys of the spec only, and its result can be kept.
+An estimate runs the stages of a build up to the guide stars. What takes long is reading; it depends
+on a few keys of the spec only (`reading_keys`), so the draft after it can be kept and `branch` for
+each spec. Stars that are too faint for a spec are only counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from starcat.arrays import Array, Mask
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
-from starcat.pipeline.build import Inputs
-from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
-from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
+from starcat.pipeline.cost import Cost, table_bytes
+from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.guide_stars import (
     MOST_FIELD_STARS,
-    check_fields,
+    check_cost,
     check_tiling,
-    depth_notes,
-    thinned_stars,
+    select,
+    thin,
+    tile,
 )
-from starcat.pipeline.motions import motions_of
-from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars
+from starcat.pipeline.recipes import field_size
+from starcat.pipeline.stages import READ
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
     CoverageSummary,
@@ -39,65 +40,119 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.levels import boresights_of_level, level_fields
+from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
-from starcat.specs.build_spec import BuildSpec, Selection
+from starcat.selection.rules.distrust import Observed
+from starcat.selection.rules.magnitude import TOO_FAINT
+from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
+from starcat.selection.ruleset import ALL_REASONS, Selection
+from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import floats_of, reject_rows, sort_rows
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 
-MOST_FOR_GAPS = 50_000
-"""Of more boresights than these the widest gap is not looked for."""
+SECONDS_PER_RECORD = 4.5e-6
+"""Time to read a record of a catalog and to place it."""
+
+SAMPLE_ROWS = 8192
+"""Rejected records whose size is measured."""
+
+MAX_FIELDS_FOR_GAPS = 50_000
+"""Of more fields than these the widest gap is not looked for."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The guide stars of a spec and their fields."""
+def read_draft(
+    spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
+) -> Draft:
+    """Read the sources of a spec as its build does, and keep what estimates need.
 
-    # guide stars, and of the others those that were bright enough to be looked at
-    selected: Selected
-    fields: FieldStars  # the tiling of the guide stars
-    rejected: Mapping[str, int]  # all records that are no guide stars, by reason
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that it takes."""
-        tables = (self.selected.guide_stars, self.selected.rejected)
-        steps = (step.directions for step in self.selected.steps)
-        return int(self.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
+    The draft has no rejected records but their number, and ``rejected_bytes`` of their file.
+    """
+    draft = run(Draft(spec, inputs, workers=workers, progress=progress, refusals=[]), READ)
+    draft.progress, draft.in_band = no_progress, None
+    draft.stars = draft.stars.combine_chunks()
+    row_bytes = _bytes_of_a_row(draft.rejected.slice(0, SAMPLE_ROWS))
+    draft.rejected_bytes = round(len(draft.rejected) * row_bytes)
+    draft.rejected = draft.rejected.schema.empty_table()
+    return draft
 
 
-def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
-    """Choose the guide stars of a spec, as its build does; a field may have too few of them."""
-    order, mag = read.by_brightness
-    bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
-    stars = read.stars.take(pa.array(bright)).combine_chunks()
-    most = spec.selection.max_stars_per_field
-    check_tiling(int(np.searchsorted(mag, spec.selection.faint_limit_mag, "right")), spec, most)
-    if len(stars) < MIN_GUIDE_STARS:
-        thinned_stars(read.stars, spec)  # says so, in the words of the build
-    selected = thinned_stars(stars, spec)
-    check_tiling(len(selected.guide_stars), spec, None)
-    _check_levels(len(selected.guide_stars), spec)
-    fields = tile_guide_stars(selected.guide_stars, spec)
-    blank = len(mag) - int(np.searchsorted(mag, np.inf))
-    found = dict.fromkeys((reason.name for reason in Reason), 0)
+def magnitude_range(stars: pa.Table) -> tuple[float, float] | None:
+    """Return the brightest and the faintest magnitude; None where no star has one."""
+    mag = floats_of(stars, "mag")
+    known = mag[mag < np.inf]
+    return (float(known.min()), float(known.max())) if len(known) else None
+
+
+def reading_keys(spec: BuildSpec) -> dict[str, Any]:
+    """Return all of a spec that reading its catalogs depends on."""
+    content = spec.model_dump(mode="json")
+    wanted = {
+        "catalog": content["catalog"],
+        "epoch_jyear": content["epoch_jyear"],
+        "join": content["selection"]["variables"]["join"],
+    }
+    if spec.selection.doubles.join:  # what it flags depends on what the sensor tells apart
+        wanted["doubles"] = content["selection"]["doubles"]
+    if spec.selection.observed != Observed():
+        wanted["observed"] = content["selection"]["observed"]
+    if spec.camera.response.name is not None:
+        wanted["response"] = content["camera"]["response"]
+    if spec.catalog.motions or spec.catalog.merged or spec.camera.response.photometry:
+        model = content["products"]["crossmatch"]
+        wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
+    return wanted
+
+
+def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
+    """Choose the guide stars of a spec, as its build does; a field may have too few of them.
+
+    The draft that is returned has none of the stars that were read but those that were chosen or
+    rejected: it can be kept without them.
+    """
+    draft, mag = read.branch(spec), floats_of(read.stars, "mag")
+    bright = np.flatnonzero(_is_bright(mag, spec.selection))
+    in_limit = int(np.count_nonzero(mag <= spec.selection.faint_limit_mag))
+    check_tiling(in_limit, spec, spec.selection.max_stars_per_field)
+    if len(bright) >= MIN_GUIDE_STARS:  # with fewer, select() names the reasons of all stars
+        draft.stars = read.stars.take(pa.array(bright)).combine_chunks()
+    run(draft, (select, thin))
+    check_tiling(len(draft.selected.guide_stars), spec, None)
+    _check_levels(len(draft.selected.guide_stars), spec)
+    run(draft, (tile,))
+    draft.stars, draft.motions = read.stars.schema.empty_table(), None
+    return draft
+
+
+def chosen_bytes(draft: Draft) -> int:
+    """Return the memory that the guide stars of a draft and their fields take."""
+    tables = (draft.selected.guide_stars, draft.selected.rejected)
+    steps = (step.directions for step in draft.selected.steps)
+    return int(draft.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
+
+
+def _is_bright(mag: Array, selection: Selection) -> Mask:
+    """Return which stars are bright enough to be looked at: no others are anybody's companion."""
+    if selection.neighbours.is_on:
+        return mag <= np.inf
+    companions = selection.doubles.companion_limit_mag
+    return mag <= max(selection.faint_limit_mag, -np.inf if companions is None else companions)
+
+
+def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
+    """Return how many records are no guide stars, by reason, in the order of the reasons."""
+    mag = floats_of(read.stars, "mag")
+    blank = int(np.count_nonzero(~(mag < np.inf)))
+    bright = int(np.count_nonzero(_is_bright(mag, chosen.spec.selection)))
+    found = dict.fromkeys(ALL_REASONS, 0)
     for counts in (
-        read.rejected,
-        count_by_reason(selected.rejected),
-        {Reason.no_magnitude.name: blank, Reason.too_faint.name: len(mag) - len(bright) - blank},
+        *(source.rejected for source in read.sources if source.role == "stars"),
+        count_by_reason(chosen.selected.rejected),
+        {NO_MAGNITUDE.name: blank, TOO_FAINT.name: len(mag) - bright - blank},
     ):
         for name, count in counts.items():
             found[name] += count
-    return Choice(selected, fields, {name: count for name, count in found.items() if count})
-
-
-def _faintest(selection: Selection) -> float:
-    """Return the magnitude beyond which a star is too faint, and nobody's companion."""
-    if selection.neighbours.is_on:
-        return np.inf
-    companions = selection.doubles.companion_limit_mag
-    return max(selection.faint_limit_mag, -np.inf if companions is None else companions)
+    return {name: count for name, count in found.items() if count}
 
 
 def _check_levels(stars: int, spec: BuildSpec) -> None:
@@ -115,7 +170,8 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
         raise BuildError(
             f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
             f"{found:,.0f} stars, limit {MOST_FIELD_STARS:,}; use a smaller boresights.count or "
-            "products.levels.stars_per_field, or a larger products.levels.max_ratio"
+            "products.levels.stars_per_field, or a larger products.levels.max_ratio",
+            key="boresights.count",
         )
 
 
@@ -134,7 +190,7 @@ class Estimate:
     full_share: float
     filters: tuple[tuple[str, int], ...]  # the stars that each filter leaves
     rejected: Mapping[str, int]  # all other records, by reason
-    refusals: tuple[str, ...]  # why the build will be refused; empty where it will not
+    refusals: tuple[BuildError, ...]  # why the build will be refused; empty where it will not
     warnings: tuple[str, ...]  # what is worth a second look
 
     @property
@@ -157,66 +213,47 @@ class Estimate:
 
 
 def estimate(
-    read: CatalogSnapshot, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
+    read: Draft, chosen: Draft, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
-    """Estimate what a spec will give."""
-    guide_stars, fields = choice.selected.guide_stars, choice.fields
-    cost = whole_cost(
-        guide_stars,
-        fields,
-        spec,
-        _rejected_bytes(read, choice, spec),
-        base_memory(read.held_bytes),
-        motions_of(read.stars, read.motions, guide_stars),
-    )
-    refusals = []
-    for check in (
-        partial(check_fields, fields, spec),
-        partial(check_memory, cost, spec, max_memory_bytes),
-    ):
-        try:
-            check()
-        except BuildError as error:
-            refusals.append(str(error))
-    count = fields.count
-    gap = _gap(spec)
-    summary = summarise_coverage(field_coverage(fields, spec.boresights.brightest))
+    """Estimate what a spec will give, from what was read and chosen for it."""
+    draft = chosen.branch(spec)
+    draft.stars, draft.motions = read.stars, read.motions
+    draft.rejected_bytes = _rejected_bytes(read, chosen)
+    draft.max_memory_bytes = max_memory_bytes
+    run(draft, (check_cost,))
+    # No key of reading: catalogs that were read with another exposure are the same.
+    draft.notes["apply_flight_terms"] = [*spec.exposure_notes, *spec.exposure_proposal]
+    fields, brightest = draft.fields, spec.boresights.brightest
+    summary = summarise_coverage(field_coverage(fields, brightest))
     return Estimate(
         spec,
-        cost,
-        read.seconds,
+        draft.cost,
+        SECONDS_PER_RECORD * read.records,
         fields,
         summary,
-        float((count >= MIN_GUIDE_STARS).mean()),
-        float((count >= spec.boresights.brightest).mean()),
-        tuple((step.name, len(step.directions)) for step in choice.selected.steps),
-        choice.rejected,
-        tuple(refusals),
-        (
-            *read.notes,
-            *spec.exposure_notes,
-            *spec.exposure_proposal,
-            *depth_notes(read.stars, spec),
-            *coverage_warnings(summary, gap),
-        ),
+        float((fields.count >= MIN_GUIDE_STARS).mean()),
+        float((fields.count >= brightest).mean()),
+        tuple((step.name, len(step.directions)) for step in draft.selected.steps),
+        count_rejected(read, chosen),
+        tuple(draft.refusals or ()),
+        (*draft.warnings, *coverage_warnings(summary, _gap(spec))),
     )
 
 
-def _rejected_bytes(read: CatalogSnapshot, choice: Choice, spec: BuildSpec) -> int:
+def _rejected_bytes(read: Draft, chosen: Draft) -> int:
     """Return the size of the file of rejected records, of which only some are at hand."""
-    seen, mag = choice.selected.rejected, floats_of(read.stars, "mag")
-    faint = np.flatnonzero(~(mag <= _faintest(spec.selection)))  # or of no magnitude
+    seen = chosen.selected.rejected
+    faint = np.flatnonzero(~_is_bright(floats_of(read.stars, "mag"), chosen.spec.selection))
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
-    some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
+    some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
     listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
-    size = table_bytes(listed, len(seen) + len(faint))
-    return size + read.rejected_bytes
+    return table_bytes(listed, len(seen) + len(faint)) + (read.rejected_bytes or 0)
 
 
 def _gap(spec: BuildSpec) -> TilingGap | None:
     """Return the widest gap of a tiling that is not too large to look for it."""
-    if spec.boresights.count > MOST_FOR_GAPS:
+    if spec.boresights.count > MAX_FIELDS_FOR_GAPS:
         return None
     size = field_size(spec)
     radius = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
@@ -231,6 +268,10 @@ def _widest_gap(boresights: int) -> TilingGap:
 def estimate_spec(
     spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> Estimate:
-    """Read the catalogs of a spec and estimate what it will give."""
-    read = read_snapshot(spec, inputs, workers, progress)
+    """Read the sources of a spec and estimate what it will give."""
+    read = read_draft(spec, inputs, workers, progress)
     return estimate(read, choose_stars(read, spec), spec)
+
+
+def _bytes_of_a_row(table: pa.Table) -> float:
+    return (table_bytes(table) - table_bytes(table.slice(0, 1))) / max(1, len(table) - 1)

@@ -1,25 +1,32 @@
-"""The guide stars of a build: selected, thinned to the tiling where asked, and counted.
+"""The stages that choose guide stars: selected, thinned to the tiling where asked, and counted.
 
 Selection knows nothing of fields; what a spec asks of a field is looked after here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
+from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.products.boresights import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.selection.rules.count import BEYOND_COUNT
+from starcat.selection.rules.density import DENSITY
+from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Reason
 
 MOST_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
@@ -34,28 +41,82 @@ POOL = 2.0
 """Times as many stars of a field as stay on average, the brightest, may stay by another rule."""
 
 
-def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars]:
-    """Select guide stars, thin them if the spec says so, and tile the sphere."""
-    selected = thinned_stars(stars, spec)
-    fields = tile_guide_stars(selected.guide_stars, spec)
-    check_fields(fields, spec)
-    return selected, fields
+def _select_plan(spec: BuildSpec) -> str:
+    limits = spec.selection
+    return f"select stars of {limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag"
 
 
-def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
-    """Select guide stars, and thin them if the spec says so."""
-    selected = select_guide_stars(stars, spec.selection, spec.camera.camera().pixel_arcsec)
-    check_guide_stars(selected, spec)
+@stage("select", "select", _select_plan)
+def select(draft: Draft) -> None:
+    """Select guide stars by the rules of the spec, which know nothing of fields."""
+    spec = draft.spec
+    pixel_arcsec = spec.camera.camera().pixel_arcsec
+    draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
+    check_guide_stars(draft.selected, spec)
+    draft.note(select.name, *depth_notes(draft.stars, spec))
+
+
+def _thin_plan(spec: BuildSpec) -> str | None:
+    thinning, most = spec.selection.thinning, spec.selection.max_stars_per_field
+    if thinning != "brightest":
+        return f"thin stars by {thinning}"
+    return None if most is None else f"keep the {most} brightest stars of every field"
+
+
+@stage("thin", "select", _thin_plan)
+def thin(draft: Draft) -> None:
+    """Keep the stars that fields need."""
+    spec, stars = draft.spec, draft.selected.guide_stars
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
-        reason = Reason.beyond_count if most is None else Reason.density
-        selected = reject_dense(selected, even_stars(selected.guide_stars, spec), reason)
+        reason = BEYOND_COUNT if most is None else DENSITY
+        draft.selected = reject_dense(draft.selected, even_stars(stars, spec), reason)
     elif most is not None:
-        selected = reject_dense(selected, brightest_of_fields(selected.guide_stars, spec, most))
-    else:
-        return selected
-    check_guide_stars(selected, spec)
-    return selected
+        draft.selected = reject_dense(draft.selected, brightest_of_fields(stars, spec, most))
+    check_guide_stars(draft.selected, spec)
+
+
+def _tile_plan(spec: BuildSpec) -> str:
+    return f"tile the sphere with {spec.boresights.count:,} fields, and find the stars of each"
+
+
+@stage("tile", "select", _tile_plan)
+def tile(draft: Draft) -> None:
+    """Tile the sphere, and find the guide stars of each field."""
+    draft.fields = tile_guide_stars(draft.selected.guide_stars, draft.spec)
+    with refusing(draft):
+        check_fields(draft.fields, draft.spec)
+
+
+@stage("cost", "select", lambda spec: "estimate files, memory and time; end where memory is short")
+def check_cost(draft: Draft) -> None:
+    """Estimate files, memory and time, and end a build that has not the memory."""
+    selected, size = draft.selected, draft.rejected_bytes
+    if size is None:
+        size = table_bytes(pa.concat_tables([draft.rejected, selected.rejected]))
+    draft.cost = whole_cost(
+        selected.guide_stars,
+        draft.fields,
+        draft.spec,
+        size,
+        base_memory(draft.catalog_bytes),
+        guide_star_motions(draft),
+    )
+    if draft.announce is not None:
+        draft.announce(draft.cost)
+    with refusing(draft):
+        check_memory(draft.cost, draft.spec, draft.max_memory_bytes)
+
+
+@contextmanager
+def refusing(draft: Draft) -> Iterator[None]:
+    """Keep why the spec cannot be built, where the draft is that of an estimate."""
+    try:
+        yield
+    except BuildError as error:
+        if draft.refusals is None:
+            raise
+        draft.refusals.append(error)
 
 
 def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
@@ -132,7 +193,8 @@ def check_tiling(
         raise BuildError(
             f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
-            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
+            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count",
+            key="selection.max_stars_per_field",
         )
 
 
@@ -147,7 +209,8 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
-            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}"
+            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}",
+            key="selection.faint_limit_mag",
         )
 
 
@@ -183,5 +246,6 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
     raise BuildError(
         f"{spec.name}: {len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
         f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}. A fainter "
-        "faint_limit_mag or a wider camera gives more stars a field"
+        "faint_limit_mag or a wider camera gives more stars a field",
+        key="boresights.min_stars_per_field",
     )

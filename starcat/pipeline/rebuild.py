@@ -13,7 +13,9 @@ from starcat.artifact.reader import Artifact, open_artifact
 from starcat.catalog.source import data_source, known_maps
 from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import ChecksumMismatch
-from starcat.pipeline.build import Inputs, build, check_inputs
+from starcat.pipeline.build import build
+from starcat.pipeline.draft import Inputs
+from starcat.pipeline.reading import check_inputs
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
 from starcat.store.wire import address_of

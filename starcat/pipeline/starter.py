@@ -11,24 +11,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pydantic import Field
 
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
 from starcat.pipeline.cost import Cost, base_memory, product_cost, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import brightest_of_fields, check_tiling
-from starcat.pipeline.recipes import RECIPES, ProductInputs, field_size, tile_guide_stars
-from starcat.products.boresights import tile_sphere
+from starcat.pipeline.recipes import field_size, product_inputs, tile_guide_stars
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
+from starcat.products.table import USUAL_PRODUCTS
+from starcat.products.tiling import tile_sphere
 from starcat.progress import Progress, no_progress
+from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_exposure import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import spec_toml
@@ -61,7 +63,10 @@ OVERLAP = 4
 """Times as many boresights as leave no hole, so that frames at any roll find their triangles."""
 
 MEMORY_BYTES, SECONDS = 1.6e9, 15.0
-"""A spec leaves out products, but never the triangles, of which the estimate is higher."""
+"""A spec leaves out products of which the estimate is higher."""
+
+NEVER_LEFT_OUT = "triangles"
+"""The product that a matcher looks up first."""
 
 MOST_LOOKED_AT = 60_000_000
 """Stars of all fields that are gone through at the most: they take some gigabytes."""
@@ -82,8 +87,8 @@ class LimitRow:
     """What a magnitude limit leaves in the fields of the tiling."""
 
     faint_limit_mag: float
-    guide_stars: int  # stars of the whole sky that pass the selection
-    stars: Spread  # how the stars are spread over the fields
+    guide_stars: Annotated[int, Field(description="Stars of the sky that pass the selection.")]
+    stars: Annotated[Spread, Field(description="How the stars are spread over the fields.")]
 
 
 @dataclass(frozen=True)
@@ -104,10 +109,9 @@ class Starter:
     @property
     def left_out(self) -> tuple[str, ...]:
         """Products that the camera could use, and that would cost too much."""
-        products = self.spec.products
-        if products.levels.enabled:
+        if self.spec.is_for_a_range:
             return ()
-        return tuple(name for name in RECIPES if not getattr(products, name).enabled)
+        return tuple(name for name in USUAL_PRODUCTS if name not in self.spec.products.wanted)
 
     @property
     def own(self) -> LimitRow:
@@ -216,7 +220,7 @@ def _spec(
 
 def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) -> dict[str, Any]:
     """Return what a spec has of its own where it serves a range of fields."""
-    others = {name: {"enabled": False} for name in RECIPES if name != "triangles"}
+    others = {name: {"enabled": False} for name in USUAL_PRODUCTS if name != NEVER_LEFT_OUT}
     levels = {"enabled": True, "widest_fov_x_deg": widest_fov_x_deg}
     return {
         "description": f"Guide stars for fields of {narrowest.fov_x_deg:.4g} to "
@@ -234,17 +238,16 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     guide_stars = selected.guide_stars
     fields = tile_guide_stars(guide_stars, spec)
     base = base_memory(sky.nbytes)
-    directions = directions_of(guide_stars)
-    cost = product_cost(ProductInputs(directions, fields, spec), base)
+    cost = product_cost(product_inputs(guide_stars, fields, spec), spec, base)
     while cost.memory_bytes > MEMORY_BYTES or cost.seconds > SECONDS:
-        others = [name for name in cost.rows if name != "triangles"]
+        others = [name for name in cost.rows if name in USUAL_PRODUCTS and name != NEVER_LEFT_OUT]
         if not others:
             break
         costly = max(others, key=lambda name: cost.bytes[name])
         content = spec.model_dump(mode="json")
         content["products"][costly]["enabled"] = False
         spec = BuildSpec.model_validate(content)
-        cost = product_cost(ProductInputs(directions, fields, spec), base)
+        cost = product_cost(product_inputs(guide_stars, fields, spec), spec, base)
     rejected = table_bytes(selected.rejected)
     cost = whole_cost(guide_stars, fields, spec, rejected, base)
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.products.boresights import FieldStars
+from starcat.products.tiling import FieldStars
 
 Counts = NDArray[np.int64]
 

@@ -1,247 +1,246 @@
-"""Counterparts: which entry of one catalog is which star of another, and how sure that is.
+"""The product ``crossmatch``: counterparts of the guide stars in other catalogs.
 
-Two sets of moving stars in; every pair of star and candidate counterpart within a radius out,
-with separation, magnitude difference, odds and a verdict in words. Separations are measured at
-one epoch of the pair: a star with proper motion is moved to its candidate's epoch, a candidate
-with proper motion to the epoch of a star without. Knows neither catalogs nor files.
+A star table becomes moving stars, matches (`starcat.products.match_stars`) become rows, and rows
+are checked against the stars that they belong to. The pipeline reads the catalogs
+(`starcat.pipeline.counterparts`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-import scipy
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from starcat.arrays import Array
-from starcat.geometry.sphere import chord_from_separation, separation
-from starcat.products.match_figures import (
-    Census,
-    Figures,
-    MatchModel,
-    MovingStars,
-    Pairs,
-    figures_of,
-    measure,
+from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
+from starcat.products.kind import Extent, ProductInputs, ProductKind, ProductSection, SpecFacts
+from starcat.products.match_figures import MovingStars
+from starcat.products.match_stars import VERDICTS, Matches
+from starcat.sections import CatalogName, Mag
+from starcat.stars.proper_motion import MAS, Motion, propagate_directions
+from starcat.stars.star_table import floats_of
+from starcat.storage.schema import product_schema
+
+POSITION = 130
+
+NEEDED = (
+    *("star_id", "catalog", "designation", "ra_deg", "dec_deg", "epoch_jyear"),
+    *("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag", "band"),
 )
-from starcat.products.match_odds import Odds, match_odds, runs
+"""Columns of a star table that a cross-identification reads."""
 
-Rows = NDArray[np.int64]
+SEPARATION_TOLERANCE_ARCSEC = 1e-6
+"""Two ways to move a star a century differ by less (docs/algorithms.md, Positions)."""
 
-VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
-"""What a candidate is to its star, in words; the numbers of `Matches.verdict` are places here."""
-
-UNIQUE, BEST, AMBIGUOUS, TAKEN, DOUBTFUL, OTHER = range(len(VERDICTS))
-
-CHUNK = 1 << 17
-"""Number of stars that are searched at once, which bounds the memory for large catalogs."""
+PROBABILITY_TOLERANCE = 1e-9
+"""The probabilities of a star's candidates may add up to 1 and a few roundings."""
 
 
-@dataclass(frozen=True)
-class Matches:
-    """Every candidate of every star, by star and rank; arrays of shape (M,)."""
-
-    star: Rows  # of the first set
-    counterpart: Rows  # of the other set
-    rank: Rows  # of the candidate among those of its star; 1 is the likeliest
-    star_rank: Rows  # of the star among those of its candidate
-    n_candidates: Rows  # of the star, within the radius
-    n_stars: Rows  # that the candidate is one of
-    separation_rad: Array  # radians, at ``epoch_jyear``
-    # magnitude of the candidate minus that of the star; NaN where either is unknown
-    delta_mag: Array
-    epoch_jyear: Array  # Julian year at which the two were compared
-    odds: Odds  # how likely each pair is, and the model behind it
-    verdict: Rows  # index into `VERDICTS`
-
-    def count(self, verdict: str) -> int:
-        """Return how many stars have a best candidate with a verdict."""
-        return int(((self.rank == 1) & (self.verdict == VERDICTS.index(verdict))).sum())
-
-    def take(self, order: Rows) -> Matches:
-        """Return some of the matches."""
-        arrays = {name: value[order] for name, value in vars(self).items() if name != "odds"}
-        return Matches(**arrays, odds=self.odds.take(order))
-
-
-def crossmatch(
-    stars: MovingStars, counterparts: MovingStars, radius_rad: float, model: MatchModel
-) -> Matches:
-    """Find the counterparts of stars in another catalog, in order of (star, rank).
-
-    The radius is the largest separation of a candidate at the epoch of the comparison, itself
-    included. Of two candidates with the same odds the nearer one, then the one with the lower
-    row, comes first.
-
-    Sutherland and Saunders 1992, MNRAS 259, 413, section 2: likelihood ratio and reliability.
-    """
-    if not radius_rad > 0.0:
-        raise ValueError(f"radius_rad is {radius_rad}; expected a positive angle")
-    pairs = candidate_pairs(stars, counterparts, radius_rad)
-    measured = measure(stars, counterparts, pairs)
-    figures = figures_of(Census.of(stars), Census.of(counterparts), measured, radius_rad, model)
-    return judged(stars, counterparts, pairs, radius_rad, figures, model)
-
-
-def judged(
-    stars: MovingStars,
-    counterparts: MovingStars,
-    pairs: Pairs,
-    radius_rad: float,
-    figures: Figures,
-    model: MatchModel,
-) -> Matches:
-    """Give every pair its odds, ranks and verdict, in order of (star, rank).
-
-    The figures are those of the whole catalogs. Where stars and counterparts are parts of them,
-    only pairs whose star and candidate have all their other pairs here are judged rightly, and
-    their probabilities are right where that is so of their whole cluster.
-    """
-    odds = match_odds(stars, counterparts, pairs, radius_rad, figures, model)
-    i, j = pairs.star, pairs.counterpart
-    star_rank, n_stars = _rank(j, odds.log_ratio, pairs.separation_rad, i)
-    rank, n_candidates = _rank(i, odds.log_ratio, pairs.separation_rad, j)
-    verdict = _verdicts(i, j, rank, star_rank, odds, model)
-    order = np.lexsort((rank, i))
-    found = Matches(
-        i,
-        j,
-        rank,
-        star_rank,
-        n_candidates,
-        n_stars,
-        pairs.separation_rad,
-        counterparts.mag[j] - stars.mag[i],
-        pairs.epoch_jyear,
-        odds,
-        verdict,
+def moving_stars(table: pa.Table) -> MovingStars:
+    """Return the stars of a table as moving stars."""
+    ra_deg, dec_deg = floats_of(table, "ra_deg"), floats_of(table, "dec_deg")
+    pm_ra, pm_dec = floats_of(table, "pm_ra_cosdec_mas_yr"), floats_of(table, "pm_dec_mas_yr")
+    known = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
+    east, north = tangent_axes(ra_deg, dec_deg)
+    east *= np.where(known, pm_ra * MAS, 0.0)[:, None]
+    north *= np.where(known, pm_dec * MAS, 0.0)[:, None]
+    east += north
+    return MovingStars(
+        directions_from_radec(ra_deg, dec_deg),
+        east,
+        known,
+        floats_of(table, "epoch_jyear"),
+        floats_of(table, "mag"),
     )
-    return found.take(order)
 
 
-def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: float) -> Pairs:
-    """Find every pair within a radius at the epoch that the two are compared at.
-
-    In order of (star, counterpart); the radius is included.
-
-    Both are first compared at one epoch in the middle, where each query's radius is wider by
-    what its proper motion can add up to the farthest epoch on the other side: Barnard's star
-    needs 10 arcsec a year of it, most stars next to nothing.
-    """
-    moving = np.flatnonzero(stars.has_motion)
-    still = np.flatnonzero(~stars.has_motion)
-    everyone = np.arange(len(counterparts.mag))
-    none, nothing = np.empty(0, np.int64), np.empty(0)
-    parts = [Pairs(none, none, nothing, nothing, nothing)]
-    if len(moving) and len(everyone):
-        middle, reach = _middle(counterparts.epoch_jyear)
-        drift = _speed(stars, moving) * reach
-        query = stars.at(moving, middle)
-        for near, found in _near(query, radius_rad + drift, counterparts.directions):
-            parts.append(_trim(stars, counterparts, moving[near], found, radius_rad))
-    if len(still) and len(everyone):
-        # These candidates move and these stars do not: each candidate looks for stars as far
-        # as its own motion may have taken it.
-        middle, reach = _middle(stars.epoch_jyear[still])
-        drift = _speed(counterparts, everyone) * reach
-        query = counterparts.at(everyone, middle)
-        for near, found in _near(query, radius_rad + drift, stars.directions[still]):
-            parts.append(_trim(stars, counterparts, still[found], near, radius_rad))
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    joined = Pairs(*map(np.concatenate, columns))
-    return joined.take(np.lexsort((joined.counterpart, joined.star)))
+def table_from_matches(found: Matches, counterparts: pa.Table) -> pa.Table:
+    """Return matches as rows of the crossmatch product."""
+    other = counterparts.select(NEEDED).take(pa.array(found.counterpart)).combine_chunks()
+    columns = {
+        **{name: other[name] for name in NEEDED if name != "star_id"},
+        "star": found.star,
+        "rank": found.rank,
+        "counterpart_id": other["star_id"],
+        "compared_jyear": found.epoch_jyear,
+        "separation_arcsec": np.degrees(found.separation_rad) * 3600.0,
+        "delta_mag": pa.array(found.delta_mag, mask=np.isnan(found.delta_mag)),
+        "position_error_arcsec": np.degrees(found.odds.error_rad) * 3600.0,
+        "n_candidates": found.n_candidates,
+        "n_stars": found.n_stars,
+        "star_rank": found.star_rank,
+        "log10_likelihood_ratio": found.odds.log_ratio / np.log(10.0),
+        "probability": found.odds.probability,
+        "verdict": pa.array(np.array(VERDICTS, dtype=object)[found.verdict], pa.string()),
+    }
+    schema = product_schema("crossmatch").arrow_schema
+    arrays = [_as_type(columns[field.name], field.type) for field in schema]
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _middle(epochs: Array) -> tuple[float, float]:
-    """Return the median epoch and the years from it to the farthest one."""
-    middle = float(np.median(epochs))
-    return middle, float(np.abs(epochs - middle).max())
+def _as_type(
+    values: pa.Array | pa.ChunkedArray | NDArray[np.generic], kind: pa.DataType
+) -> pa.Array | pa.ChunkedArray:
+    """Return values as a column; a number that does not fit raises."""
+    if not isinstance(values, pa.Array | pa.ChunkedArray):
+        values = pa.array(values)
+    return values if values.type == kind else values.cast(kind)
 
 
-def _speed(stars: MovingStars, rows: Rows) -> Array:
-    """Return the proper motions of stars, radians a year."""
-    velocity = stars.velocities[rows]
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", velocity, velocity)))
+def matched_stars(table: pa.Table) -> NDArray[np.intp]:
+    """Return the rows that name the counterpart of a star, be it ambiguous."""
+    named = pc.is_in(table["verdict"], pa.array(["unique", "best", "ambiguous"]))
+    return np.flatnonzero(named.to_numpy() & (table["rank"].to_numpy() == 1))
 
 
-def _near(query: Array, radii: Array, others: Array) -> Iterator[tuple[Rows, Rows]]:
-    """Yield rows of queries and of others that are near each other, in pieces.
-
-    A piece is searched with the largest of its radii, at most half as wide again as its least:
-    most radii are nearly the same, and the few wide ones do not slow down the others.
-    """
-    tree = scipy.spatial.cKDTree(others, leafsize=32, balanced_tree=False)
-    order = np.argsort(radii, kind="stable")
-    ascending = radii[order]
-    start = 0
-    while start < len(order):
-        alike = int(np.searchsorted(ascending, 1.5 * ascending[start], side="right"))
-        end = min(alike, start + CHUNK)
-        piece = order[start:end]
-        part = scipy.spatial.cKDTree(query[piece], leafsize=32, balanced_tree=False)
-        chord = _chord(float(ascending[end - 1]))
-        found = part.sparse_distance_matrix(tree, chord, output_type="ndarray")
-        yield piece[found["i"]], found["j"].astype(np.int64)
-        start = end
+def counterparts_of(table: pa.Table, catalog: str) -> int:
+    """Return how many stars have a counterpart in a catalog."""
+    return len(matched_stars(table.filter(pc.equal(table["catalog"], catalog))))
 
 
-def _chord(separation_rad: float) -> float:
-    """Return the radius of a search as a chord, a little wider than asked.
+class Crossmatch(ProductSection):
+    """Counterparts of the guide stars in other catalogs."""
 
-    The separations are compared with the radius afterwards.
-    """
-    return chord_from_separation(separation_rad) * (1.0 + 1e-9) + 1e-14
+    enabled: bool = Field(False, description="whether the database has this product")
+    catalogs: tuple[CatalogName, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        description="star catalogs to look for counterparts in",
+        examples=[["hipparcos"]],
+    )
+    radius_arcsec: float = Field(
+        10.0, ge=0.001, le=600.0, description="largest separation of a candidate"
+    )
+    position_error_arcsec: float | None = Field(
+        None,
+        ge=0.0001,
+        le=60.0,
+        description="standard deviation of the difference of two positions of a star, each axis; "
+        "default: measured",
+    )
+    unknown_motion_mas_yr: float = Field(
+        20.0,
+        ge=0.0,
+        le=10_000.0,
+        description="standard deviation of the motion of a pair in which neither has one",
+    )
+    outlier_share: float = Field(
+        0.02,
+        ge=0.0,
+        le=0.99,
+        description="share of the stars that are off by more than their stated errors",
+    )
+    expected_delta_mag: Mag | None = Field(
+        None, description="magnitude of the counterpart minus the star's; default: measured"
+    )
+    colour_spread_mag: float = Field(
+        1.0, ge=0.01, le=30.0, description="standard deviation of that difference"
+    )
+    completeness: float | None = Field(
+        None, ge=0.001, le=0.999, description="share of stars with a counterpart; default: measured"
+    )
+    ambiguous_odds: float = Field(
+        10.0, ge=1.0, le=1e6, description="candidates that differ by no more are ambiguous"
+    )
+    min_probability: float = Field(
+        0.5, ge=0.0, le=1.0, description="candidates that together have less are doubtful"
+    )
+    read_limit_mag: Mag | None = Field(
+        None, description="fainter counterparts are counted while reading, not listed"
+    )
+
+    @model_validator(mode="after")
+    def _catalogs_once_each(self) -> Crossmatch:
+        if self.enabled and not self.catalogs:
+            raise ValueError('no catalogs; name some, such as catalogs = ["hipparcos"]')
+        if len(set(self.catalogs)) != len(self.catalogs):
+            raise ValueError(f"a catalog is named twice: {', '.join(self.catalogs)}")
+        return self
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the catalogs that counterparts are looked for in."""
+        return self.catalogs if self.enabled else ()
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check that no catalog is that of the stars."""
+        if facts.catalog in self.catalogs:
+            raise ValueError(
+                f"products.crossmatch.catalogs: {facts.catalog} is the catalog of the stars "
+                "themselves; name others"
+            )
 
 
-def _trim(
-    stars: MovingStars, counterparts: MovingStars, i: Rows, j: Rows, radius_rad: float
-) -> Pairs:
-    """Return those of some pairs that are within the radius at their epoch."""
-    star_moves, other_moves = stars.has_motion[i], counterparts.has_motion[j]
-    epoch_i, epoch_j = stars.epoch_jyear[i], counterparts.epoch_jyear[j]
-    epoch = np.where(star_moves | ~other_moves, epoch_j, epoch_i)
-    angle = separation(stars.at(i, epoch), counterparts.at(j, epoch))
-    unmoved = np.where(star_moves | other_moves, 0.0, np.abs(epoch_j - epoch_i))
-    return Pairs(i, j, angle, epoch, unmoved).take(angle <= radius_rad)
+def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
+    """Yield where the crossmatch product contradicts itself or the stars."""
+    yield from _separation_problems(table, stars)
+    yield from _rank_problems(table)
+    unknown = set(pc.unique(table["verdict"]).to_pylist()) - set(VERDICTS)
+    if unknown:
+        yield f"verdict {', '.join(sorted(unknown))}; expected one of {', '.join(VERDICTS)}"
 
 
-def _rank(group: Rows, log_ratio: Array, angle: Array, other: Rows) -> tuple[Rows, Rows]:
-    """Return each pair's rank within its group, from 1, and the size of the group."""
-    order = np.lexsort((other, angle, -log_ratio, group))
-    first, size = runs(group[order])
-    rank, count = np.empty_like(group), np.empty_like(group)
-    rank[order] = np.arange(len(group)) - np.repeat(first, size) + 1
-    count[order] = np.repeat(size, size)
-    return rank, count
+def _separation_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
+    own = stars.take(table["star"].combine_chunks())
+    epoch = floats_of(table, "compared_jyear")
+    # By the catalog's own way of moving stars, not by that which made the product.
+    angle = separation(_moved_to(own, epoch), _moved_to(table, epoch))
+    off = np.abs(np.degrees(angle) * 3600.0 - floats_of(table, "separation_arcsec"))
+    for row in np.flatnonzero(~(off <= SEPARATION_TOLERANCE_ARCSEC))[:1]:
+        yield f"separation_arcsec of row {row} is not that of its star and its counterpart"
+    expected = floats_of(table, "mag") - floats_of(own, "mag")
+    delta = floats_of(table, "delta_mag")
+    same = (expected == delta) | (np.isnan(expected) & np.isnan(delta))
+    for row in np.flatnonzero(~same)[:1]:
+        yield f"delta_mag of row {row} is not that of its star and its counterpart"
 
 
-def _verdicts(i: Rows, j: Rows, rank: Rows, star_rank: Rows, odds: Odds, model: MatchModel) -> Rows:
-    """Return the verdict on each pair, as an index into `VERDICTS`."""
-    near = float(np.log(model.ambiguous_odds))
-    behind, lead = _gaps(i, rank, odds.log_ratio)
-    star_behind, star_lead = _gaps(j, star_rank, odds.log_ratio)
-    verdict = np.full(len(i), BEST)
-    alone = np.isinf(lead) & np.isinf(star_lead)
-    verdict[alone] = UNIQUE
-    verdict[(lead <= near) | (star_lead <= near) | (star_rank > 1)] = AMBIGUOUS
-    verdict[star_behind > near] = TAKEN
-    verdict[rank > 1] = np.where(behind[rank > 1] <= near, AMBIGUOUS, OTHER)
-    verdict[(odds.any_probability < model.min_probability) & (rank == 1)] = DOUBTFUL
-    verdict[(odds.any_probability < model.min_probability) & (rank > 1)] = OTHER
-    return verdict
+def _moved_to(table: pa.Table, epoch: Array) -> Array:
+    names = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+    motion = Motion(*(floats_of(table, name) for name in names))
+    return propagate_directions(motion, epoch - floats_of(table, "epoch_jyear"))[1]
 
 
-def _gaps(group: Rows, rank: Rows, log_ratio: Array) -> tuple[Array, Array]:
-    """Return how far each pair is behind the best of its group, and how far the best one leads.
+def _rank_problems(table: pa.Table) -> Iterator[str]:
+    """Yield where ranks and counts of a star's candidates do not fit its rows."""
+    star, catalog = table["star"].to_numpy(), table["catalog"].to_numpy()
+    begins = np.diff(star, prepend=-1) != 0
+    begins[1:] |= catalog[1:] != catalog[:-1]
+    first = np.flatnonzero(begins)
+    size = np.diff(np.append(first, len(star)))
+    ranks = np.arange(len(star)) - np.repeat(first, size) + 1
+    for row in np.flatnonzero(table["rank"].to_numpy() != ranks)[:1]:
+        yield f"rank of row {row} is not {ranks[row]}, its place among its star's candidates"
+    for row in np.flatnonzero(table["n_candidates"].to_numpy() != np.repeat(size, size))[:1]:
+        yield f"n_candidates of row {row} is not the number of its star's rows"
+    probability = table["probability"].to_numpy()
+    wrong = ~((probability >= 0.0) & (probability <= 1.0))
+    if len(first):
+        whole = np.repeat(np.add.reduceat(probability, first), size)
+        wrong |= ~(whole <= 1.0 + PROBABILITY_TOLERANCE)
+    for row in np.flatnonzero(wrong)[:1]:
+        yield f"probability of row {row}: the candidates of a star share at most 1"
 
-    The lead of a pair that is not the best, and of one that is alone, is infinite.
-    """
-    behind, lead = np.zeros(len(group)), np.full(len(group), np.inf)
-    order = np.lexsort((rank, group))
-    first, size = runs(group[order])
-    behind[order] = np.repeat(log_ratio[order[first]], size) - log_ratio[order]
-    several = first[size > 1]
-    lead[order[several]] = log_ratio[order[several]] - log_ratio[order[several + 1]]
-    return behind, lead
+
+def _count(inputs: ProductInputs, wanted: Crossmatch) -> Extent:
+    return Extent(float(len(inputs.directions) * len(wanted.catalogs)))
+
+
+def _file_bytes(extent: Extent, stars: int, wanted: Crossmatch) -> float:
+    return 75.0 * extent.rows
+
+
+KIND = ProductKind(
+    name="crossmatch",
+    section=Crossmatch,
+    in_database=False,
+    count=_count,
+    cost=None,
+    file_bytes=_file_bytes,
+    problems=counterpart_problems,
+    joined=(counterparts_of, "have a counterpart"),
+)

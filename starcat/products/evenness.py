@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.attitude import attitude_deviations, information_of_groups
-from starcat.products.boresights import FieldSize, FieldStars, reach_rad
+from starcat.products.tiling import FieldSize, FieldStars, reach_rad
 
 ARCSEC = float(np.degrees(1.0)) * 3600.0
 

@@ -79,3 +79,16 @@ def stable_order(labels: NDArray[np.integer[Any]], count: int) -> NDArray[np.int
         order = order[np.argsort(digits[order], kind="stable")]
         shift += 16
     return order
+
+
+def inverted_lists(
+    name: str, row: NDArray[np.int64], cell: NDArray[np.int64], rows: int, count: int
+) -> tuple[Ragged, dict[str, NDArray[Any]]]:
+    """Return the occupied cells (or rings) of each row, and the rows of each of ``count`` cells."""
+    row, cell = np.divmod(sorted_unique(row * count + cell), count)
+    order = stable_order(cell, count)
+    lookup: dict[str, NDArray[Any]] = {
+        f"{name}_offsets": row_offsets(cell[order], count),
+        f"{name}_rows": row[order].astype(np.int32),
+    }
+    return Ragged(row_offsets(row, rows), cell.astype(np.int32)), lookup

@@ -1,8 +1,9 @@
-"""Levels: stars and triangles for fields wider than the camera's, each level thinned by itself.
+"""The product ``levels``: stars and triangles for fields wider than the camera's.
 
 A frame shows its brightest stars best, and which these are depends on how wide it is. A database
 for fields of 5 to 30 deg therefore has one set of stars and triangles for each of some widths
-between the two: the wider the field, the brighter and the fewer the stars.
+between the two: the wider the field, the brighter and the fewer the stars. Each level is thinned
+from the one before.
 """
 
 from __future__ import annotations
@@ -13,11 +14,26 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from starcat.arrays import Array, Directions
-from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
+from starcat.products.counting import count_triangles
 from starcat.products.index import Index, Ragged
-from starcat.products.pairs_and_triangles import distinct_triangles
+from starcat.products.kind import (
+    STAR_ROW_IN_ORDER,
+    Extent,
+    ProductInputs,
+    ProductKind,
+    ProductSection,
+    RowCost,
+    SpecFacts,
+)
+from starcat.products.layouts import LAYOUTS
+from starcat.products.tiling import FieldSize, FieldStars, NominalField, tile_sphere
+from starcat.products.triangles import distinct_triangles
+from starcat.sections import FieldDeg
+
+POSITION = 110
 
 Rows = NDArray[np.int32]
 
@@ -25,8 +41,49 @@ Rows = NDArray[np.int32]
 FEWEST_BORESIGHTS = 1000
 
 
+class Levels(ProductSection):
+    """Stars and triangles for fields wider than the camera's: one database for a range of them."""
+
+    is_later = True
+
+    enabled: bool = Field(False, description="whether the database has this product")
+    widest_fov_x_deg: FieldDeg = Field(
+        30.0, description="largest field across the width; the range begins at the camera's own"
+    )
+    max_ratio: float = Field(
+        1.5, ge=1.1, le=2.0, description="largest ratio of the fields of neighbouring levels"
+    )
+    stars_per_field: int = Field(
+        20, ge=4, le=10_000, description="number of stars of each field of a level, the brightest"
+    )
+
+    def widest_field_deg(self, own_deg: float) -> float:
+        """Return the wide end of the range."""
+        return self.widest_fov_x_deg if self.enabled else own_deg
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check that the range begins at the camera's own field and its triangles."""
+        own_deg = facts.camera.fov_x_deg
+        if not self.enabled:
+            return
+        if "triangles" not in facts.enabled:
+            raise ValueError(
+                "products.levels: they begin where the product triangles ends; set "
+                "products.triangles.enabled = true"
+            )
+        if self.widest_fov_x_deg <= own_deg:
+            raise ValueError(
+                f"products.levels: widest_fov_x_deg {self.widest_fov_x_deg:g} is not above the "
+                f"camera's own field, {own_deg:.4g} deg; the camera is the narrow end of the range"
+            )
+
+    def fields(self, narrowest: FieldSize) -> tuple[NominalField, ...]:
+        """Return the fields of the levels, the narrowest first."""
+        return level_fields(narrowest, self.widest_fov_x_deg, self.max_ratio)
+
+
 @dataclass(frozen=True)
-class Levels:
+class LevelRows:
     """Stars and triangles of each level, the narrowest first."""
 
     level: Rows  # shape (L,): 1 to L; level 0 is the camera's own field
@@ -82,7 +139,7 @@ def find_levels(
     boresights: int,
     stars_per_field: int,
     brightest: int,
-) -> Levels:
+) -> LevelRows:
     """Find the stars and the triangles of each level.
 
     ``boresights`` tile the sphere for the camera's field, fewer for a level. A star is kept
@@ -95,7 +152,7 @@ def find_levels(
         triangles.append(level.before[found])
         stars.append(level.rows)
     i, j, k = (_ragged([found[:, n] for found in triangles]) for n in range(3))
-    return Levels(
+    return LevelRows(
         np.arange(1, len(fields) + 1, dtype=np.int32),
         np.array([field.fov_x_deg for field in fields]),
         np.array([field.fov_y_deg for field in fields]),
@@ -143,3 +200,44 @@ def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize)
 def _ragged(lists: Sequence[Rows]) -> Ragged:
     offsets = np.cumsum([0, *(len(one) for one in lists)]).astype(np.int64)
     return Ragged(offsets, np.concatenate([np.empty(0, dtype=np.int32), *lists]))
+
+
+def _make(inputs: ProductInputs, wanted: Levels) -> LevelRows:
+    return find_levels(
+        inputs.directions,
+        inputs.mag,
+        inputs.field_size,
+        wanted.fields(inputs.field_size),
+        boresights=inputs.boresights,
+        stars_per_field=wanted.stars_per_field,
+        brightest=inputs.brightest,
+    )
+
+
+def _count(inputs: ProductInputs, wanted: Levels) -> Extent:
+    fields = wanted.fields(inputs.field_size)
+    stars, triangles, records = 0.0, 0.0, 0.0
+    sizes = (inputs.field_size, fields, inputs.boresights, wanted.stars_per_field)
+    for level in thin_levels(inputs.directions, inputs.mag, *sizes):
+        each, distinct = count_triangles(level.tiled, len(level.before), inputs.brightest)
+        stars, triangles, records = stars + len(level.rows), triangles + distinct, records + each
+    lists = {"stars": stars, **dict.fromkeys(("i", "j", "k"), triangles)}
+    return Extent(float(len(fields)), lists, reached=triangles, records=records)
+
+
+def _file_bytes(extent: Extent, stars: int, wanted: Levels) -> float:
+    listed, triangles = extent.lists["stars"], extent.lists["i"]
+    # Triangles go by their stars, so that many of a star take less each.
+    each = 3.0 * float(max(1.0, triangles / max(1.0, listed)) ** -0.27)
+    return STAR_ROW_IN_ORDER * listed + each * triangles
+
+
+KIND = ProductKind(
+    name="levels",
+    make=_make,
+    section=Levels,
+    layout=LAYOUTS["levels"],
+    count=_count,
+    cost=RowCost(24.0, 60.0, 0.6),
+    file_bytes=_file_bytes,
+)

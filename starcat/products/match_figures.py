@@ -61,7 +61,7 @@ class MovingStars:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class CandidatePairs:
     """Stars and candidate counterparts within a radius; arrays of shape (M,)."""
 
     star: Rows  # of the first set
@@ -70,9 +70,9 @@ class Pairs:
     epoch_jyear: Array  # Julian year at which the two were compared
     unmoved_years: Array  # years between their positions where neither could be moved, else 0
 
-    def take(self, rows: Rows | Mask) -> Pairs:
+    def take(self, rows: Rows | Mask) -> CandidatePairs:
         """Return some of the pairs."""
-        return Pairs(*(column[rows] for column in vars(self).values()))
+        return CandidatePairs(*(column[rows] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def is_sure(star: Rows, counterpart: Rows) -> Mask:
     return np.asarray(alone & (np.bincount(counterpart)[counterpart] == 1))
 
 
-def measure(stars: MovingStars, counterparts: MovingStars, pairs: Pairs) -> Measured:
+def measure(stars: MovingStars, counterparts: MovingStars, pairs: CandidatePairs) -> Measured:
     """Return what the pairs of two whole catalogs say of them."""
     sure = is_sure(pairs.star, pairs.counterpart)
     angle = pairs.separation_rad[sure]

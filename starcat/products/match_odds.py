@@ -21,7 +21,13 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.products.match_figures import Figures, MatchModel, MovingStars, Pairs, tiles_of
+from starcat.products.match_figures import (
+    CandidatePairs,
+    Figures,
+    MatchModel,
+    MovingStars,
+    tiles_of,
+)
 
 Rows = NDArray[np.int64]
 
@@ -61,7 +67,7 @@ class Odds:
 def match_odds(
     stars: MovingStars,
     counterparts: MovingStars,
-    pairs: Pairs,
+    pairs: CandidatePairs,
     radius_rad: float,
     figures: Figures,
     model: MatchModel,

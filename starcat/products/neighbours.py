@@ -1,8 +1,7 @@
-"""Every star's neighbours: by separation, by planar distance, and by position angle.
+"""The product ``neighbours``: every star's neighbours by position angle.
 
-Separations do not change as the camera turns; planar distances over the smallest one depend not
-even on its focal length; the angle from one neighbour to the next, with the separation, is looked
-up in a table that leads to the rows that may be meant. A row is one neighbour of one star.
+The angle from one neighbour to the next, with the separation, is looked up in a table that leads
+to the rows that may be meant. A row is one neighbour of one star.
 """
 
 from __future__ import annotations
@@ -12,119 +11,62 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.patterns import bin_of
-from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
-from starcat.products.index import Index, row_offsets, stable_order
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.index import Index, row_offsets
+from starcat.products.kind import (
+    HALF_FIELD,
+    Extent,
+    ProductInputs,
+    ProductKind,
+    ProductSection,
+    RowCost,
+    SpecFacts,
+    neighbour_extent,
+    rows_by_star_bytes,
+)
+from starcat.products.layouts import LAYOUTS
+from starcat.sections import SmallDeg
 
-# Number of stars whose rows are sorted together, few enough for the processor's cache.
-STARS_AT_ONCE = 4096
+POSITION = 60
 
-
-@dataclass(frozen=True)
-class AngularReferenceSets:
-    """Every star's neighbours by separation; a row is one neighbour of one star."""
-
-    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
-    neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
-    # shape (M,): great-circle separations of the two, radians, ascending within a star
-    separation_rad: Array
-    index: Index  # dataset ``star_offsets``: the `row_offsets` of the stars; ``radius_rad``
-
-
-def angular_reference_sets(directions: Directions, radius_rad: float) -> AngularReferenceSets:
-    """Find the neighbours of every star within a radius, nearest first.
-
-    Sorted by (star, separation, neighbour); the radius is included.
-
-    Every pair of stars makes two rows, one from either end. Stars at the same place are
-    neighbours at separation 0. The star itself is not in its set.
-
-    Rotation-invariant feature with modified Hausdorff distance (S5), the feature of a star.
-
-    >>> found = angular_reference_sets(np.eye(3)[:2], 2.0)
-    >>> found.star, found.neighbour, found.separation_rad
-    (array([0, 1], dtype=int32), array([1, 0], dtype=int32), array([1.570..., 1.570...]))
-    """
-    pairs, angle = pairs_within(directions, radius_rad)
-    i, j = pairs.astype(np.int32).T
-    star, neighbour = np.concatenate([i, j]), np.concatenate([j, i])
-    both = np.concatenate([angle, angle])
-    order = stable_order(star, len(directions))
-    star, neighbour, both = star[order], neighbour[order], both[order]
-    offsets = row_offsets(star, len(directions))
-    for first in range(0, len(directions), STARS_AT_ONCE):
-        last = min(first + STARS_AT_ONCE, len(directions))
-        rows = slice(int(offsets[first]), int(offsets[last]))
-        nearest = _nearest_first(star[rows] - first, neighbour[rows], both[rows])
-        neighbour[rows], both[rows] = neighbour[rows][nearest], both[rows][nearest]
-    index = Index({"star_offsets": offsets}, {"radius_rad": radius_rad})
-    return AngularReferenceSets(star, neighbour, both, index)
+MAX_BINS = 10_000_000
+"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
 
 
-def _nearest_first(
-    star: NDArray[np.int32], neighbour: NDArray[np.int32], separation_rad: Array
-) -> NDArray[np.int64]:
-    """Return the order of (star, separation, neighbour); the stars ascend already."""
-    order = np.argsort(separation_rad)
-    order = order[stable_order(star[order], STARS_AT_ONCE)]
-    same = np.diff(separation_rad[order]) == 0.0
-    if bool(np.any(same & (np.diff(star[order]) == 0))):
-        order = np.lexsort((neighbour, separation_rad, star))
-    return order
+class Neighbours(ProductSection):
+    """Angles and separations of each star's neighbours, with a look-up table (S2)."""
 
-
-@dataclass(frozen=True)
-class PlanarReferenceSets:
-    """Every star's neighbours by planar distance; a row is one neighbour of one star."""
-
-    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
-    neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
-    # shape (M,): gnomonic distance over the star's smallest one, 1 or more, ascending within a star
-    ratio: Array
-    # datasets ``star_offsets`` as above, and ``smallest_distance``, float64, shape (N,): what was
-    # divided by, in units of the focal length, NaN for a star without rows; ``radius_rad``
-    index: Index
-
-
-def planar_reference_sets(directions: Directions, radius_rad: float) -> PlanarReferenceSets:
-    """Find the ratios of the gnomonic distances around every star.
-
-    Sorted by (star, ratio, neighbour); the radius is below pi / 2, where the tangent plane
-    ends.
-
-    On the plane that touches the sphere at the star, a neighbour lies at the tangent of its
-    separation. Stars at the same place have distance 0 and are left out: the method divides by
-    the smallest distance that is not 0. The star itself, the method's leading 0, has no row.
-
-    Wang et al. 2020 (S1), eqs. 6, 9 and 12.
-    """
-    if not radius_rad < 0.5 * np.pi:
-        raise ValueError(f"radius_rad is {radius_rad}; expected less than pi / 2")
-    sets = angular_reference_sets(directions, radius_rad)
-    apart = sets.separation_rad > 0.0
-    star, neighbour = sets.star[apart], sets.neighbour[apart]
-    distance = np.tan(sets.separation_rad[apart])
-    offsets = row_offsets(star, len(directions))
-    smallest = np.full(len(directions), np.nan)
-    # The nearest comes first.
-    smallest[np.diff(offsets) > 0] = distance[offsets[:-1][np.diff(offsets) > 0]]
-    ratio = distance / smallest[star]
-    # Ratios that differed may be equal after rounding, and equal ratios are in order of neighbour.
-    order = np.lexsort((neighbour, ratio, star))
-    index = Index(
-        {"star_offsets": offsets, "smallest_distance": smallest}, {"radius_rad": radius_rad}
+    radius_deg: SmallDeg | None = Field(
+        None, description=f"how far a neighbour may be; {HALF_FIELD}"
     )
-    return PlanarReferenceSets(star, neighbour[order], ratio[order], index)
+    angle_bin_deg: float = Field(
+        2.0, ge=0.1, le=360.0, description="width of the look-up table's bins in angle"
+    )
+    separation_bin_deg: SmallDeg = Field(
+        0.1, description="width of the look-up table's bins in separation"
+    )
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check that the look-up table is not too large for the field."""
+        radius_deg = self.radius_deg or facts.half_field_deg
+        bins = 360.0 / self.angle_bin_deg * radius_deg / self.separation_bin_deg
+        if bins > MAX_BINS:
+            raise ValueError(
+                f"products.neighbours: angle_bin_deg and separation_bin_deg make {bins:,.0f} bins; "
+                f"at most {MAX_BINS:,} fit. Make the bins wider or radius_deg smaller"
+            )
 
 
 _TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class NeighbourRows:
     """Every star's neighbours by position angle; a row is one neighbour of one star."""
 
     star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
@@ -144,7 +86,7 @@ class Neighbours:
 
 def find_neighbours(
     directions: Directions, radius_rad: float, *, angle_bin_rad: float, separation_bin_rad: float
-) -> Neighbours:
+) -> NeighbourRows:
     """Find the neighbours of every star within a radius, counter-clockwise.
 
     Sorted by (star, position angle, neighbour).
@@ -178,7 +120,7 @@ def find_neighbours(
         "lookup_rows": rows.astype(np.int32),
     }
     # The rows of one star have changed places, so that the column of stars is still the same.
-    return Neighbours(
+    return NeighbourRows(
         sets.star, sets.neighbour[order], angle, successive, separation_rad, Index(lookup, bins)
     )
 
@@ -221,3 +163,34 @@ def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
     first, last = offsets[:-1][some], offsets[1:][some] - 1
     step[last] = _TURN - (angle[last] - angle[first])
     return step
+
+
+def _make(inputs: ProductInputs, wanted: Neighbours) -> NeighbourRows:
+    return find_neighbours(
+        inputs.directions,
+        inputs.radius_rad(wanted.radius_deg),
+        angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
+        separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
+    )
+
+
+def _count(inputs: ProductInputs, wanted: Neighbours) -> Extent:
+    radius_deg = wanted.radius_deg or inputs.half_field_deg
+    rings = np.ceil(radius_deg / wanted.separation_bin_deg)
+    bins = float(np.ceil(360.0 / wanted.angle_bin_deg) * rings)
+    return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg), bins)
+
+
+def _file_bytes(extent: Extent, stars: int, wanted: Neighbours) -> float:
+    return rows_by_star_bytes(extent, stars, 22.1)  # with its angle and separations
+
+
+KIND = ProductKind(
+    name="neighbours",
+    make=_make,
+    section=Neighbours,
+    layout=LAYOUTS["neighbours"],
+    count=_count,
+    cost=RowCost(44.0, 50.0, 2.4),
+    file_bytes=_file_bytes,
+)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.attitude import information_terms
-from starcat.products.boresights import FieldStars
+from starcat.products.tiling import FieldStars
 
 BATCH = 0.1
 """Share of the stars, those with the smallest cells, of which a round drops some."""

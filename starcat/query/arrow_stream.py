@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.query.frames import MalformedMessage
+from starcat.workers.messages import malformed
 
 BATCH_ROWS = 1 << 16
 """Rows that DuckDB is asked to put into a batch."""
@@ -77,7 +77,7 @@ def schema_of(content: bytes | bytearray) -> pa.Schema:
         for field in schema:
             _check_type(field.type)
     except Exception as error:  # whatever wrong bytes lead to
-        raise _malformed(error) from error
+        raise malformed(error) from error
     return schema
 
 
@@ -94,15 +94,8 @@ def batches_of(content: bytes | bytearray, schema: pa.Schema) -> list[pa.RecordB
             for column in batch.columns:
                 _check_values(column, max(8 * len(content), 2 * BATCH_ROWS))
     except Exception as error:  # whatever wrong bytes lead to
-        raise _malformed(error) from error
+        raise malformed(error) from error
     return batches
-
-
-def _malformed(error: Exception) -> MalformedMessage:
-    return MalformedMessage(
-        f"the process of the query sent rows that cannot be read ({type(error).__name__}); ask "
-        "again"
-    )
 
 
 def _check_type(kind: pa.DataType) -> None:

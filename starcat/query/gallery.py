@@ -16,6 +16,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from starcat.errors import QueryError, suggest
 
@@ -46,10 +49,10 @@ class NamedQuery:
     """A query of the gallery."""
 
     name: str
-    help: str
-    targets: int  # how many it is about
+    help: Annotated[str, Field(description="Description.")]
+    targets: Annotated[int, Field(description="How many targets it is about.")]
     values: tuple[Value, ...]
-    text: str
+    text: Annotated[str, Field(description="SQL.")]
 
     def with_values(self, given: Mapping[str, str]) -> dict[str, Literal]:
         """Return the values of the query, given or by default."""
@@ -113,14 +116,11 @@ class Macro:
 
     name: str
     arguments: str
+    is_table: Annotated[bool, Field(description="Whether it is a table macro, used after FROM.")]
     help: str
-    example: str  # a query that shows it and runs on any database
-    text: str  # the SQL that makes it, with {places} where that schema has to be named
-
-    @property
-    def is_table(self) -> bool:
-        """Whether it is a table macro, used after FROM."""
-        return "AS TABLE" in self.text
+    example: Annotated[str, Field(description="A query that shows it and runs on any database.")]
+    # The SQL that makes it, with {places} where that schema has to be named.
+    text: Annotated[str, Field(exclude=True)]
 
     def statement(self, schema: str, places: str) -> str:
         """Return the SQL that makes a table macro."""
@@ -142,7 +142,7 @@ def _macro(name: str) -> Macro:
     found = re.search(rf"CREATE MACRO {name}\((.*?)\) AS", text, re.DOTALL)
     if found is None:
         raise ValueError(f"{name}.sql makes no macro of that name")
-    return Macro(name, found[1], told, example, text)
+    return Macro(name, found[1], "AS TABLE" in text, told, example, text)
 
 
 def _parts(path: Path) -> tuple[list[str], str]:

@@ -1,39 +1,22 @@
-"""What a session and the process that runs its queries say to each other.
+"""What a session and the process that runs its queries tell each other beside values and rows.
 
-A request is the name of a method of `starcat.query.worker.Worker` and its arguments. Each reply has
-one of the kinds below. `starcat.query.frames` makes bytes of both. The process is confined and the
-session is not, so the session trusts nothing that it reads.
+A request is the name of a method of `starcat.query.worker.QueryWorker`, a time and its arguments.
 """
 
 from __future__ import annotations
 
-import os
-import signal
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from starcat.query.frames import MalformedMessage
-
-REQUEST = "?"  # name of the method, seconds, arguments
-PROGRESS = "%"  # a percentage; more replies follow
-PART = "p"  # some rows; more replies follow
-DONE = "d"  # the answer, or what follows the rows, as JSON
-ARROW = "a"  # the answer, as an Arrow stream
-REFUSED = "r"  # a text: the query cannot be answered
-SHORT = "s"  # a text: memory or disk ran out
-LARGE = "l"  # a text: the answer is larger than the session takes
-BROKEN = "b"  # a text: DuckDB failed, and should answer nothing more
-INTERRUPT = signal.SIGUSR1 if os.name == "posix" else signal.SIGTERM  # end what is asked
-ENDINGS = {DONE, ARROW, REFUSED, SHORT, LARGE, BROKEN}
-HARMLESS = {DONE, ARROW, REFUSED, LARGE}  # the process can be asked again afterwards
+from starcat.errors import AnswerTooLarge
+from starcat.workers.messages import MalformedMessage
 
 
 @dataclass(frozen=True)
 class Opening:
     """What a process is told before it starts DuckDB."""
 
-    spill: Path  # folder for what does not fit into the memory; the only one it may write in
+    spill: str  # folder for what does not fit into the memory; the only one it may write in
     # Gigabytes that DuckDB may take of each.
     memory_gb: float
     disk_gb: float
@@ -66,3 +49,10 @@ class Statement:
             )
         except (TypeError, LookupError) as error:
             raise MalformedMessage("the process of the query sent no statement") from error
+
+
+def too_large(max_bytes: int) -> AnswerTooLarge:
+    """Return the error for an answer of more bytes than wanted."""
+    return AnswerTooLarge(
+        f"the answer has more than {max_bytes / 1e6:,.0f} MB; ask for fewer rows or columns"
+    )

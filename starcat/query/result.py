@@ -15,12 +15,14 @@ from decimal import Decimal
 from functools import cached_property, partial
 from html import escape
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from starcat.errors import ConfigError
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine
-from starcat.query.frames import MalformedMessage
+from starcat.workers.messages import MalformedMessage
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped, unused-ignore]
@@ -77,7 +79,7 @@ class ResultColumn:
     """A column of a query's result."""
 
     name: str
-    type: str  # as DuckDB calls it
+    type: Annotated[str, Field(description="As DuckDB calls it.", examples=["DOUBLE"])]
     unit: str
     description: str
 
@@ -98,8 +100,11 @@ class ResultTable:
     """The first rows that a query found."""
 
     columns: tuple[ResultColumn, ...]
-    rows: Sequence[Sequence[Any]]
-    is_cut: bool  # whether there are more rows
+    rows: Annotated[
+        Sequence[Sequence[Any]],
+        Field(description="In JSON, integers beyond 2^53 are text, NaN and infinities null."),
+    ]
+    is_cut: Annotated[bool, Field(description="Whether there are more rows.")]
 
     @classmethod
     def from_json(cls, found: Mapping[str, Any]) -> ResultTable:

@@ -20,7 +20,7 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.engine import MESSAGE_BYTES, Allowance, Engine, WorkerEnded
+from starcat.query.engine import MAX_MESSAGE_BYTES, Allowance, Engine, WorkerEnded
 from starcat.query.gallery import macros
 from starcat.query.messages import Statement
 from starcat.query.names import quoted, short_names
@@ -51,7 +51,7 @@ class Limits:
     time_s: float = 60.0  # seconds until it is stopped
     memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
     disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
-    message_bytes: int = MESSAGE_BYTES  # size of a row, and of what is sent at once
+    message_bytes: int = MAX_MESSAGE_BYTES  # size of a row, and of what is sent at once
     rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
 
 

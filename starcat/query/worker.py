@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import sys
 import threading
 import time
@@ -18,34 +17,18 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 
 from starcat.errors import QueryError
-from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.query.frames import (
-    decoded,
-    encoded_rows,
-    from_json,
-    json_content,
-    read_message,
-    write_message,
-)
-from starcat.query.messages import (
-    ARROW,
-    BROKEN,
-    DONE,
-    INTERRUPT,
-    LARGE,
-    PART,
-    PROGRESS,
-    REFUSED,
-    SHORT,
-    Opening,
-)
+from starcat.query.messages import Opening, too_large
 from starcat.query.names import quoted_name
 from starcat.query.statement import check_statement
+from starcat.query.values import decoded, encoded_rows
+from starcat.workers.channel import Channel
+from starcat.workers.confinement import forbid_writing, limit_memory, limit_time
+from starcat.workers.messages import ARROW, DONE, ERROR, PART, PROGRESS, error_content
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -64,68 +47,47 @@ _ODD = re.compile(rf"{_ZONED.pattern}|\bINTERVAL\b")
 
 def serve() -> None:
     """Answer requests until there are no more."""
-    # Ctrl-C reaches every process of a terminal; the one that asks decides what becomes of this.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if os.name == "posix":  # it is one thread that waits for it
-        signal.pthread_sigmask(signal.SIG_BLOCK, {INTERRUPT})
+    channel = Channel()
     sys.setrecursionlimit(NESTED_CALLS)
-    replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # Whatever a library prints goes where nobody reads it, unless the process dies.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    requests = sys.stdin.buffer
     try:
-        opening = from_json(read_message(requests)[1])
-        worker = Worker(Opening(**{**opening, "spill": Path(opening["spill"])}), replies)
+        worker = QueryWorker(Opening(**channel.receive()), channel)
         while True:
-            worker.answer(*from_json(read_message(requests)[1]))
+            worker.answer(*channel.receive())
     except (EOFError, BrokenPipeError):
         # The other end is closed. Threads of a query that still runs are not waited for.
         os._exit(0)
 
 
-class _TooLarge(Exception):  # noqa: N818 - the name reads as the fact
-    """An answer is larger than the session takes."""
-
-
-class Worker:
+class QueryWorker:
     """A DuckDB and what it is asked."""
 
-    def __init__(self, opening: Opening, replies: BinaryIO) -> None:
+    def __init__(self, opening: Opening, channel: Channel) -> None:
         self._opening = opening
-        self._replies = replies
-        self._sending = threading.Lock()
+        self._channel = channel
         self._is_running = False
         self._reader: pa.RecordBatchReader | None = None
         self._streams: Iterator[bytes] = iter(())  # what is left of a batch of the reader
         self._macros: frozenset[str] = frozenset()
         # Before DuckDB starts its threads.
-        forbid_writing(except_in=opening.spill)
+        forbid_writing(except_in=Path(opening.spill))
         self._connection = duckdb.connect(":memory:", config=_settings(opening))
         limit_memory(int(opening.memory_gb * 1e9) + BESIDE_BYTES)
         threading.Thread(target=self._watch, daemon=True).start()
-        if os.name == "posix":
-            threading.Thread(target=self._hear, daemon=True).start()
 
     def answer(self, name: str, time_s: float, arguments: list[Any]) -> None:
-        """Answer a request; the arguments are as `starcat.query.frames.encoded` writes them."""
+        """Answer a request; the arguments are as `starcat.query.values.encoded` writes them."""
         limit_time(max(1.0, time_s) * (os.cpu_count() or 1) + 1.0)
-        with self._sending:
-            self._is_running = True
+        self._is_running = True
         try:
             if name != "next_batch":
                 self._let_go()
             found = getattr(self, name)(*map(decoded, arguments))
-            kind, content = DONE, found
-            if isinstance(found, bytes):
-                kind = ARROW
-            else:
-                content = json_content(found)
+            kind = ARROW if isinstance(found, bytes) else DONE
         except Exception as error:
-            kind, words = _failure(error)
-            content = json_content([words, list(getattr(error, "fields", ()))])
-        with self._sending:
+            kind, found = ERROR, _failure(error)
+        with self._channel.sending:
             self._is_running = False
-            self._send(kind, content)
+            self._channel.send(kind, found)
 
     def footer(self, path: str) -> tuple[str, tuple[str, ...]]:
         """Return the schema's name, or nothing, and the columns that a Parquet file tells."""
@@ -193,9 +155,8 @@ class Worker:
             for content in self._contents(_in_utc(part, zoned) if zoned else part, types):
                 size += len(content)
                 if max_bytes is not None and size > max_bytes:
-                    raise _TooLarge
-                with self._sending:
-                    self._send(PART, content)
+                    raise too_large(max_bytes)
+                self._channel.send(PART, content, more=True)
         self._connection.abort()
         return columns
 
@@ -207,7 +168,7 @@ class Worker:
         if len(content) <= self._opening.message_bytes:
             yield content
         elif len(rows) == 1:
-            raise _TooLarge
+            raise too_large(self._opening.message_bytes)
         else:
             half = len(rows) // 2
             yield from self._contents(rows[:half], types)
@@ -235,7 +196,7 @@ class Worker:
                 for stream in self._streams:
                     return stream
         except RowTooLarge as error:
-            raise _TooLarge from error
+            raise too_large(self._opening.message_bytes) from error
         return None
 
     def _let_go(self) -> None:
@@ -245,28 +206,17 @@ class Worker:
             self._reader, self._streams = None, iter(())
         self._connection.abort()
 
-    def _send(self, kind: str, content: bytes) -> None:
-        write_message(self._replies, kind, content, more=kind == PART)
-
-    def _hear(self) -> None:
-        """Interrupt what runs when that is wanted."""
-        while True:
-            signal.sigwait({INTERRUPT})
-            with self._sending:
-                if self._is_running:
-                    self._connection.interrupt()
-
     def _watch(self) -> None:
         """Tell how far a query is; end this process when the one that asks is gone."""
         while True:
             time.sleep(WATCH_S)
             if os.name == "posix" and os.getppid() != self._opening.parent:
                 os._exit(1)
-            with self._sending:
+            with self._channel.sending:
                 percent = self._connection.query_progress() if self._is_running else -1.0
                 if percent >= 0.0:
                     try:
-                        self._send(PROGRESS, json_content(int(percent)))
+                        self._channel.send(PROGRESS, int(percent))
                     except OSError:  # the one that asks has gone since it was looked for
                         os._exit(1)
 
@@ -274,7 +224,7 @@ class Worker:
 def _settings(opening: Opening) -> dict[str, Any]:
     return {
         "memory_limit": f"{opening.memory_gb}GB",
-        "temp_directory": str(opening.spill),
+        "temp_directory": opening.spill,
         "max_temp_directory_size": f"{opening.disk_gb}GB",
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
@@ -320,18 +270,21 @@ def _in_utc(rows: list[tuple[Any, ...]], zoned: list[int]) -> list[tuple[Any, ..
     ]
 
 
-def _failure(error: Exception) -> tuple[str, str]:
+def _failure(error: Exception) -> dict[str, Any]:
+    """Return an error as a reply; after ``is_last`` the process should answer nothing more."""
     words = str(error).strip() or type(error).__name__
-    if isinstance(error, _TooLarge):
-        return LARGE, words
-    if isinstance(error, QueryError):
-        return REFUSED, words
+    line = words.splitlines()[0]
+    told, is_last = error, False
     if isinstance(error, (duckdb.OutOfMemoryException, MemoryError)) or words.startswith(
         ("Out of Memory", "std::bad_alloc", "malloc of size")
     ):
-        return SHORT, words
-    if isinstance(error, duckdb.PermissionException):
-        return REFUSED, f"refused: {words.splitlines()[0]}; a query reads the named targets only"
-    if isinstance(error, (duckdb.InternalException, duckdb.FatalException)):
-        return BROKEN, words.splitlines()[0]
-    return REFUSED, words if isinstance(error, duckdb.Error) else f"{type(error).__name__}: {words}"
+        told, is_last = MemoryError(words), True
+    elif isinstance(error, duckdb.PermissionException):
+        told = QueryError(f"refused: {line}; a query reads the named targets only")
+    elif isinstance(error, (duckdb.InternalException, duckdb.FatalException)):
+        told, is_last = QueryError(f"DuckDB failed: {line}"), True
+    elif isinstance(error, duckdb.Error):
+        told = QueryError(words)
+    elif not isinstance(error, QueryError):
+        told = QueryError(f"{type(error).__name__}: {words}")
+    return {**error_content(told), "is_last": is_last}

@@ -16,7 +16,7 @@ from starcat.catalog.sensor_band import InBand
 from starcat.images.figure_file import own_style
 from starcat.report.page import figure, table
 from starcat.report.plots import STYLE, headline
-from starcat.specs.build_spec import Selection
+from starcat.selection.ruleset import Selection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

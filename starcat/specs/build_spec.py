@@ -6,11 +6,13 @@ spec travels in the manifest of the database. `starcat.specs.reading` reads one 
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
+from starcat.products.kind import SpecFacts
+from starcat.products.table import Products
 from starcat.sections import (
     NAME_PATTERN,
     SOURCE_NAME,
@@ -20,6 +22,7 @@ from starcat.sections import (
     Mag,
     Section,
 )
+from starcat.selection.ruleset import Selection, check_rules
 from starcat.specs.camera_exposure import (
     CameraExposure,
     contradiction,
@@ -28,17 +31,7 @@ from starcat.specs.camera_exposure import (
     with_limits,
 )
 from starcat.specs.camera_response import CameraResponse
-from starcat.specs.doubtful_stars import Doubles, Variables
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
-from starcat.specs.neighbour_rule import NeighbourRule
-from starcat.specs.product_sections import Products
-
-MOST_BINS = 10_000_000
-"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
-
-
-SHA256_PATTERN = r"^[0-9a-f]{64}$"
-Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
 
 
 class Catalog(Section):
@@ -92,136 +85,6 @@ class Catalog(Section):
             )
         if len(set(self.motions)) != len(self.motions):
             raise ValueError(f"motions: a catalog is named twice: {', '.join(self.motions)}")
-        return self
-
-
-class Observed(Section):
-    """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
-
-    is_later = True
-
-    zero_point_mag: float | None = Field(
-        None,
-        ge=-100.0,
-        le=100.0,
-        description="measured magnitude of a star of colour 0 minus the catalog's; told, not "
-        "applied",
-        examples=[0.2],
-    )
-    colour_term: float = Field(
-        0.0,
-        ge=-5.0,
-        le=5.0,
-        description="mag becomes mag + colour_term x (colour_mag - reference_colour_mag)",
-    )
-    colour_bands: str | None = Field(
-        None, max_length=40, description="the colour that the term is for", examples=["BP-RP"]
-    )
-    reference_colour_mag: float = Field(
-        0.0,
-        ge=-20.0,
-        le=20.0,
-        description="stars of this colour keep their mag, as do those of unknown colour",
-    )
-    reject: tuple[int, ...] = Field(
-        (),
-        strict=False,  # a list in TOML
-        max_length=4000,
-        description="star_id of the stars to distrust, which are rejected",
-        examples=[[3, 17]],
-    )
-    frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
-    database: str | None = Field(
-        None,
-        max_length=200,
-        description="database that they were identified with",
-        examples=["mycam-1.0.0"],
-    )
-    manifest_sha256: str | None = Field(
-        None, pattern=SHA256_PATTERN, description="digest of its manifest", examples=["0" * 64]
-    )
-    results_sha256: tuple[Sha256, ...] = Field(
-        (),
-        strict=False,
-        max_length=1000,
-        description="digests of the files of identified frames",
-        examples=[["0" * 64]],
-    )
-
-
-class Selection(Section):
-    """Which stars become guide stars."""
-
-    later_keys = ("max_drift_arcsec", "thinning")
-
-    bright_limit_mag: Mag = Field(-30.0, description="brighter stars are rejected")
-    faint_limit_mag: Mag = Field(
-        description="fainter stars are rejected; the limit itself is kept", examples=[6.0]
-    )
-    max_stars: int | None = Field(
-        None,
-        ge=1,
-        le=2_000_000_000,
-        description="number of stars that are kept, by default the brightest",
-    )
-    max_stars_per_field: int | None = Field(
-        None,
-        ge=1,
-        le=10_000,
-        description="thins to an even density: keeps the stars that are among this many brightest "
-        "of any field of the tiling",
-    )
-    max_drift_arcsec: float | None = Field(
-        None,
-        gt=0.0,
-        le=36_000.0,
-        description="stars that are further from their place at the ends of the span of "
-        "epoch_jyear are rejected; default: none",
-    )
-    thinning: Literal["brightest", "voronoi", "information"] = Field(
-        "brightest",
-        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
-        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
-        "large for their brightness; or those that the attitude of the worst fields needs most",
-    )
-    doubles: Doubles = Doubles()
-    neighbours: NeighbourRule = NeighbourRule()
-    variables: Variables = Variables()
-    observed: Observed = Observed()
-
-    @model_validator(mode="after")
-    def _limits_in_order(self) -> Selection:
-        if self.bright_limit_mag >= self.faint_limit_mag:
-            raise ValueError(
-                f"bright_limit_mag {self.bright_limit_mag} is not below faint_limit_mag "
-                f"{self.faint_limit_mag}: larger is fainter, so they may be swapped"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _something_to_thin(self) -> Selection:
-        if self.thinning != "brightest" and self.max_stars is None is self.max_stars_per_field:
-            raise ValueError(
-                f"thinning is {self.thinning}, but nothing says how many stars stay; give "
-                "max_stars or max_stars_per_field"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _one_rule_of_close_stars(self) -> Selection:
-        doubles = self.doubles
-        if self.neighbours.is_on and doubles.action == "merge":
-            raise ValueError(
-                'doubles.action = "merge" and [selection.neighbours] both say what becomes of '
-                'close stars; leave it out, and set neighbours.action = "merge" to merge them as '
-                "the sensor does"
-            )
-        if self.neighbours.is_on and doubles.companion_limit_mag is not None:
-            raise ValueError(
-                f"doubles.companion_limit_mag {doubles.companion_limit_mag:g} is of the separation "
-                "rule, which [selection.neighbours] replaces: it counts all stars that were read. "
-                "Leave it out, or set catalog.read_limit_mag"
-            )
         return self
 
 
@@ -355,21 +218,8 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
-    def _drift_needs_a_span(self) -> BuildSpec:
-        if self.selection.max_drift_arcsec is not None and not isinstance(self.epoch_jyear, tuple):
-            raise ValueError(
-                "selection.max_drift_arcsec: epoch_jyear is one year, in which no star drifts; "
-                "give a span, such as epoch_jyear = [2027.0, 2042.0]"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _counterparts_in_other_catalogs(self) -> BuildSpec:
-        if self.catalog.source in self.products.crossmatch.catalogs:
-            raise ValueError(
-                f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
-                "themselves; name others"
-            )
+    def _rules_of_selection_agree(self) -> BuildSpec:
+        check_rules(self)
         return self
 
     @model_validator(mode="after")
@@ -393,32 +243,15 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
-    def _levels_are_wider(self) -> BuildSpec:
-        wanted, own_deg = self.products.levels, self.camera.camera().fov_x_deg
-        if not wanted.enabled:
-            return self
-        if not self.products.triangles.enabled:
-            raise ValueError(
-                "products.levels: they begin where the product triangles ends; set "
-                "products.triangles.enabled = true"
-            )
-        if wanted.widest_fov_x_deg <= own_deg:
-            raise ValueError(
-                f"products.levels: widest_fov_x_deg {wanted.widest_fov_x_deg:g} is not above the "
-                f"camera's own field, {own_deg:.4g} deg; the camera is the narrow end of the range"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _look_up_table_of_a_size(self) -> BuildSpec:
-        wanted = self.products.neighbours
-        radius_deg = wanted.radius_deg or self.camera.half_field_deg
-        bins = 360.0 / wanted.angle_bin_deg * radius_deg / wanted.separation_bin_deg
-        if bins > MOST_BINS:
-            raise ValueError(
-                f"products.neighbours: angle_bin_deg and separation_bin_deg make {bins:,.0f} bins; "
-                f"at most {MOST_BINS:,} fit. Make the bins wider or radius_deg smaller"
-            )
+    def _products_agree(self) -> BuildSpec:
+        facts = SpecFacts(
+            self.catalog.source,
+            self.camera.camera(),
+            self.camera.half_field_deg,
+            tuple(self.products.wanted),
+        )
+        for section in self.products.sections.values():
+            section.check_agrees(facts)
         return self
 
     @property
@@ -450,16 +283,25 @@ class BuildSpec(Section):
     @property
     def fields_deg(self) -> tuple[float, float]:
         """Narrowest and widest horizontal field of view that the database is for."""
-        own_deg, levels = self.camera.camera().fov_x_deg, self.products.levels
-        return own_deg, levels.widest_fov_x_deg if levels.enabled else own_deg
+        own_deg = self.camera.camera().fov_x_deg
+        return own_deg, max(
+            each.widest_field_deg(own_deg) for each in self.products.sections.values()
+        )
+
+    @property
+    def is_for_a_range(self) -> bool:
+        """Whether the database serves fields of view that are wider than the camera's."""
+        narrowest, widest = self.fields_deg
+        return widest > narrowest
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
-        wanted = self.products.crossmatch
         names = [*self.catalog.catalogs, *self.catalog.motions, *self.joins]
         names += self.camera.response.photometry
-        return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
+        for section in self.products.sections.values():
+            names += section.sources
+        return tuple(dict.fromkeys(names))
 
     def __repr__(self) -> str:
         camera = self.camera.camera()

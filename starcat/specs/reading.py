@@ -152,6 +152,16 @@ def put_key(content: dict[str, Any], key: str, value: Any) -> None:
             del outer[table]
 
 
+def value_at(content: Mapping[str, Any], key: str) -> Any:
+    """Return the value of a dotted key, or None if the content lacks it."""
+    value: Any = content
+    for name in key.split("."):
+        if not isinstance(value, Mapping):
+            return None
+        value = value.get(name)
+    return value
+
+
 def _value(text: str) -> Any:
     try:
         return content_of_toml(f"value = {text}", "")["value"]

@@ -112,10 +112,12 @@ def _as_array(value: Values, kind: pa.DataType, count: int) -> pa.Array:
     return pa.array(array).cast(kind)
 
 
-def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
+def reject_rows(stars: pa.Table, reasons: pa.Array, details: pa.Array | None = None) -> pa.Table:
     """Return rows of a star table as rows of a rejected table, each with its reason."""
     schema = product_schema("rejected").arrow_schema
-    verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
+    if details is None:
+        details = pa.nulls(len(stars), pa.string())
+    verdict = {"reason": reasons, "detail": details}
     columns = [verdict[name] if name in verdict else stars[name] for name in schema.names]
     return pa.Table.from_arrays(columns, schema=schema)
 
@@ -125,7 +127,7 @@ def split_by_verdict(stars: pa.Table, verdicts: Verdicts) -> tuple[pa.Table, pa.
     is_kept = verdicts.is_kept
     if is_kept.all():
         return stars, product_schema("rejected").arrow_schema.empty_table()
-    rejected = reject_rows(_where(stars, ~is_kept), verdicts.reasons)
+    rejected = reject_rows(_where(stars, ~is_kept), verdicts.reasons, verdicts.details)
     return _where(stars, is_kept), rejected
 
 

@@ -1,12 +1,15 @@
 """Verdicts on records, kept or rejected with exactly one reason; and the bits of their quality.
 
-The reasons stand in the order in which they are tried; the first that applies is the verdict.
+`Reason` has the reasons for which the record of an archive cannot be used. The rules of selection
+have their own (`starcat.selection.rules`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum, IntFlag
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +19,10 @@ from starcat.arrays import Mask
 
 
 class Reason(Enum):
-    """Why a record is not a guide star; the value of a member says it in words."""
+    """Why the record of an archive cannot be used; the value of a member says it in words.
+
+    They stand in the order in which they are tried; the first that applies is the verdict.
+    """
 
     malformed_record = "the record does not follow the archive's layout"
     beyond_read_limit = "fainter than read_limit_mag, or without magnitude: counted, not listed"
@@ -32,38 +38,35 @@ class Reason(Enum):
     minor_planet = "the archive flags a minor planet"
     extended = "the archive flags an extended or non-stellar source"
     artifact = "the archive doubts that there is a star"
-    no_magnitude = "no magnitude in the band of the build"
     uncertain_magnitude = "the magnitude may be wrong by more than 0.3 mag"
-    too_bright = "brighter than bright_limit_mag"
-    too_faint = "fainter than faint_limit_mag"
-    double = "a companion within min_separation_deg"
-    blended = (
-        "neighbours move its centroid or add to its light more than [selection.neighbours] allows"
-    )
-    merged = "merged into the brighter star of a close group"
-    flagged_double = "the archive flags an unresolved double"
-    variable = "amplitude above max_amplitude_mag"
-    flagged_variable = "flagged variable, amplitude unknown"
-    drifts = "further from its place at an end of the span than max_drift_arcsec"
-    distrusted = "distrusted by what flew: [selection.observed] lists it"
-    beyond_count = "thinned to max_stars: fainter, or as selection.thinning says"
-    density = (
-        "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says"
-    )
 
 
-_CODES = {reason: code for code, reason in enumerate(Reason, start=1)}
+class NamedReason(Protocol):
+    """A reason of an archive or of a rule."""
+
+    @property
+    def name(self) -> str:
+        """What the product ``rejected`` calls it."""
 
 
 class Verdicts:
     """The verdicts on a number of records: kept until rejected, then final."""
 
     def __init__(self, count: int) -> None:
-        self._code = np.zeros(count, dtype=np.int8)
+        self._code = np.zeros(count, dtype=np.int16)  # 0: kept; n: the verdict n - 1
+        self._verdicts: list[tuple[str, str | None]] = []  # name of the reason, and the detail
 
-    def reject(self, where: Mask, reason: Reason) -> None:
+    def reject(self, where: Mask, reason: NamedReason, detail: str | None = None) -> None:
         """Reject records that no earlier reason applied to."""
-        self._code[where & (self._code == 0)] = _CODES[reason]
+        verdict = (reason.name, detail)
+        if verdict not in self._verdicts:
+            self._verdicts.append(verdict)
+        self._code[where & (self._code == 0)] = self._verdicts.index(verdict) + 1
+
+    def has(self, reason: NamedReason) -> Mask:
+        """Return which records are rejected for a reason."""
+        codes = [n for n, (name, _) in enumerate(self._verdicts, start=1) if name == reason.name]
+        return np.isin(self._code, codes)
 
     @property
     def is_kept(self) -> Mask:
@@ -73,9 +76,16 @@ class Verdicts:
     @property
     def reasons(self) -> pa.Array:
         """Names of the reasons of the rejected records, in order."""
+        return self._of_rejected([name for name, _ in self._verdicts])
+
+    @property
+    def details(self) -> pa.Array:
+        """Details of the verdicts on the rejected records, in order; null where there is none."""
+        return self._of_rejected([detail for _, detail in self._verdicts])
+
+    def _of_rejected(self, texts: Sequence[str | None]) -> pa.Array:
         # Made here: the first array of a list imports pandas, where that is installed.
-        names = pa.array(["kept", *(reason.name for reason in Reason)])
-        return names.take(pa.array(self._code[self._code != 0]))
+        return pa.array(texts, pa.string()).take(pa.array(self._code[self._code != 0] - 1))
 
 
 class Quality(IntFlag):

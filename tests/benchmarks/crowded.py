@@ -19,7 +19,8 @@ import numpy as np
 from rows import Options, Rows, database, ended
 
 from starcat.matcher.c_engine import is_compiled
-from starcat.matcher.matcher import Engine, Matcher
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.settings import Engine
 from starcat.simulation.simulate import Noise, simulate_frames
 
 COUNTS = (512, 2_000, 10_000, 50_000)

@@ -21,6 +21,7 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.source import give_map
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.build import build
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 
@@ -83,7 +84,8 @@ def spec_of(merged: tuple[str, ...], faint: float, asked: object) -> dict[str, o
         "boresights": {"count": count},
         "products": {
             name: {"enabled": False}
-            for name in ("neighbours", "hausdorff_angular", "hausdorff_l2", "grid", "radial")
+            for name in USUAL_PRODUCTS
+            if name not in ("pairs", "triangles")
         },
         "self_test": {"frames": frames, "min_identified": 0.0},
     }

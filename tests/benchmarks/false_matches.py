@@ -43,6 +43,7 @@ from starcat.images.figure_file import own_style, write_figure
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
 from starcat.pipeline.build import build
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.report.plots import STYLE, headline
 from starcat.simulation.selftest import wilson_interval
 from starcat.specs.reading import preset, spec_from_dict
@@ -54,12 +55,7 @@ DENSE = {
     "catalog": {"source": "gaia", "band": "G"},
     "selection": {"faint_limit_mag": 7.5, "doubles": {"min_separation_deg": 0.01}},
     "camera": {"width_px": 1024, "height_px": 1024, "fov_x_deg": 24.0},
-    "products": {
-        name: {"enabled": False}
-        for name in (
-            "pairs", "neighbours", "hausdorff_angular", "hausdorff_l2", "grid", "radial"
-        )
-    },
+    "products": {name: {"enabled": False} for name in USUAL_PRODUCTS if name != "triangles"},
     "self_test": {"frames": 1, "noise_px": 0.05},
 }  # fmt: skip
 """A field as dense as TESS's. With its 36,000 stars a field has up to 560,000 pairs, which no

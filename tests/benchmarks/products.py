@@ -23,11 +23,11 @@ from rows import Options, Rows, ended, fresh
 from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
-from starcat.pipeline.recipes import RECIPES, ProductInputs, make_product, tile_guide_stars
+from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
+from starcat.products.table import USUAL_PRODUCTS
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
-from starcat.stars.star_table import directions_of
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
 
@@ -42,10 +42,10 @@ def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    sky = ProductInputs(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    sky = product_inputs(stars, tile_guide_stars(stars, spec), spec)
     found = {"tiling": {"seconds": time.perf_counter() - start, "rows": float(len(stars))}}
     with tempfile.TemporaryDirectory() as folder:
-        for name in RECIPES:
+        for name in USUAL_PRODUCTS:
             start = time.perf_counter()
             product = make_product(name, sky)
             seconds = time.perf_counter() - start
@@ -118,7 +118,7 @@ def main(rows: Rows) -> None:
             print(f", peak {memory['peak_mib']:.0f} MiB")
             print_products(found)
     print("\nNanoseconds a row, smallest and largest of all limits")
-    for name in RECIPES if growth else ():
+    for name in USUAL_PRODUCTS if growth else ():
         each = [g[name]["seconds"] / max(1.0, g[name]["rows"]) * 1e9 for g in growth.values()]
         print(f"  {name:<18}{min(each):>8.0f}{max(each):>8.0f}{max(each) / min(each):>7.2f} x")
 

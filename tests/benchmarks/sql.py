@@ -20,11 +20,10 @@ from rows import Options, Rows, ended, fresh
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
-from starcat.pipeline.recipes import ProductInputs, make_product, tile_guide_stars
+from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
 from starcat.query.session import Session, open_session
+from starcat.selection.selecting import select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
-from starcat.stars.star_table import directions_of
 from starcat.storage.parquet import write_parquet
 
 MOST_RATIO, MOST_START_S, MOST_CONE_MS = 1.2, 0.5, 60.0
@@ -70,7 +69,7 @@ def make_tables(folder: Path, limit_mag: float) -> tuple[Path, Path]:
     spec = spec_from_dict(content, "bench")
     read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear)
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
-    given = ProductInputs(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    given = product_inputs(stars, tile_guide_stars(stars, spec), spec)
     paths = folder / "stars.parquet", folder / "pairs.parquet"
     write_parquet(stars, paths[0])
     write_parquet(make_product("pairs", given).table, paths[1])

@@ -26,8 +26,9 @@ from rows import Options, Rows, database, ended
 from slew import is_near, slew, wrong_by
 
 from starcat.matcher.c_engine import is_compiled
-from starcat.matcher.matcher import Engine, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import Engine
 from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame, Noise
 

@@ -1,4 +1,4 @@
-"""Write the generated pages of docs/: commands, SQL, products and data sources. ``make docs``."""
+"""Write the generated pages of docs/: commands, stages, SQL, products, sources. ``make docs``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.table_map import UNITS, Flags, Remote, StarColumns, TableMap
 from starcat.cli.main import app
+from starcat.pipeline.stages import CHOOSE, FINISH, PRODUCTS, READ
 from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
-from starcat.stars.verdict import Reason
 from starcat.storage.schema import read_schema
 from starcat_lab.report.files import reproduction_page
 
@@ -63,7 +64,7 @@ def products_page() -> str:
         page.append("")
     page.append("## Reasons\n\nWhy a record is not a guide star, in the order in which they are")
     page.append("tried; the first that applies is the verdict.\n\n| reason | meaning |\n|---|---|")
-    page += [f"| {reason.name} | {reason.value} |" for reason in Reason]
+    page += [f"| {name} | {words} |" for name, words in ALL_REASONS.items()]
     return "\n".join(page) + "\n"
 
 
@@ -187,8 +188,37 @@ def _example(key: SpecKey) -> str:
     return "" if key.example is None else f"`{toml_value(key.example)}`"
 
 
+def stages_page() -> str:
+    """Return the list of the stages of a build, with what `--explain` says for a preset."""
+    page = [
+        NOTE + "# The stages of a build\n",
+        "A build runs these stages in this order; one that has nothing to do for the spec is",
+        "skipped. All work on one `Draft` (`starcat/pipeline/draft.py`). An estimate runs the",
+        "first two lists. `starcat build --explain SPEC` says what each will do for a spec, and",
+        "what it reads; it needs no input files.\n",
+    ]
+    for title, stages in (
+        ("Read", READ), ("Choose", CHOOSE), ("Make products", PRODUCTS), ("Finish", FINISH)
+    ):  # fmt: skip
+        page.append(f"## {title}\n\n| stage | what it does | function |\n|---|---|---|")
+        for each in stages:
+            module = each.change.__module__.rpartition(".")[2]
+            page.append(f"| {each.title} | {each.summary} | `{module}.{each.name}` |")
+        page.append("")
+    runner = CliRunner(env={"COLUMNS": "96", "TERMINAL_WIDTH": "96"})
+    arguments = ["build", "--preset", EXPLAINED, "--explain"]
+    done = runner.invoke(app, arguments, prog_name="starcat")
+    body = "\n".join(line.rstrip() for line in done.output.strip().splitlines())
+    page.append(f"## An example\n\n```text\n$ starcat {' '.join(arguments)}\n{body}\n```")
+    return "\n".join(page)
+
+
+EXPLAINED = "gaia-12deg-2026"
+"""The preset whose stages are shown: it takes motions from another catalog."""
+
 PAGES: dict[str, Callable[[], str]] = {
     "cli.md": cli_page,
+    "stages.md": stages_page,
     "spec.md": spec_page,
     "sql.md": sql_page,
     "products.md": products_page,

@@ -31,9 +31,7 @@ def main() -> None:
     every, run, service = map(entries, sys.argv[1:4])
     section = {name: "run" if name in run else "service" if name in service else "dev"
                for name in every}  # fmt: skip
-    print(
-        "# Versions and hashes of all libraries, for every platform, from 'make lock'."
-    )
+    print("# Versions and hashes of all libraries, for every platform, from 'make lock'.")
     for wanted, words in SECTIONS.items():
         print(f"# --- {wanted}: {words}")
         print("".join(every[name] for name in every if section[name] == wanted), end="")

@@ -13,15 +13,15 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions
 from starcat.matcher.database import Database, ProductArrays
-from starcat.products.boresights import tile_sphere
+from starcat.products.grid import grid_patterns
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Index, Ragged
-from starcat.products.neighbours import (
-    angular_reference_sets,
-    find_neighbours,
-    planar_reference_sets,
-)
-from starcat.products.pairs_and_triangles import find_pairs, find_triangles
-from starcat.products.star_patterns import grid_patterns, radial_patterns
+from starcat.products.neighbours import find_neighbours
+from starcat.products.pairs import find_pairs
+from starcat.products.radial import radial_patterns
+from starcat.products.tiling import tile_sphere
+from starcat.products.triangles import find_triangles
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 

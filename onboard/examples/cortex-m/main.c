@@ -58,18 +58,18 @@ int main(void) {
   print_place("opened image", &image, sizeof image);
   print_place("room for the stack", stack_begin, (size_t)(stack_end - stack_begin) * 4u);
 
-  starcat_status status = starcat_open(&image, image_begin, size, 0);
-  if (status != STARCAT_IDENTIFIED) {
+  starcat_status status = starcat_open_image(&image, image_begin, size, 0);
+  if (status != STARCAT_OK) {
     (void)printf("the image is not opened: %d\n", (int)status);
     return 2;
   }
-  starcat_camera_of(&image, &camera);
-  starcat_default_options(&options);
+  starcat_get_camera(&image, &camera);
+  starcat_set_default_options(&options);
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const uint32_t first = FIRST[n], count = FIRST[n + 1u] - first;
     const starcat_frame frame = {count, X_PX + first, Y_PX + first, MAGNITUDES + first, NULL};
     paint_stack();
-    status = starcat_identify(&image, &camera, &options, &frame, &work, &result);
+    status = starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
     const size_t used = stack_used();
     deepest = used > deepest ? used : deepest;
     identified += (uint32_t)(status == STARCAT_IDENTIFIED);

@@ -18,7 +18,8 @@ from typing import Any
 
 from starcat.artifact.manifest import read_manifest
 from starcat.errors import ConfigError
-from starcat.pipeline.build import Inputs, build
+from starcat.pipeline.build import build
+from starcat.pipeline.draft import Inputs
 from starcat.progress import Progress, no_progress
 from starcat.specs.reading import preset
 from starcat.version import __version__

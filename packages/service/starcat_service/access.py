@@ -25,7 +25,7 @@ from starlette.types import Scope
 
 from starcat_service.problems import Problem
 from starcat_service.records import Records
-from starcat_service.sandbox.places import asker
+from starcat_service.sandbox.limiter import asker
 from starcat_service.security.request_limits import Buckets, address_of, later
 from starcat_service.security.tokens import SessionStore, Token, TokenStore, digest_of
 from starcat_service.settings import Role, Settings

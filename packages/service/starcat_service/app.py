@@ -17,7 +17,7 @@ from starcat_service.jobs.slots import JobSlots
 from starcat_service.pages.rendering import add_missing_page
 from starcat_service.problems import REFUSALS, add_problem_handlers
 from starcat_service.removal import keep_removing
-from starcat_service.sandbox.places import in_thread
+from starcat_service.sandbox.limiter import in_thread
 from starcat_service.security import metrics
 from starcat_service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
 from starcat_service.security.origin import Origins

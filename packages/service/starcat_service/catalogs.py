@@ -10,19 +10,28 @@ import hashlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from cachetools import LRUCache
+from pydantic import BaseModel, Field
 
 from starcat.catalog.parts import CATALOGS
-from starcat.catalog.source import DataSource, data_source, star_sources
+from starcat.catalog.source import data_source, star_sources
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
-from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
-from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
+from starcat.pipeline.draft import Draft
+from starcat.pipeline.estimate import (
+    Estimate,
+    choose_stars,
+    chosen_bytes,
+    estimate,
+    magnitude_range,
+    read_draft,
+    reading_keys,
+)
 from starcat.pipeline.guide_stars import MOST_FIELD_STARS
 from starcat.pipeline.starter import Starter, enough_limit, starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -31,6 +40,7 @@ from starcat.storage.digests import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files
 from starcat_service.problems import Problem
+from starcat_service.sandbox.limiter import Limiter, asker
 
 T = TypeVar("T")
 
@@ -55,23 +65,34 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CatalogRead:
-    """What is known of a catalog that was read."""
+    """A catalog as it was read for an estimate."""
 
-    source: str
-    band: str
-    epoch_jyear: float  # its stars were moved to this Julian year
-    stars: int  # that can be chosen from
-    brightest_mag: float | None  # of the stars that have a magnitude
-    faintest_mag: float | None
+    source: Annotated[str, Field(exclude=True)]
+    band: Annotated[str, Field(description="Of the magnitudes.", examples=["G"])]
+    epoch_jyear: Annotated[float, Field(description="Julian year that the stars were moved to.")]
+    stars: Annotated[int, Field(description="Stars that can be chosen from.")]
+    brightest_mag: Annotated[float | None, Field(description="Of the stars with a magnitude.")]
+    faintest_mag: Annotated[float | None, Field(description="Of the stars with a magnitude.")]
 
 
-@dataclass(frozen=True)
-class Offered:
+class Offered(BaseModel):
     """A catalog that a spec may name."""
 
-    source: DataSource  # what it is
-    is_here: bool  # whether its files are
-    read: tuple[CatalogRead, ...]  # what is known of it where it was read
+    name: str = Field(description="For ``catalog.source``.", examples=["gaia"])
+    title: str = Field(examples=["The Hipparcos Catalogue, main file"])
+    is_here: bool = Field(description="Whether its files are, so that a build can read it.")
+    bands: tuple[str, ...] = Field(
+        description="For ``catalog.band``, the default first.", examples=[["V", "Hp"]]
+    )
+    epoch_jyear: float | None = Field(
+        None, description="Of the positions in its files, where all have the same."
+    )
+    frame: str = Field(description="Axes of the positions in its files.", examples=["ICRS"])
+    records: int | None = Field(None, description="Records of the whole archive.")
+    citation: str = Field(description="How to cite it.")
+    licence: str = Field(description="Terms that it comes under.")
+    read: tuple[CatalogRead, ...] = Field(description="Figures known from earlier estimates.")
+    hint: str | None = Field(None, description="What to do where it is not here.")
 
 
 class Catalogs:
@@ -80,18 +101,18 @@ class Catalogs:
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        # Pairs of CatalogSnapshot and CatalogRead; one that is larger than the limit is alone.
-        self._read: LRUCache[str, tuple[CatalogSnapshot, CatalogRead]] = LRUCache(
-            READ_BYTES, lambda pair: min(pair[0].nbytes, READ_BYTES)
+        # Drafts that were read; one that is larger than the limit is alone.
+        self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
+            READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
         )
-        self._choices: LRUCache[Any, Choice] = LRUCache(CHOICE_BYTES, lambda choice: choice.nbytes)
+        self._choices: LRUCache[Any, Draft] = LRUCache(CHOICE_BYTES, chosen_bytes)
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
         self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
-        self._slots = threading.Semaphore(AT_ONCE)
+        self._limiter = Limiter(AT_ONCE, AT_ONCE)
         self._lock = threading.RLock()
-        self._underway: dict[str, Future[CatalogSnapshot]] = {}
+        self._underway: dict[str, Future[Draft]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
@@ -100,7 +121,7 @@ class Catalogs:
         known, found = self.known(), []
         for name in (*CATALOGS, *filter(is_here, set(star_sources()) - set(CATALOGS))):
             read = tuple(one for one in known if one.source == name)
-            found.append(Offered(data_source(name), is_here(name), read))
+            found.append(_offered(name, read))
         return sorted(found, key=lambda one: not one.is_here)
 
     def known(self) -> list[CatalogRead]:
@@ -149,12 +170,12 @@ class Catalogs:
         if found is None:
             read = self.read(spec, key)
             with self._slot():
-                deepest = read.magnitudes[1] if read.magnitudes else np.inf
+                _, deepest = magnitude_range(read.stars) or (np.inf, np.inf)
                 found = enough_limit(read.stars, spec), deepest
             self._cache(self._limits, part, found)
         return found
 
-    def read(self, spec: BuildSpec, key: str | None = None) -> CatalogSnapshot:
+    def read(self, spec: BuildSpec, key: str | None = None) -> Draft:
         """Return the catalogs of a spec; read them where that was not done yet."""
         key = self._key(spec) if key is None else key
         found = self._cached(self._read, key)
@@ -187,8 +208,8 @@ class Catalogs:
         with self._lock:
             self._underway.pop(key, None)
 
-    def _read_files(self, key: str, spec: BuildSpec) -> CatalogSnapshot:
-        found = read_snapshot(spec, {})
+    def _read_files(self, key: str, spec: BuildSpec) -> Draft:
+        found = read_draft(spec, {})
         self._cache(self._read, key, (found, _facts(spec, found)))
         return found
 
@@ -200,7 +221,7 @@ class Catalogs:
         with self._lock, suppress(ValueError):  # larger than the cache
             cache[key] = value
 
-    def _choice(self, read: CatalogSnapshot, key: str, spec: BuildSpec) -> Choice:
+    def _choice(self, read: Draft, key: str, spec: BuildSpec) -> Draft:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["levels"] = content["products"]["levels"]
@@ -213,12 +234,12 @@ class Catalogs:
 
     @contextmanager
     def _slot(self) -> Iterator[None]:
-        if not self._slots.acquire(timeout=self._wait_s):
-            raise _busy("too many estimates are being made", 1)
-        try:
+        with ExitStack() as held:
+            try:
+                held.enter_context(self._limiter.held(asker.get(), self._wait_s))
+            except Problem:
+                raise _busy("too many estimates are being made", 1) from None
             yield
-        finally:
-            self._slots.release()
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:
@@ -239,6 +260,27 @@ def is_here(name: str) -> bool:
         return bool(locate(name, {}))
     except SourceMissing:
         return False
+
+
+def _offered(name: str, read: tuple[CatalogRead, ...]) -> Offered:
+    source, is_found = data_source(name), is_here(name)
+    hint = (
+        f"the operator can get it with 'starcat fetch {name}', or set $STARCAT_CATALOGS to the "
+        "folder that has its files"
+    )
+    return Offered(
+        name=name,
+        title=source.title,
+        is_here=is_found,
+        bands=source.bands,
+        epoch_jyear=source.epoch_jyear,
+        frame=source.frame,
+        records=source.rows,
+        citation=source.citation,
+        licence=source.licence,
+        read=read,
+        hint=None if is_found else hint,
+    )
 
 
 def _check_size(spec: BuildSpec) -> None:
@@ -272,8 +314,13 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
     return found
 
 
-def _facts(spec: BuildSpec, read: CatalogSnapshot) -> CatalogRead:
-    mags = read.magnitudes
+def _bytes_of(read: Draft) -> int:
+    """Return the memory that a draft that was read takes."""
+    return int(read.stars.nbytes + (0 if read.motions is None else read.motions.nbytes))
+
+
+def _facts(spec: BuildSpec, read: Draft) -> CatalogRead:
+    mags = magnitude_range(read.stars)
     band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
     return CatalogRead(
         spec.catalog.source,

@@ -2,45 +2,53 @@
 
 A catalog that was read takes hundreds of megabytes, and choosing stars from it takes processor
 time. Both are the child process's, so the server process stays small and answers other requests
-meanwhile. Requests and answers are lines of JSON; several requests can be underway. If the process
+meanwhile. Several requests can be underway. If the process
 ends, its requests are refused and the next one starts another process.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, TypeVar
 
 import numpy as np
 
-from starcat.errors import error_of_kind
+from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.estimate import Estimate
 from starcat.pipeline.starter import LimitRow, Starter
-from starcat.products.boresights import FieldStars
 from starcat.products.coverage import CoverageSummary, Spread
+from starcat.products.tiling import FieldStars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import spec_from_dict
+from starcat.workers.channel import Channel, return_free_memory
+from starcat.workers.messages import (
+    DONE,
+    ERROR,
+    MalformedMessage,
+    error_content,
+    error_of,
+    from_json,
+)
+from starcat.workers.process import WorkerProcess
 from starcat_service.catalogs import RETRY_S, WAIT_S, CatalogRead, Catalogs
 from starcat_service.problems import Problem
-from starcat_service.sandbox.child import Child, own_output, return_free_memory
+from starcat_service.sandbox.limiter import asker
 
 T = TypeVar("T")
 
 ANSWER_S = 4 * WAIT_S
 """Seconds that a request waits for its answer; the process refuses it long before."""
 
-TICK_S = 3600.0
 THREADS = 40
 """Requests that the process works on or keeps waiting at the same time, as the server does."""
 
-_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected", "refusals")
+_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected")
 
 
 class ChildCatalogs(Catalogs):
@@ -48,7 +56,7 @@ class ChildCatalogs(Catalogs):
 
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         super().__init__(max_memory_bytes, wait_s)
-        self._child: Child | None = None
+        self._worker: WorkerProcess | None = None
         self._pending: dict[int, Future[Any]] = {}  # requests of this process, by their numbers
         self._read_ones: tuple[CatalogRead, ...] = ()  # catalogs that the process has read
         self._number = 0
@@ -79,7 +87,7 @@ class ChildCatalogs(Catalogs):
             full_share=found["full_share"],
             filters=tuple((name, stars) for name, stars in found["filters"]),
             rejected=found["rejected"],
-            refusals=tuple(found["refusals"]),
+            refusals=tuple(BuildError(words, key=key) for words, key in found["refusals"]),
             warnings=tuple(found["warnings"]),
         )
 
@@ -115,56 +123,58 @@ class ChildCatalogs(Catalogs):
         """End the process; whoever waits for an answer is refused."""
         super().close()
         with self._sending:
-            child, self._child = self._child, None
-        if child is not None:
-            child.kill()
+            worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.kill()
             self._hearing.join()
 
     def _ask(self, task: str, **arguments: Any) -> Any:
         answer: Future[Any] = Future()
         with self._sending:
-            if self._child is None or not self._child.is_running:
-                self._child = self._started()
+            if self._worker is None or not self._worker.is_running:
+                self._worker = self._started()
             self._number += 1
             self._pending[self._number] = answer
-            self._child.send({"number": self._number, "task": task, "arguments": arguments})
+            with suppress(OSError):  # that it ended is heard
+                self._worker.send([self._number, asker.get(), task, arguments])
         try:
-            content = answer.result(ANSWER_S)
+            kind, content = answer.result(ANSWER_S)
         except TimeoutError:
             raise _ended() from None
-        if "kind" not in content:
-            return content["found"]
-        status, message, key = content["status"], content["message"], content["key"]
-        if status is not None:
+        if kind == DONE:
+            return content
+        if content["status"] is not None:
+            status, message, key = content["status"], content["message"], content["key"]
             raise Problem(status, message, headers=content["headers"], key=key)
-        error = error_of_kind(content["kind"], message, key=key, fields=content["fields"])
-        raise error or RuntimeError(f"{content['kind']}: {message}")
+        raise error_of(content)
 
-    def _started(self) -> Child:
-        # Arrow's own allocators keep the memory of a catalog that is not needed any more.
-        memory = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2"}
-        child = Child("starcat_service.estimates:serve", environment=memory)
-        child.send({"max_memory_bytes": self._max_memory_bytes, "wait_s": self._wait_s})
+    def _started(self) -> WorkerProcess:
+        # Each arena keeps the memory of a catalog that is not needed any more.
+        worker = WorkerProcess(
+            "starcat_service.estimates:serve", environment={"MALLOC_ARENA_MAX": "2"}
+        )
+        worker.send([self._max_memory_bytes, self._wait_s])
         self._pending = {}
-        given = child, self._pending
+        given = worker, self._pending
         self._hearing = threading.Thread(target=self._hear, args=given, daemon=True)
         self._hearing.start()
-        return child
+        return worker
 
-    def _hear(self, child: Child, pending: dict[int, Future[Any]]) -> None:
+    def _hear(self, worker: WorkerProcess, pending: dict[int, Future[Any]]) -> None:
         """Give each answer of a process to whom it is for, until the process ends."""
         try:
-            for line in child.lines(TICK_S):
-                if line is not None:
-                    content = json.loads(line)
-                    self._read_ones = tuple(CatalogRead(**one) for one in content["read"])
-                    waiting = pending.pop(content["number"], None)
+            while True:
+                reply = worker.receive()
+                if reply is not None:
+                    number, read, content = from_json(reply[1])
+                    self._read_ones = tuple(CatalogRead(**one) for one in read)
+                    waiting = pending.pop(number, None)
                     if waiting is not None:
-                        waiting.set_result(content)
-        except (OSError, ValueError):  # the pipe was closed
+                        waiting.set_result((reply[0], content))
+        except (EOFError, OSError, MalformedMessage):
             pass
         finally:
-            child.close()
+            worker.close()
             with self._sending:
                 lost = list(pending.values())
                 pending.clear()
@@ -185,50 +195,36 @@ def _limit_row(content: Mapping[str, Any]) -> LimitRow:
 
 
 def serve() -> None:
-    """Answer requests until there are no more: what the child process runs."""
-    output = own_output()
-    opening = json.loads(sys.stdin.buffer.readline() or b"{}")
-    if not opening:
-        return
-    catalogs = Catalogs(opening["max_memory_bytes"], opening["wait_s"])
-    writing = threading.Lock()
-
-    def answer(request: Mapping[str, Any]) -> None:
-        before = catalogs.known()
-        content = {"number": request["number"], **_answer(catalogs, request)}
-        content["read"] = [asdict(one) for one in catalogs.known()]
-        if catalogs.known() != before:
-            return_free_memory()
-        line = json.dumps(content, default=_plain).encode() + b"\n"
-        with writing:
-            output.write(line)
-            output.flush()
-
-    with ThreadPoolExecutor(THREADS, "estimate") as threads:
-        for line in sys.stdin.buffer:
-            threads.submit(answer, json.loads(line))
+    """Answer requests until there are no more: what the worker runs."""
+    channel = Channel()
+    with suppress(EOFError), ThreadPoolExecutor(THREADS, "estimate") as threads:
+        catalogs = Catalogs(*channel.receive())
+        while True:
+            threads.submit(_answer, channel, catalogs, *channel.receive())
 
 
-def _answer(catalogs: Catalogs, request: Mapping[str, Any]) -> dict[str, Any]:
+def _answer(
+    channel: Channel, catalogs: Catalogs, number: int, who: str, task: str, arguments: Any
+) -> None:
+    asker.set(who)
+    before = catalogs.known()
     try:
-        return {"found": _TASKS[request["task"]](catalogs, **request["arguments"])}
+        kind, content = DONE, _TASKS[task](catalogs, **arguments)
     except Exception as error:
         problem = error if isinstance(error, Problem) else None
-        key = getattr(error, "key", None)
-        return {
-            "kind": type(error).__name__,
-            "message": str(error)[:4000],
-            "key": None if key is None else str(key),
-            "fields": list(getattr(error, "fields", ())),
-            "status": problem.status if problem else None,
-            "headers": problem.headers if problem else {},
-        }
+        status, headers = (problem.status, problem.headers) if problem else (None, {})
+        kind, content = ERROR, {**error_content(error), "status": status, "headers": headers}
+    known = catalogs.known()
+    if known != before:
+        return_free_memory()
+    channel.send(kind, [number, [asdict(one) for one in known], content])
 
 
 def _estimate(catalogs: Catalogs, spec: dict[str, Any]) -> dict[str, Any]:
     found = catalogs.estimate(spec_from_dict(spec, "spec"))
     return {
         **{name: getattr(found, name) for name in (*_SIMPLE, "warnings")},
+        "refusals": [(str(error), error.key) for error in found.refusals],
         "cost": asdict(found.cost),
         "coverage": asdict(found.coverage),
         "counts": found.fields.count,
@@ -255,8 +251,3 @@ _TASKS: dict[str, Callable[..., Any]] = {
     "starter": _starter,
     "enough_limit": _enough_limit,
 }
-
-
-def _plain(value: Any) -> Any:
-    """Return an array or a number of numpy as JSON has it."""
-    return value.tolist()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
@@ -22,28 +23,54 @@ CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re
 """How jobs name the files and folders of catalogs."""
 
 
-@dataclass(frozen=True)
-class Database:
-    """A built database."""
+class Database(BaseModel):
+    """A built database: what it was made from, and what it holds."""
 
-    id: str  # 16 hexadecimal digits: the beginning of the digest of what it was made from
-    folder: Path  # the database, ``<name>-<version>``
-    manifest: dict[str, Any]
+    model_config = ConfigDict(frozen=True)
 
-    @property
-    def name(self) -> str:
-        """Name of the database."""
-        return str(self.manifest["name"])
+    folder: Path = Field(exclude=True)  # ``<name>-<version>``
+    manifest: dict[str, Any] = Field(exclude=True)
+    id: str = Field(
+        description="First digits of the digest of its inputs and spec.",
+        examples=["0123456789abcdef"],
+    )
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    title: str = Field(description="Name of its folder.", examples=["gaia-12deg-1.0.0"])
+    description: str = Field(description="Description from the spec.")
+    frame: str = Field(description="Axes of all positions.", examples=["ICRS"])
+    epoch_jyear: float = Field(description="Epoch of all positions, Julian year.")
+    catalog: str = Field(description="The star catalog.", examples=["gaia"])
+    stars: int = Field(description="Guide stars.")
+    bytes: int = Field(description="Size of all files together, without the manifest.")
+    products: dict[str, int] = Field(description="Rows of each product.")
+    manifest_sha256: str = Field(description="Digest that the manifest carries of itself.")
+    spec: dict[str, Any] = Field(description="The spec, with all defaults.")
+    software: dict[str, str] = Field(description="Versions of what built it.")
 
-    @property
-    def version(self) -> str:
-        """Version of the database."""
-        return str(self.manifest["version"])
-
-    @property
-    def title(self) -> str:
-        """Name and version, as the folder has them."""
-        return f"{self.name}-{self.version}"
+    @classmethod
+    def of_manifest(cls, database_id: str, folder: Path, manifest: dict[str, Any]) -> Database:
+        """Return the database that a manifest describes."""
+        spec = manifest["spec"]
+        products = {name: int(facts["rows"]) for name, facts in manifest["products"].items()}
+        return cls(
+            folder=folder,
+            manifest=manifest,
+            id=database_id,
+            name=manifest["name"],
+            version=manifest["version"],
+            title=f"{manifest['name']}-{manifest['version']}",
+            description=spec.get("description") or "",
+            frame=manifest["frame"],
+            epoch_jyear=manifest["epoch_jyear"],
+            catalog=spec["catalog"]["source"],
+            stars=products.get("stars", 0),
+            bytes=sum(int(facts["bytes"]) for facts in manifest["files"].values()),
+            products=products,
+            manifest_sha256=manifest.get("manifest_sha256", ""),
+            spec=spec,
+            software=manifest["software"],
+        )
 
     @property
     def built_ns(self) -> int:
@@ -51,36 +78,15 @@ class Database:
         return (self.folder / MANIFEST_NAME).stat().st_mtime_ns
 
     @property
-    def spec(self) -> dict[str, Any]:
-        """The spec, with all defaults."""
-        return dict(self.manifest["spec"])
-
-    @property
-    def description(self) -> str:
-        """Description from the spec."""
-        return str(self.spec.get("description") or "")
-
-    @property
-    def catalog(self) -> str:
+    def catalog_in_words(self) -> str:
         """Name of the star catalog, with the band."""
-        catalog = self.spec["catalog"]
-        band = catalog.get("band")
-        return f"{catalog['source']}{f' ({band})' if band else ''}"
+        band = self.spec["catalog"].get("band")
+        return f"{self.catalog}{f' ({band})' if band else ''}"
 
     @cached_property
     def camera(self) -> Camera:
         """The camera that it is for."""
         return CameraSpec.model_validate(self.spec["camera"]).camera()
-
-    @property
-    def products(self) -> dict[str, int]:
-        """Rows of each product."""
-        return {name: int(facts["rows"]) for name, facts in self.manifest["products"].items()}
-
-    @property
-    def bytes(self) -> int:
-        """Size of all files together, without the manifest."""
-        return sum(int(facts["bytes"]) for facts in self.manifest["files"].values())
 
     @cached_property
     def manifest_blob(self) -> Blob:
@@ -171,6 +177,7 @@ class Library:
         known = self._known.get(path)
         if known is None or known[0] != changed_ns:
             folder = path.parent
-            known = changed_ns, Database(folder.parent.name, folder, read_manifest(folder))
+            manifest = read_manifest(folder)
+            known = changed_ns, Database.of_manifest(folder.parent.name, folder, manifest)
             self._known[path] = known
         return known[1]

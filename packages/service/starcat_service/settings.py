@@ -69,7 +69,7 @@ class Settings(BaseModel):
         60.0, gt=0, description="Seconds until a worker of the cluster that is silent is lost."
     )
     queries: int = Field(
-        2, ge=1, le=64, description="Queries that take long and run at the same time."
+        2, ge=1, le=64, description="Uploads that are read at the same time; of queries, six more."
     )
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
     rows_mib: float = Field(

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, Any
 
 from fastapi import Request
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.datastructures import MutableHeaders
 
 from starcat.errors import QueryLimitError, TargetMissing
@@ -234,6 +234,16 @@ def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[in
                     f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
                 )
     return count, first.were_more
+
+
+def open_attachment(path: Path, name: str, media_type: str) -> StreamingResponse:
+    """Return a file as an attachment of a name; the file may be removed before it is sent."""
+    file = path.open("rb")
+    headers = {
+        "Content-Length": str(path.stat().st_size),
+        "Content-Disposition": f'attachment; filename="{name}"',
+    }
+    return StreamingResponse(chunks_of(file), media_type=media_type, headers=headers)
 
 
 def chunks_of(file: IO[bytes]) -> Iterator[bytes]:

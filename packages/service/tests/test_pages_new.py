@@ -1,4 +1,4 @@
-"""The page *New database*: designs as addresses, names that follow, suggestions and verdicts."""
+"""The page *New database*: designs as addresses, suggestions and verdicts."""
 
 from __future__ import annotations
 
@@ -229,32 +229,13 @@ def test_a_dropped_response_changes_the_magnitudes_that_are_counted(client):
 # Names
 
 
-def test_name_and_description_of_a_preset_follow_the_camera():
-    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
-    assert draft.values["name"] == "gaia-20deg"
-    told = "gaia, G <= 6, for a 20 x 20 deg camera of 1024 x 1024 px"
-    assert draft.values["description"] == told
-    wrong = draft_with(draft, {"camera.fov_x_deg": 500.0})
-    assert wrong.values["description"] == told
-    again = draft_with(wrong, {"camera.fov_x_deg": 7.25, "selection.faint_limit_mag": 7.0})
-    assert again.values["name"] == "gaia-7-25deg"
-    assert "G <= 7, for a 7.25 x 7.25 deg" in again.values["description"]
-
-
-def test_an_address_is_short_where_the_name_follows():
-    draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 20.0})
-    assert query_of(draft, "") == "?camera.fov_x_deg=20.0"
-    assert draft_of_query({"camera.fov_x_deg": "20.0"}).content == draft.content
-    stale = draft_of_text(draft.text.replace("gaia-20deg", "gaia-12deg"))
-    assert pinned_draft(query_of(stale, "")).values["name"] == "gaia-12deg"
-
-
-def test_what_somebody_has_called_a_design_stays():
-    mine = {"name": "polaris", "description": "For the second flight."}
-    draft = draft_with(draft_with(draft_of_query({}), mine), {"camera.fov_x_deg": 20.0})
-    assert {key: draft.values[key] for key in mine} == mine
-    draft = draft_with(draft_of_query({}), {"version": "1.0.1"})
-    assert draft.values["description"].startswith("Embedded sky (Gaia DR3")
+def test_a_design_keeps_its_name_and_description():
+    draft = draft_of_query({})
+    wider = draft_with(draft, {"camera.fov_x_deg": 20.0})
+    names = ("name", "description")
+    assert [wider.values[key] for key in names] == [draft.values[key] for key in names]
+    assert query_of(wider, "") == "?camera.fov_x_deg=20.0"
+    assert draft_of_query({"camera.fov_x_deg": "20.0"}).content == wider.content
 
 
 def test_a_second_database_of_one_name_and_version_is_refused(client):

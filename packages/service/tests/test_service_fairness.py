@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,13 @@ from starcat.query.engine import Engine
 from starcat.query.session import open_session
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem
-from starcat_service.sandbox import places
-from starcat_service.sandbox.places import Lanes, Overdue, Places, asker, lease
-from starcat_service.sandbox.pool import QueryPool
+from starcat_service.sandbox.limiter import Limiter, asker
+from starcat_service.sandbox.pool import SHORT_PLACES, SHORT_S, QueryPool
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
 from starcat_service.settings import Settings
 from starcat_service.vo import tap_jobs
 
 ENDLESS = "SELECT sum(a.i * b.j + c.i) FROM pairs a, pairs b, pairs c"
-LONG = "SELECT sum(sqrt(a.range * b.range)) FROM range(8000) a, range(10000) b"
 
 
 @pytest.fixture
@@ -44,114 +43,99 @@ def pool(tmp_path: Path) -> Iterator[QueryPool]:
 # Places.
 
 
-def test_a_user_has_another_place_only_where_more_are_free_and_half_at_most():
-    shared = Places(4)
-    assert [shared.try_take("greedy") for _ in range(3)] == [True, True, False]
-    assert [shared.try_take("anna") for _ in range(2)] == [True, False]
-    assert shared.try_take("bob")
-    shared.release("greedy")
-    assert not shared.try_take("greedy")
-    assert shared.try_take("carl")
+_held: list[ExitStack] = []  # a place that nobody refers to would be given back
 
 
-def test_who_asks_what_takes_long_has_one_place_for_what_is_short():
-    lanes = Lanes(8, 2)
-    assert lanes.long.try_take("greedy")
-    assert [lanes.short.try_take("greedy") for _ in range(2)] == [True, False]
-    assert [lanes.short.try_take("anna") for _ in range(2)] == [True, True]
+def taken(shared: Limiter, who: str) -> ExitStack | None:
+    """Return a place of a client that is given back by ``close``, None if there is none at once."""
+    held = ExitStack()
+    try:
+        held.enter_context(shared.held(who, 0.0))
+    except Problem:
+        return None
+    _held.append(held)
+    return held
 
 
-def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_longest():
-    shared, order = Places(2), list[str]()
-    shared.take("greedy", 1.0)
-    shared.take("anna", 1.0)
+def test_a_client_has_another_place_only_where_more_are_free_and_so_many_at_most():
+    shared = Limiter(4, 2)
+    places = [taken(shared, "greedy") for _ in range(3)]
+    assert [place is not None for place in places] == [True, True, False]
+    assert taken(shared, "anna")
+    assert taken(shared, "anna") is None
+    assert taken(shared, "bob")
+    assert taken(shared, "carl") is None
+    assert places[0] is not None
+    places[0].close()
+    assert taken(shared, "greedy") is None
+    assert taken(shared, "carl")
+
+
+def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
+    shared, order = Limiter(2, 1), list[str]()
+    held = {who: taken(shared, who) for who in ("greedy", "anna")}
 
     def wait(who: str) -> None:
-        shared.take(who, 10.0)
-        order.append(who)
-        shared.release(who)
+        with shared.held(who, 10.0):
+            order.append(who)
 
     threads = []
-    for number, who in enumerate(["greedy", "greedy", "greedy", "anna", "bob"], start=1):
+    for number, who in enumerate(["greedy", "greedy", "anna", "anna", "bob"], start=1):
         threads.append(threading.Thread(target=wait, args=(who,)))
         threads[-1].start()
-        while sum(map(shared.waiting, ("greedy", "anna", "bob"))) < number:
+        while len(shared._waiting) < number:
             time.sleep(0.001)
-    shared.release("anna")
-    for thread in threads[-2:]:
+    held["anna"].close()
+    for thread in threads[-3:]:
         thread.join(10.0)
-    assert order[:2] == ["bob", "anna"], "greedy asked before both, and holds a place"
-    shared.release("greedy")
+    assert order[:3] == ["anna", "bob", "anna"], "greedy asked before both, and holds a place"
+    held["greedy"].close()
     for thread in threads:
         thread.join(10.0)
-    assert order[2:] == ["greedy"] * 3
+    assert order[3:] == ["greedy"] * 2
 
 
 def test_who_waits_too_long_is_told_to_come_again():
-    shared = Places(1)
-    shared.take("anna", 1.0)
-    with pytest.raises(Problem, match="ask again later") as caught:
-        shared.take("bob", 0.01)
-    assert caught.value.status == 503
-    assert int(caught.value.headers["Retry-After"]) >= 1
-    with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as own:
-        asyncio.run(shared.take_later("anna", 0.01))
-    assert own.value.status == 429
-    shared.release("anna")
-    assert shared.try_take("bob"), "nobody who went away has the place"
+    shared = Limiter(1, 1)
+    with shared.held("anna", 1.0):
+        with pytest.raises(Problem, match="ask again later") as caught, shared.held("bob", 0.01):
+            pass
+        assert caught.value.status == 503
+        assert int(caught.value.headers["Retry-After"]) >= 1
+        asker.set("anna")
+        with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as own:
+            asyncio.run(shared.run(0.01, str))
+        assert own.value.status == 429
+    assert taken(shared, "bob"), "nobody who went away has the place"
 
 
 def test_a_client_that_goes_while_it_waits_takes_no_place():
-    shared = Places(1)
+    shared = Limiter(1, 1)
 
     async def go() -> None:
-        shared.take("anna", 1.0)
-        waiting = asyncio.create_task(shared.take_later("bob", 10.0))
-        await asyncio.sleep(0.01)
-        waiting.cancel()
-        await asyncio.gather(waiting, return_exceptions=True)
-        shared.release("anna")
+        with shared.held("anna", 1.0):
+            asker.set("bob")
+            waiting = asyncio.create_task(shared.run(10.0, str))
+            await asyncio.sleep(0.01)
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
 
     asyncio.run(go())
-    assert shared.try_take("carl")
+    assert taken(shared, "carl")
 
 
-def test_what_is_not_short_is_begun_again_where_it_may_take_long():
-    lanes, seen = Lanes(1, 1), list[bool]()
+def test_a_place_is_held_as_long_as_something_uses_it():
+    shared, using = Limiter(1, 1), ExitStack()
 
-    def function() -> str:
-        place = lease.get()
+    def begin() -> None:
+        place = shared.place.get()
         assert place is not None
-        seen.append(place.is_long)
-        if not place.is_long:
-            assert not place.prolong()
-            raise Overdue
-        return "done"
+        using.enter_context(place.used())
 
-    async def go() -> str:
-        lanes.long.take("other", 1.0)
-        running = asyncio.create_task(lanes.run(10.0, function))
-        while not lanes.long.waiting(""):
-            await asyncio.sleep(0.001)
-        assert lanes.short.try_take("anna"), "it waits in the long lane only"
-        lanes.long.release("other")
-        return await running
-
-    assert asyncio.run(go()) == "done"
-    assert seen == [False, True]
-    assert lanes.long.try_take("anna")
-
-
-def test_a_user_may_have_so_many_long_queries_waiting(monkeypatch):
-    monkeypatch.setattr(places, "MOST_WAITING", 0)
-    lanes = Lanes(1, 1)
-
-    def function() -> None:
-        raise Overdue
-
-    with pytest.raises(Problem, match="wait for one that takes long") as caught:
-        asyncio.run(lanes.run(10.0, function))
-    assert caught.value.status == 429
+    asyncio.run(shared.run(1.0, begin))
+    assert taken(shared, "anna") is None
+    using.close()
+    assert taken(shared, "anna")
 
 
 # Queries.
@@ -175,7 +159,7 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
 
     async def go() -> list[object]:
         greedy = [asyncio.create_task(of(who, ENDLESS)) for who in ("a", "b", "a", "b", "a")]
-        await asyncio.sleep(3.0 * places.SHORT_S)
+        await asyncio.sleep(3.0 * SHORT_S)
         took = []
         for number in range(12):
             began = time.monotonic()
@@ -189,29 +173,6 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
 
     pool._limits = type(pool._limits)(time_s=8.0, memory_gb=0.5, disk_gb=0.1)
     assert len(asyncio.run(go())) == 12
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(60)
-def test_a_query_that_is_begun_again_has_the_same_answer(pool, small_artifact, monkeypatch):
-    monkeypatch.setattr(places, "SHORT_S", 0.05)
-    held = pool._lanes.long
-    for who in ("a", "b"):
-        held.take(who, 1.0)
-
-    async def go() -> list[tuple[Any, ...]]:
-        running = asyncio.create_task(pool.run(ask, pool, small_artifact, LONG))
-        while not held.waiting(""):
-            assert not running.done()
-            await asyncio.sleep(0.01)
-        assert len(pool._open._idle) == 1, "its process was interrupted, and serves others"
-        held.release("a")
-        return await running
-
-    found = asyncio.run(go())
-    assert found == ask(pool, small_artifact, LONG)
-    assert held.try_take("a"), "its place is given back"
-    assert pool._lanes.short.try_take("a")
 
 
 def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
@@ -243,7 +204,7 @@ def test_a_request_has_one_allowance(pool, small_artifact):
 
 
 @pytest.mark.timeout(60)
-def test_a_long_answer_of_tap_is_sent_as_it_is_made_and_a_short_one_when_it_is_whole(root):
+def test_answers_of_tap_hold_a_place_until_they_are_sent(root):
     with client_of(root, queries=2) as client:
         found = [
             client.get("/tap/sync", params={"QUERY": query, "FORMAT": "csv"})
@@ -254,8 +215,8 @@ def test_a_long_answer_of_tap_is_sent_as_it_is_made_and_a_short_one_when_it_is_w
         ]
         assert [one.status_code for one in found] == [200, 200]
         assert [one.text.count("\n") for one in found] == [4, 2]
-        lanes = client.app.state.service.query_pool._lanes
-        assert [lane._free for lane in (lanes.short, lanes.long)] == [places.SHORT_PLACES, 2]
+        limiter = client.app.state.service.query_pool._limiter
+        assert limiter._free == SHORT_PLACES + 2, "all places are given back"
 
 
 def client_at(client: TestClient, address: str) -> TestClient:

@@ -567,8 +567,8 @@ def test_a_process_that_is_killed_is_told_of(service, spec):
     job = long_build(service, spec)
 
     def kill() -> None:
-        for child in slots.processes.children:
-            os.kill(child.pid, signal.SIGKILL)
+        for worker in slots.processes.running:
+            os.kill(worker.pid, signal.SIGKILL)
 
     failed = run_until(service, slots, job, kill)
     assert failed.state == "failed"

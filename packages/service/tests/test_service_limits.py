@@ -25,13 +25,13 @@ from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.releases import publishing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.reading import preset
+from starcat.workers.messages import ERROR, HEAD, MalformedMessage, error_content, json_content
+from starcat.workers.process import WorkerProcess
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs
 from starcat_service.problems import Problem
 from starcat_service.removal import remove_old
-from starcat_service.sandbox import child as child_module
-from starcat_service.sandbox.child import Child
 from starcat_service.security.request_limits import Buckets
 from starcat_service.security.tokens import DAY_S
 
@@ -77,9 +77,14 @@ def test_a_page_says_that_an_answer_is_too_large(client):
     assert "</html>" in page.text
 
 
+def reported(error: Exception) -> tuple[str, bytes]:
+    """Return what a worker sends when an error was raised."""
+    return ERROR, json_content(error_content(error))
+
+
 def test_a_format_that_needs_the_table_in_memory_says_which_do_not(client, monkeypatch):
     sandbox = client.app.state.service.sandbox
-    monkeypatch.setattr(sandbox, "_answer", lambda child, request: {"kind": "MemoryError"})
+    monkeypatch.setattr(sandbox, "_answer", lambda worker, request: reported(MemoryError()))
     given = {"targets": [DATABASE], "query": "SELECT 1", "format": "ecsv"}
     answer = client.post("/api/v1/sql", json=given)
     assert answer.status_code == 413
@@ -112,19 +117,17 @@ def test_fits_is_made_outside_of_the_server_process(client, monkeypatch, address
 
 
 def endless() -> None:
-    """Write without an end of a line."""
-    while True:
-        sys.stdout.write("x" * 65_536)
+    """Write a message that is too long."""
+    sys.stdout.buffer.write(HEAD.pack(b"d", 1 << 21))
+    sys.stdout.buffer.write(b"x" * (1 << 21))
 
 
-def test_a_child_that_sends_a_line_without_end_is_ended(monkeypatch):
-    monkeypatch.setattr(child_module, "MAX_LINE_BYTES", 1 << 20)
+def test_a_worker_that_sends_a_message_without_end_is_not_read(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
-    child = Child(f"{Path(__file__).stem}:endless")
-    with pytest.raises(EOFError):
-        child.answer(60.0)
-    assert child.wait() == -signal.SIGKILL
-    child.close()
+    worker = WorkerProcess(f"{Path(__file__).stem}:endless", max_bytes=1 << 20)
+    with pytest.raises(MalformedMessage, match="at most 1,048,576 are read"):
+        worker.receive()
+    worker.close()
 
 
 # Temporary files.
@@ -133,7 +136,7 @@ def test_a_child_that_sends_a_line_without_end_is_ended(monkeypatch):
 def test_temporary_files_of_queries_are_in_the_root(client):
     service = client.app.state.service
     with service.query_pool.session([service.library.target(DATABASE)]) as session:
-        spill = session._engine._opening.spill
+        spill = Path(session._engine._opening.spill)
         assert spill.is_relative_to(service.paths.scratch)
         remove_old(service, time.time() + 10 * DAY_S)
         assert spill.is_dir(), "the folder of a session that lives is not old"
@@ -173,17 +176,10 @@ def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifac
 
 def test_a_flight_image_on_a_full_disk_is_told_as_such(client, monkeypatch):
     """The process of the sandbox tells an OutputError, and that the disk is full."""
-    from starcat_service.sandbox import worker
-
-    def full(**_: object) -> None:
-        try:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        except OSError as error:
-            raise OutputError("image.img: cannot be written") from error
-
-    sandbox, answer = client.app.state.service.sandbox, worker._answer(full, {})
-    assert answer["errno"] == errno.ENOSPC
-    monkeypatch.setattr(sandbox, "_answer", lambda child, request: answer)
+    error = OutputError("image.img: cannot be written")
+    error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    sandbox, reply = client.app.state.service.sandbox, reported(error)
+    monkeypatch.setattr(sandbox, "_answer", lambda worker, request: reply)
     found = client.get(f"/databases/{DATABASE}/image")
     assert found.status_code == 507
 
@@ -301,7 +297,7 @@ def test_estimates_of_the_child_process_are_the_same():
         assert remote.starter("own", spec.camera) == catalogs.starter("own", spec.camera)
         assert remote.known() == catalogs.known()
         # If the process ends, the next request starts another one.
-        child = remote._child
+        child = remote._worker
         assert child is not None
         os.kill(child.pid, signal.SIGKILL)
         child.wait()
@@ -314,7 +310,7 @@ def test_estimates_of_the_child_process_are_the_same():
 def test_who_waits_for_a_process_that_ends_is_told(monkeypatch):
     remote = ChildCatalogs()
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
-    threading.Timer(1.0, lambda: os.kill(remote._child.pid, signal.SIGKILL)).start()
+    threading.Timer(1.0, lambda: os.kill(remote._worker.pid, signal.SIGKILL)).start()
     with pytest.raises(Problem, match="ended, as it does without memory") as told:
         remote.estimate(spec)
     assert told.value.status == 503

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
-from starcat_service.sandbox.pool import QueryPool
+from starcat_service.sandbox.pool import Pool, QueryPool
 from starcat_service.settings import Settings
 
 COUNT = "SELECT count(*) > 100 FROM stars"
@@ -88,7 +89,7 @@ def test_one_that_was_left_halfway_is_thrown_away(sessions, small_artifact):
 
 def test_only_some_are_kept(sessions, artifact_version):
     processes = []
-    sessions._open._most_idle = 2
+    sessions._open._max_idle = 2
     for number in range(3):
         with sessions.session([artifact_version(f"1.0.{number}")]) as session:
             processes.append(process_of(session))
@@ -114,3 +115,43 @@ def test_checked_queries_do_not_grow_without_end(sessions, small_artifact):
         for number in range(MAX_CHECKED + 20):
             session.check(f"SELECT {number}")
         assert len(session._checked) == MAX_CHECKED
+
+
+class Still:
+    """A process that runs until somebody closes it."""
+
+    is_running = True
+
+
+def test_a_process_that_cannot_begin_is_told_of_once():
+    begun: list[str] = []
+
+    @contextmanager
+    def begin(key: str) -> Iterator[Still]:
+        begun.append(key)
+        if len(begun) == 1:
+            raise QueryError("it cannot begin")
+        yield Still()
+
+    shared = Pool(begin, 1)
+    with pytest.raises(QueryError, match="cannot begin"), shared.lend("a"):
+        pass
+    with shared.lend("a") as process:
+        assert process.is_running
+    assert begun == ["a", "a"]
+
+
+def test_who_waits_while_a_pool_is_closed_has_the_process_that_begins():
+    begun: list[str] = []
+
+    @contextmanager
+    def begin(key: str) -> Iterator[Still]:
+        begun.append(key)
+        shared.close()
+        yield Still()
+
+    shared = Pool(begin, 1)
+    with shared.lend("a"):
+        assert begun == ["a"]
+    with shared.lend("a"):
+        assert begun == ["a", "a"], "nothing is kept"

@@ -14,8 +14,8 @@ import pytest
 from fastapi.testclient import TestClient
 from services import client_of
 
-from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
-from starcat.pipeline.estimate import choose_stars
+from starcat.pipeline.draft import Draft
+from starcat.pipeline.estimate import choose_stars, read_draft
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
@@ -161,7 +161,7 @@ def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     answer = client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
     assert answer.status_code == 200
     found = answer.json()
-    read = read_snapshot(small, {})
+    read = read_draft(small, {})
     choice = choose_stars(read, small)
     assert found["guide_stars"] == len(choice.selected.guide_stars)
     assert found["fields"]["count"] == small.boresights.count
@@ -249,12 +249,12 @@ def test_catalogs_say_whether_they_are_here_and_what_was_read(client, small_spec
 def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     calls = []
 
-    def counted(*arguments: Any, **options: Any) -> CatalogSnapshot:
+    def counted(*arguments: Any, **options: Any) -> Draft:
         calls.append(arguments)
         time.sleep(0.2)
-        return read_snapshot(*arguments, **options)
+        return read_draft(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_snapshot", counted)
+    monkeypatch.setattr(catalogs_module, "read_draft", counted)
     catalogs = Catalogs()
     found: list[int] = []
     threads = [
@@ -279,11 +279,11 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
 def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
     go_on = threading.Event()
 
-    def slow(*arguments: Any, **options: Any) -> CatalogSnapshot:
+    def slow(*arguments: Any, **options: Any) -> Draft:
         go_on.wait(20)
-        return read_snapshot(*arguments, **options)
+        return read_draft(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_snapshot", slow)
+    monkeypatch.setattr(catalogs_module, "read_draft", slow)
     catalogs = Catalogs(wait_s=0.05)
     with pytest.raises(Problem) as told:
         catalogs.estimate(small)

@@ -28,7 +28,7 @@ from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER
 from starcat_service.protocols.parameters import Question
-from starcat_service.sandbox.places import asker
+from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service
 from starcat_service.settings import Settings
 from starcat_service.vo.tap import ClientGone, Spool

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.frames import icrs_from
-from starcat.catalog.readers.expressions import columns_in, evaluate
 from starcat.catalog.readers.records import Problem, Records, Rows, TableColumn
 from starcat.catalog.readers.tables import BLANKS, OpenTable
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
 from starcat.errors import ConfigError, quoted
+from starcat.stars.expressions import columns_in, evaluate
 from starcat.stars.star_table import Columns, known, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 

@@ -45,32 +45,10 @@ REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report
 SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
 
 
-class DatabaseFacts(BaseModel):
-    """What a database was made from, and what it holds."""
-
-    id: str = Field(
-        description="First digits of the digest of its inputs and spec.",
-        examples=["0123456789abcdef"],
-    )
-    name: str = Field(examples=["gaia-12deg"])
-    version: str = Field(examples=["1.0.0"])
-    title: str = Field(description="Name of its folder.", examples=["gaia-12deg-1.0.0"])
-    description: str = Field(description="Description from the spec.")
-    frame: str = Field(description="Axes of all positions.", examples=["ICRS"])
-    epoch_jyear: float = Field(description="Epoch of all positions, Julian year.")
-    catalog: str = Field(description="The star catalog.", examples=["gaia"])
-    stars: int = Field(description="Guide stars.")
-    bytes: int = Field(description="Size of all files together, without the manifest.")
-    products: dict[str, int] = Field(description="Rows of each product.")
-    manifest_sha256: str = Field(description="Digest that the manifest carries of itself.")
-    spec: dict[str, Any] = Field(description="The spec, with all defaults.")
-    software: dict[str, str] = Field(description="Versions of what built it.")
-
-
 class Databases(BaseModel):
     """All databases there are."""
 
-    databases: list[DatabaseFacts]
+    databases: list[Database]
 
 
 class DatabaseFile(BaseModel):
@@ -100,37 +78,16 @@ class CoverageAnswer(BaseModel):
     fields: CoverageFields
 
 
-def facts_of(database: Database) -> DatabaseFacts:
-    """Return what is said of a database."""
-    manifest, spec = database.manifest, database.spec
-    return DatabaseFacts(
-        id=database.id,
-        name=database.name,
-        version=database.version,
-        title=database.title,
-        description=database.description,
-        frame=manifest["frame"],
-        epoch_jyear=manifest["epoch_jyear"],
-        catalog=spec["catalog"]["source"],
-        stars=database.products.get("stars", 0),
-        bytes=database.bytes,
-        products=database.products,
-        manifest_sha256=str(manifest.get("manifest_sha256", "")),
-        spec=spec,
-        software=manifest["software"],
-    )
-
-
 @router.get("", summary="All databases")
 def all_databases(service: TheService, reader: Reader) -> Databases:
     """Return what databases there are, by name and version."""
-    return Databases(databases=[facts_of(one) for one in service.library.databases()])
+    return Databases(databases=service.library.databases())
 
 
 @router.get("/{database}", summary="One database")
-def one_database(database: DatabaseId, service: TheService, reader: Reader) -> DatabaseFacts:
+def one_database(database: DatabaseId, service: TheService, reader: Reader) -> Database:
     """Return what a database was made from, and what it holds."""
-    return facts_of(service.library.database(database))
+    return service.library.database(database)
 
 
 @router.get("/{database}/manifest", summary="Manifest", responses=SAME)

@@ -139,64 +139,18 @@ EXAMPLES: dict[str, Any] = {
 }
 
 
-class JobView(BaseModel):
-    """A job."""
-
-    id: str = Field(description="Thirty-two hexadecimal digits.")
-    kind: Kind = Field(description="Kind of work.")
-    key: str = Field(description="SHA-256 of all that the result depends on.")
-    owner: str = Field(description="User who requested it.")
-    title: str = Field(description="For people.")
-    state: State = Field(description="How far it is.")
-    request: dict[str, Any] = Field(description="The request.")
-    created_s: float = Field(description="Seconds since 1970.")
-    started_s: float | None = Field(None, description="When the last attempt began.")
-    ended_s: float | None = Field(None, description="When it ended.")
-    attempt: int = Field(description="How often it was begun.")
-    stage: str | None = Field(None, description="The stage that it is in.")
-    done: int | None = Field(None, description="How much of the stage is done.")
-    total: int | None = Field(None, description="Of how much, where that is known.")
-    error: dict[str, Any] | None = Field(None, description="Problem details, where it failed.")
-    result: dict[str, Any] | None = Field(
-        None, description="Result: the id of a database, a catalog, or rates."
-    )
-
-
 class JobPage(BaseModel):
     """Some of the jobs, the newest first."""
 
-    jobs: list[JobView] = Field(description="The jobs.")
+    jobs: list[Job] = Field(description="The jobs.")
     total: int = Field(description="Total number of jobs that match.")
-
-
-class EventView(BaseModel):
-    """Something that happened to a job."""
-
-    number: int = Field(
-        description="Number within its job, from 1; only the last stages are stored."
-    )
-    at_s: float = Field(description="Seconds since 1970.")
-    kind: Literal["state", "stage", "log"] = Field(description="What changed.")
-    data: dict[str, Any] = Field(
-        description="The state; the stage with 'done' and 'total'; or 'level' and 'text'."
-    )
-
-
-def view_of(job: Job) -> JobView:
-    """Return what is told of a job."""
-    return JobView.model_validate(job, from_attributes=True)
-
-
-def event_view(event: Event) -> EventView:
-    """Return what is told of an event."""
-    return EventView.model_validate(event, from_attributes=True)
 
 
 @router.post(
     "",
     status_code=201,
     responses={
-        200: {"model": JobView, "description": "A job was there that does the same."},
+        200: {"model": Job, "description": "A job was there that does the same."},
         507: {"description": "The disk of the service is nearly full."},
     },
     summary="Request a job",
@@ -206,7 +160,7 @@ def submit_job(
     response: Response,
     service: TheService,
     principal: Builder,
-) -> JobView:
+) -> Job:
     """Have a database built, a catalog read, or rates measured.
 
     The same request gives the same job while it waits, runs, or what it made is there.
@@ -214,7 +168,7 @@ def submit_job(
     submitted = _submitted(service, wish, principal.name)
     response.status_code = 201 if submitted.is_new else 200
     response.headers["Location"] = f"/api/v1/jobs/{submitted.job.id}"
-    return view_of(submitted.job)
+    return submitted.job
 
 
 def _submitted(service: Service, wish: AnyWish, owner: str) -> Submitted:
@@ -252,13 +206,13 @@ def list_jobs(
     """Return jobs, the newest first."""
     jobs = service.jobs.all(state=state, kind=kind, owner=owner, most=limit, skip=offset)
     total = service.jobs.count(state=state, kind=kind, owner=owner)
-    return JobPage(jobs=list(map(view_of, jobs)), total=total)
+    return JobPage(jobs=jobs, total=total)
 
 
 @router.get("/{job_id}", summary="Look at a job")
-async def show_job(job_id: JobId, service: TheService, principal: Reader) -> JobView:
+async def show_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
     """Return a job as it is now."""  # asked most often, and quicker than the way to a thread
-    return view_of(service.jobs.get(job_id))
+    return service.jobs.get(job_id)
 
 
 After = Annotated[
@@ -269,10 +223,10 @@ After = Annotated[
 @router.get("/{job_id}/events.json", summary="What happened to a job")
 def list_events(
     job_id: JobId, service: TheService, principal: Reader, after: After = 0
-) -> list[EventView]:
+) -> list[Event]:
     """Return what happened to a job so far."""
     service.jobs.get(job_id)
-    return [event_view(event) for event in service.jobs.events(job_id, after)]
+    return service.jobs.events(job_id, after)
 
 
 def _known_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
@@ -337,9 +291,9 @@ def _log_line(event: Event) -> str:
 
 
 @router.post("/{job_id}/cancel", summary="End a job")
-def end_job(job_id: JobId, service: TheService, principal: Builder) -> JobView:
+def end_job(job_id: JobId, service: TheService, principal: Builder) -> Job:
     """End a job that waits or runs; what it has begun to make is removed."""
-    return view_of(cancel_job(service, job_id, principal))
+    return cancel_job(service, job_id, principal)
 
 
 @router.post(
@@ -347,6 +301,6 @@ def end_job(job_id: JobId, service: TheService, principal: Builder) -> JobView:
     responses={507: {"description": "The disk of the service is nearly full."}},
     summary="Try a job again",
 )
-def try_again(job_id: JobId, service: TheService, principal: Builder) -> JobView:
+def try_again(job_id: JobId, service: TheService, principal: Builder) -> Job:
     """Have a job that failed or was cancelled done once more."""
-    return view_of(retry_job(service, job_id, principal))
+    return retry_job(service, job_id, principal)

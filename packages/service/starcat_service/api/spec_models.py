@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.estimate import Estimate
-from starcat.pipeline.starter import Starter, advice
+from starcat.pipeline.starter import LimitRow, Starter, advice
+from starcat.products.coverage import Spread
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
@@ -44,18 +44,6 @@ class Presets(BaseModel):
     presets: list[PresetFacts]
 
 
-class SpreadFacts(BaseModel):
-    """How a number is spread over the fields."""
-
-    model_config = ConfigDict(from_attributes=True)
-
-    minimum: int
-    one_percent: int = Field(description="1 % of the fields have no more.")
-    median: int
-    maximum: int
-    mean: Annotated[float, AfterValidator(partial(round, ndigits=3))]
-
-
 class WorstField(BaseModel):
     """The field with the fewest stars."""
 
@@ -69,7 +57,7 @@ class FieldFigures(BaseModel):
     """Guide stars in the fields of the tiling."""
 
     count: int = Field(description="Boresights.")
-    stars: SpreadFacts
+    stars: Spread
     enough_share: float = Field(description="Share of the fields with at least 4 stars.")
     full_share: float = Field(
         description="Share of fields with ``boresights.brightest`` stars, the number for triangles."
@@ -148,22 +136,12 @@ class StarterRequest(BaseModel):
     )
 
 
-class LimitFigures(BaseModel):
-    """What a magnitude limit leaves in a field."""
-
-    model_config = ConfigDict(from_attributes=True)
-
-    faint_limit_mag: float
-    guide_stars: int
-    stars: SpreadFacts
-
-
 class StarterAnswer(BaseModel):
     """A first spec for a camera, as 'starcat init' writes it."""
 
     checked: CheckedSpec
-    limits: list[LimitFigures] = Field(description="Its own limit, and some around it.")
-    thinned: LimitFigures = Field(description="Faintest magnitude left after thinning.")
+    limits: list[LimitRow] = Field(description="Its own limit, and some around it.")
+    thinned: LimitRow = Field(description="Faintest magnitude left after thinning.")
     advice: list[str] = Field(description="Remarks on the limit.")
     in_words: str = Field(description="Size, memory and time of the build, in one line.")
 
@@ -198,7 +176,7 @@ def estimate_answer(found: Estimate) -> EstimateAnswer:
         guide_stars=cost.stars,
         fields=FieldFigures(
             count=cost.fields,
-            stars=SpreadFacts.model_validate(coverage.stars),
+            stars=coverage.stars,
             enough_share=round(found.enough_share, 6),
             full_share=round(found.full_share, 6),
             worst=WorstField(
@@ -216,7 +194,7 @@ def estimate_answer(found: Estimate) -> EstimateAnswer:
         memory_bytes=cost.memory_bytes,
         read_seconds=round(found.read_seconds, 2),
         build_seconds=round(found.build_seconds, 2),
-        refusals=list(found.refusals),
+        refusals=list(map(str, found.refusals)),
         warnings=list(found.warnings),
         in_words=cost.in_words,
     )
@@ -226,8 +204,8 @@ def starter_answer(starter: Starter) -> StarterAnswer:
     """Return what is said of a first spec."""
     return StarterAnswer(
         checked=checked_spec(starter.spec),
-        limits=[LimitFigures.model_validate(row) for row in starter.limits],
-        thinned=LimitFigures.model_validate(starter.thinned),
+        limits=list(starter.limits),
+        thinned=starter.thinned,
         advice=list(advice(starter)),
         in_words=starter.cost.in_words,
     )

@@ -10,16 +10,15 @@ from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.errors import QueryError
+from starcat.errors import AnswerTooLarge, QueryError
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.engine import AnswerTooLarge
-from starcat.query.gallery import gallery, macros, named_query
+from starcat.query.gallery import Macro, NamedQuery, gallery, macros, named_query
 from starcat.query.result import ResultTable
 from starcat.query.targets import View
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import chunks_of, scratch_folder, write_rows
+from starcat_service.transfers import open_attachment, scratch_folder, write_rows
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -59,53 +58,6 @@ class SqlQuestion(BaseModel):
     format: Form = Field("rows", description="Rows as JSON lists, or a file.")
     max_rows: int | None = Field(None, ge=1, description="Rows at most; by default 1000, or all.")
     time_limit_s: float | None = Field(None, gt=0, description="Seconds that it may take.")
-
-
-class Column(BaseModel):
-    """A column of an answer."""
-
-    name: str
-    type: str = Field(description="As DuckDB calls it.", examples=["DOUBLE"])
-    unit: str = Field(examples=["deg"])
-    description: str
-
-
-class SqlRows(BaseModel):
-    """An answer in rows."""
-
-    columns: list[Column]
-    rows: list[list[Any]] = Field(
-        description="Integers beyond 2^53 are text; NaN and infinities are null."
-    )
-    is_cut: bool = Field(description="Whether there are more rows.")
-
-
-class GalleryValue(BaseModel):
-    """A value that a named query can be given."""
-
-    name: str
-    default: Plain
-    help: str
-
-
-class GalleryQuery(BaseModel):
-    """A query that people ask often."""
-
-    name: str
-    help: str = Field(description="Description.")
-    targets: int = Field(description="How many targets it is about.")
-    values: list[GalleryValue]
-    text: str = Field(description="SQL.")
-
-
-class MacroFacts(BaseModel):
-    """A function of queries."""
-
-    name: str
-    arguments: str
-    is_table: bool = Field(description="Whether it is a table macro, used after FROM.")
-    help: str
-    example: str
 
 
 class ViewColumn(BaseModel):
@@ -173,19 +125,14 @@ def result_file(
         ):
             count, is_cut = write_rows(running.batches(), source, query.max_rows)
         service.sandbox.convert(source, target, form)
-        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
-    headers = {
-        "Content-Length": str(size),
-        "Content-Disposition": f'attachment; filename="{stem}{FORMATS[form].suffix}"',
-    }
-    answer = StreamingResponse(chunks, media_type=FORMATS[form].media_type, headers=headers)
+        answer = open_attachment(target, f"{stem}{FORMATS[form].suffix}", FORMATS[form].media_type)
     return answer, count, is_cut
 
 
 @router.post(
     "",
     summary="Run a query",
-    response_model=SqlRows,
+    response_model=ResultTable,
     responses={
         200: {
             "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
@@ -200,25 +147,22 @@ def result_file(
 )
 async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
     """Run an SQL query on databases and catalogs; nothing is ever written."""
-    asked = _checked(service, question)
+    asked = query_of(service, question)
     if question.format == "rows":
         return await service.query_pool.run(_rows, service, asked)
     return await service.query_pool.run(_file, service, asked, question.format)
 
 
 @router.get("/queries", summary="Queries by name")
-def queries(reader: Reader) -> list[GalleryQuery]:
+def queries(reader: Reader) -> list[NamedQuery]:
     """Return the queries that people ask often, with their values."""
-    return [
-        GalleryQuery.model_validate(query, from_attributes=True) for query in gallery().values()
-    ]
+    return list(gallery().values())
 
 
 @router.get("/macros", summary="Functions of queries")
-def all_macros(reader: Reader) -> list[MacroFacts]:
+def all_macros(reader: Reader) -> list[Macro]:
     """Return the functions that queries have beside those of DuckDB."""
-    listed = sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
-    return [MacroFacts.model_validate(one, from_attributes=True) for one in listed]
+    return sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
 
 
 @router.get("/views", summary="Tables of targets")
@@ -234,8 +178,8 @@ async def views(
     return await service.query_pool.run(_views, service, target)
 
 
-def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
-    """Return what is asked, within the limits that the operator set."""
+def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
+    """Return the query of a question, within the limits that the operator set."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
     settings = service.settings

@@ -12,7 +12,9 @@ import sqlite3
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from starcat.errors import TargetMissing
 from starcat_service.paths import JOB_ID, checked
@@ -42,22 +44,24 @@ NO_STAGE = "stage = NULL, done = NULL, total = NULL"
 class Job:
     """A job; times are seconds since 1970."""
 
-    id: str  # 32 hexadecimal digits
-    kind: Kind
-    key: str  # SHA-256 of all that the result depends on
-    owner: str
-    title: str  # for people, such as "gaia-12deg 1.0.0"
-    state: State
-    request: dict[str, Any]
-    created_s: float
-    started_s: float | None
-    ended_s: float | None
-    attempt: int  # how often it was begun
-    stage: str | None
-    done: int | None  # of the stage
-    total: int | None
-    error: dict[str, Any] | None  # problem details
-    result: dict[str, Any] | None  # such as {"database": "0123456789abcdef"}
+    id: Annotated[str, Field(description="Thirty-two hexadecimal digits.")]
+    kind: Annotated[Kind, Field(description="Kind of work.")]
+    key: Annotated[str, Field(description="SHA-256 of all that the result depends on.")]
+    owner: Annotated[str, Field(description="User who requested it.")]
+    title: Annotated[str, Field(description="For people, such as ``gaia-12deg 1.0.0``.")]
+    state: Annotated[State, Field(description="How far it is.")]
+    request: Annotated[dict[str, Any], Field(description="The request.")]
+    created_s: Annotated[float, Field(description="When it was requested.")]
+    started_s: Annotated[float | None, Field(description="When the last attempt began.")]
+    ended_s: Annotated[float | None, Field(description="When it ended.")]
+    attempt: Annotated[int, Field(description="How often it was begun.")]
+    stage: Annotated[str | None, Field(description="The stage that it is in.")]
+    done: Annotated[int | None, Field(description="How much of the stage is done.")]
+    total: Annotated[int | None, Field(description="Of how much, where that is known.")]
+    error: Annotated[dict[str, Any] | None, Field(description="Problem details of a failure.")]
+    result: Annotated[
+        dict[str, Any] | None, Field(description="The id of a database, a catalog, or rates.")
+    ]
 
     @property
     def has_ended(self) -> bool:
@@ -67,12 +71,17 @@ class Job:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job: ``data`` is a state, a stage, or a line of the log."""
+    """Something that happened to a job."""
 
-    number: int  # 1, 2, 3 ... of its job
-    at_s: float
-    kind: str  # "state", "stage" or "log"
-    data: dict[str, Any]
+    number: Annotated[
+        int, Field(description="Number within its job, from 1; only the last stages are stored.")
+    ]
+    at_s: Annotated[float, Field(description="Seconds since 1970.")]
+    kind: Annotated[Literal["state", "stage", "log"], Field(description="What changed.")]
+    data: Annotated[
+        dict[str, Any],
+        Field(description="The state; the stage with 'done' and 'total'; or 'level' and 'text'."),
+    ]
 
 
 class JobStore:

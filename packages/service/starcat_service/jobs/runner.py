@@ -6,20 +6,20 @@ stops; nothing is left of an attempt but what it has finished.
 
 from __future__ import annotations
 
-import json
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from starcat.storage.atomic import make_folder
+from starcat.workers.messages import DONE, ERROR, MalformedMessage, from_json
+from starcat.workers.process import WorkerProcess
 from starcat_service.jobs.job import Outcome, failed
 from starcat_service.jobs.work import Order, out_of_memory
-from starcat_service.sandbox.child import Child
 
 TASK = "starcat_service.jobs.work:main"
 
@@ -59,60 +59,61 @@ class Processes:
     """The processes of jobs that run."""
 
     def __init__(self) -> None:
-        self.children: set[Child] = set()
+        self.running: set[WorkerProcess] = set()
         self._lock = threading.Lock()
 
     def run(self, order: Order, report: Report, reason_to_end: ReasonToEnd) -> Outcome:
         """Run the process of a job until it ends, or has to."""
         ended: Outcome | None = None
         told: Outcome | None = None
-        with self._started(order) as child:
-            for line in child.lines(TICK_S):
-                if line is not None:
-                    told = _outcome_in(line, report) or told
-                elif ended is None and told is None:
+        looked_s = time.monotonic()
+        with self._started(order) as worker, suppress(EOFError, MalformedMessage):
+            while True:
+                reply = worker.receive(TICK_S)
+                if reply is not None:
+                    told = _outcome_of(*reply, report) or told
+                if time.monotonic() - looked_s >= TICK_S and ended is None and told is None:
+                    looked_s = time.monotonic()
                     ended = reason_to_end()
                     if ended is not None:
-                        child.kill()
+                        worker.kill()
         if told is not None and (told.state == "done" or ended is None):
             return told  # it was faster than whoever wanted its end
-        return ended or _death(child.wait(), order)
+        return ended or _death(worker.wait() or 0, order)
 
     def end_all(self) -> None:
         """End all processes at once."""
         with self._lock:
-            for child in self.children:
-                child.kill()
+            for worker in self.running:
+                worker.kill()
 
     @contextmanager
-    def _started(self, order: Order) -> Iterator[Child]:
+    def _started(self, order: Order) -> Iterator[WorkerProcess]:
         """Start the process of a job, in a group of its own, and see that it has ended."""
         make_folder(order.paths.job(order.job_id))
         with order.paths.job_stderr(order.job_id).open("wb") as stderr:
-            # Arrow's own allocators reserve gigabytes, which count as memory that is used.
-            environment = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MPLBACKEND": "agg"}
-            child = Child(TASK, environment=environment, stderr=stderr, has_group=True)
+            worker = WorkerProcess(
+                TASK, environment={"MPLBACKEND": "agg"}, stderr=stderr, has_group=True
+            )
         with self._lock:
-            self.children.add(child)
+            self.running.add(worker)
         try:
-            child.send(asdict(order))
-            yield child
+            with suppress(OSError):  # what it died of is told by how it ended
+                worker.send(asdict(order))
+            yield worker
         finally:
-            child.close()
+            worker.close()
             with self._lock:
-                self.children.discard(child)
+                self.running.discard(worker)
 
 
-def _outcome_in(line: bytes, report: Report) -> Outcome | None:
-    try:
-        message: dict[str, Any] = json.loads(line)
-    except ValueError:  # cut off
-        return None
-    if "result" in message:
-        return Outcome("done", message["result"])
-    if "error" in message:
-        return Outcome("failed", message["error"])
-    report(message)
+def _outcome_of(kind: str, content: bytes | bytearray, report: Report) -> Outcome | None:
+    found: dict[str, Any] = from_json(content)
+    if kind == DONE:
+        return Outcome("done", found)
+    if kind == ERROR:
+        return Outcome("failed", found)
+    report(found)
     return None
 
 

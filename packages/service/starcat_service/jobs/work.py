@@ -1,8 +1,7 @@
 """The process of one job: it reads an order, says how far it is, and leaves a result or an error.
 
-The order is the first line of its input. What it has to say are lines of JSON on its output: a
-stage, a line of the log, and at last the result or the error. It ends when its input does, which
-is when the worker that started it is gone.
+What it has to say are messages of `starcat.workers`: a stage, a line of the log, and at last the
+result or the error. It ends when its input does, which is when the server that started it is gone.
 
 What the kinds of jobs do is a function each, from a request to a result. What a job makes is made
 in a folder of its own, and moved to its place in one step when it is whole; what is there already
@@ -12,7 +11,6 @@ is not made again.
 from __future__ import annotations
 
 import ctypes
-import json
 import logging
 import os
 import shutil
@@ -26,17 +24,18 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.query.confinement import limit_memory
 from starcat.storage.atomic import sync
 from starcat.storage.locks import locked
+from starcat.workers.channel import Channel
+from starcat.workers.confinement import limit_memory
+from starcat.workers.messages import DONE, ERROR, PROGRESS
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
-from starcat_service.sandbox.child import own_output
 from starcat_service.settings import Settings
 
 NICENESS = 10
@@ -250,10 +249,10 @@ def threads_of(workers: int) -> int:
 
 
 class Messages:
-    """What happens, written as lines of JSON."""
+    """What happens, sent to the server."""
 
-    def __init__(self, output: IO[bytes]) -> None:
-        self._output = output
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
         self._lock = threading.Lock()
         self._stage, self._at_s = "", 0.0
 
@@ -268,19 +267,16 @@ class Messages:
             if is_last and not is_new and now - self._at_s < 0.05:
                 return
             self._stage, self._at_s = stage, now
-        self.write(
-            {"stage": stage, "done": int(done), "total": None if total is None else int(total)}
-        )
+        content = {
+            "stage": stage,
+            "done": int(done),
+            "total": None if total is None else int(total),
+        }
+        self._channel.send(PROGRESS, content)
 
     def log(self, level: str, text: str) -> None:
         """Write a line of the log."""
-        self.write({"log": text[:MAX_LINE], "level": level})
-
-    def write(self, content: dict[str, Any]) -> None:
-        """Write any message."""
-        with self._lock:
-            self._output.write(json.dumps(content).encode() + b"\n")
-            self._output.flush()
+        self._channel.send(PROGRESS, {"log": text[:MAX_LINE], "level": level})
 
 
 class _Lines(logging.Handler):
@@ -298,9 +294,10 @@ class _Lines(logging.Handler):
 def main() -> None:
     """Read the order, and do it."""
     _end_with_parent()
-    messages = Messages(own_output())
-    order = Order(**json.loads(sys.stdin.buffer.readline()))
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    channel = Channel()
+    messages = Messages(channel)
+    order = Order(**channel.receive())
+    threading.Thread(target=_end_with_input, args=(channel,), daemon=True).start()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
         # What answers somebody who waits gets a processor at once, where Linux can do that.
@@ -314,9 +311,9 @@ def main() -> None:
         prepare(order.kind)
         limit_memory(order.memory_bytes)
         try:
-            messages.write({"result": _do_job(order, messages.stage, messages.log)})
+            channel.send(DONE, _do_job(order, messages.stage, messages.log))
         except Exception as error:
-            messages.write({"error": _problem_of(error, order)})
+            channel.send(ERROR, _problem_of(error, order))
     sys.stderr.flush()
     os._exit(0)  # whatever threads of libraries do
 
@@ -326,10 +323,9 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
 
 
-def _end_with_input() -> None:
+def _end_with_input(channel: Channel) -> None:
     """End this process, and those that it has started, when its input ends."""
-    while sys.stdin.buffer.read(1):
-        pass
+    channel.wait_for_end()
     if hasattr(os, "killpg") and os.getpgid(0) == os.getpid():
         os.killpg(os.getpid(), signal.SIGKILL)
     os._exit(1)

@@ -16,7 +16,7 @@ from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
 from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
 from starcat.query.result import ResultTable
 from starcat_service.access import Reader
-from starcat_service.api.sql import SqlQuery, result_file, result_table
+from starcat_service.api.sql import Form, SqlQuery, SqlQuestion, query_of, result_file, result_table
 from starcat_service.library import Database
 from starcat_service.pages.facts import database_rows, products_of
 from starcat_service.pages.notebook import Notebook, query_code
@@ -98,32 +98,35 @@ async def answer_file(
 ) -> Response:
     """Give all rows of an answer as a file."""
     database = service.library.database(database_id)
-    query = _checked(service, database.id, asked, service.settings.max_rows)
+    query = _query(service, database.id, asked, form)
     found = await service.query_pool.run(result_file, service, query, form, database.title)
     return found[0]
 
 
 def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
-    most = min(form.rows, service.settings.max_rows)
-    found = result_table(service, _checked(service, database_id, form, most))
-    return found.with_json_values()
+    return result_table(service, _query(service, database_id, form)).with_json_values()
 
 
-def _checked(service: Service, database_id: str, form: ConsoleForm, most: int) -> SqlQuery:
+def _query(
+    service: Service, database_id: str, form: ConsoleForm, file_format: Form = "rows"
+) -> SqlQuery:
     """Return the query of a form with its values as numbers where they look like numbers."""
     if not form.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
-    targets = [database_id, *([form.other] if form.other else [])]
+    question = SqlQuestion(
+        targets=[database_id, *([form.other] if form.other else [])],
+        query=form.query,
+        values={name: guessed(text) for name, text in form.values.items()},
+        format=file_format,
+        max_rows=form.rows if file_format == "rows" else None,
+    )
     chosen = _chosen(form.named)
-    values: Mapping[str, Any]
     if chosen is not None and form.query.strip() == chosen.text.strip():
-        if chosen.targets != len(targets):
-            raise QueryError(f"{chosen.name} is about {chosen.targets} targets; choose the other")
         known = {value.name for value in chosen.values}
-        values = chosen.with_values({n: t for n, t in form.values.items() if n in known})
-    else:
-        values = {name: guessed(text) for name, text in form.values.items()}
-    return SqlQuery(targets, form.query, values, most, service.settings.query_time_s)
+        values = {name: text for name, text in form.values.items() if name in known}
+        named = {"query": None, "named": chosen.name, "values": values}
+        question = question.model_copy(update=named)
+    return query_of(service, question)
 
 
 def _page(
@@ -164,7 +167,7 @@ def _page(
 def _notebook(
     request: Request, service: Service, database: Database, form: ConsoleForm
 ) -> Notebook:
-    asked = _checked(service, database.id, form, min(form.rows, service.settings.max_rows))
+    asked = _query(service, database.id, form)
     code = query_code(
         address_of(request, service), list(asked.targets), asked.text, asked.values, asked.max_rows
     )

@@ -30,7 +30,6 @@ from starcat_service.jobs.submission import submit_evaluation
 from starcat_service.library import Database
 from starcat_service.pages.downloads import image_choices
 from starcat_service.pages.facts import (
-    MANIFEST_DIGEST,
     database_rows,
     products_of,
     rejections_of,
@@ -99,7 +98,7 @@ def one_database(
             if set(method.products) <= set(manifest["products"])
         ],
         files=sorted(manifest["files"].items()),
-        digest=manifest[MANIFEST_DIGEST],
+        digest=database.manifest_sha256,
         may_evaluate=reader.role >= Role.BUILDER,
     )
 

@@ -21,7 +21,6 @@ from starcat_service.pages.draft import (
     draft_of_text,
     without_defaults,
 )
-from starcat_service.pages.naming import FOLLOWING, followed
 
 PRESET, PINNED = "preset", "pinned"
 OTHERS = (PRESET, PINNED, TEXT, "job", "database")
@@ -54,7 +53,7 @@ def draft_of_query(query: Mapping[str, str]) -> Draft:
         return draft_of_text(query[TEXT])
     changes = {key: text for key, text in query.items() if key not in OTHERS}
     try:
-        return draft_of_content(_content(query.get(PRESET) or preset_names()[0], changes))
+        return draft_of_content(changed(_base(query.get(PRESET) or preset_names()[0]), changes))
     except (ConfigError, ValueError, TypeError) as error:
         raise ConfigError(f"the address is of no design: {error}", key="address") from None
 
@@ -77,21 +76,11 @@ def _changes(draft: Draft, base: str) -> dict[str, str] | None:
     changes |= {key: "" for key in before if key not in after}
     if any(key in OTHERS for key in changes):
         return None
-    own = {key: changes.pop(key, _typed(after.get(key, ""))) for key in FOLLOWING}
     try:
-        followed_by = _content(base, changes)
-        changes |= {k: v for k, v in own.items() if followed_by.get(k) != draft.content.get(k)}
-        same = _content(base, changes)
+        same = changed(_base(base), changes)
     except (ConfigError, ValueError, TypeError):
         return None
     return changes if same == draft.content else None
-
-
-def _content(base: str, changes: dict[str, str]) -> dict[str, Any]:
-    """Return a preset as it is changed; name and description follow where they are not given."""
-    content = changed(_base(base), changes)
-    own = followed(content) if changes else {}
-    return content | {key: text for key, text in own.items() if key not in changes}
 
 
 def _leaves(content: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

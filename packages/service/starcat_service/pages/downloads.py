@@ -6,14 +6,14 @@ from typing import Annotated, Any, Literal
 
 import tomlkit
 from fastapi import Query
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import Response
 
 from starcat.onboard.layout import BYTE_ORDERS, FEATURES
 from starcat_service.access import Reader
 from starcat_service.library import Database
 from starcat_service.pages.rendering import page_router
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import BYTES, TYPES, chunks_of, scratch_folder
+from starcat_service.transfers import BYTES, TYPES, open_attachment, scratch_folder
 
 router = page_router()
 
@@ -48,12 +48,7 @@ def _image(service: Service, database: Database, method: str, endian: str) -> Re
         target = folder / "image.img"
         arguments = {"artifact": str(database.folder), "target": str(target)}
         service.sandbox.call("flight_image", {**arguments, "method": method, "endian": endian})
-        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
-    headers = {
-        "Content-Length": str(size),
-        "Content-Disposition": f'attachment; filename="{database.title}.img"',
-    }
-    return StreamingResponse(chunks, media_type=BYTES, headers=headers)
+        return open_attachment(target, f"{database.title}.img", BYTES)
 
 
 @router.get("/databases/{database_id}/spec.toml")

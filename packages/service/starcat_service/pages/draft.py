@@ -19,10 +19,16 @@ from tomlkit.exceptions import TOMLKitError
 
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import all_that_is_wrong, content_of_toml, put_key, spec_from_dict
-from starcat_service.pages.naming import followed, value_at
+from starcat.specs.reading import (
+    all_that_is_wrong,
+    content_of_toml,
+    put_key,
+    spec_from_dict,
+    value_at,
+)
 from starcat_service.pages.response import FILE, NAME, keys_of_another, responses_of
 
 ORIGIN = "spec"  # what messages call the text
@@ -59,17 +65,6 @@ FIELDS = (
     "selection.neighbours.action",
 )
 """Keys that the form has a field for, by the same names."""
-
-PRODUCTS = (
-    "pairs",
-    "triangles",
-    "neighbours",
-    "hausdorff_angular",
-    "hausdorff_l2",
-    "grid",
-    "radial",
-)
-"""Products that the form has a box for."""
 
 _OF_LENS = {"field": ("camera.focal_length_mm", "camera.pixel_um"), "focal": ("camera.fov_x_deg",)}
 """What goes away where a camera is told by the one or by the other."""
@@ -111,6 +106,12 @@ class Draft:
             for key, words in self._beside(error).items():
                 found.setdefault(key, words)
         return found
+
+    def field_of(self, key: str | None) -> str | None:
+        """Return the field of a key, or the first field of a section; None if there is none."""
+        if not key:
+            return None
+        return next((name for name in self.values if f"{name}.".startswith(f"{key}.")), None)
 
     def _beside(self, error: ConfigError) -> dict[str, str]:
         key = error.key or ""
@@ -159,16 +160,8 @@ def draft_with(draft: Draft, changes: Mapping[str, Any]) -> Draft:
 
 
 def _edited(draft: Draft, edit: _Edit) -> Draft:
-    """Return a draft as it was edited; its name and description follow unless they are somebody's.
-
-    What starcat has called it tells the catalog, the limit and the camera: it would be wrong.
-    """
-    if not edit.changes:
-        return draft
-    for key, value in followed(edit.content).items():
-        if key not in edit.changes:
-            edit.put(key, value)
-    return _draft(edit.content, edit.text(draft.text))
+    """Return a draft with the changes of an edit."""
+    return _draft(edit.content, edit.text(draft.text)) if edit.changes else draft
 
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
@@ -178,7 +171,7 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
         draft,
         values=values,
         lens="focal" if form.get(LENS) == "focal" else "field",
-        products={name: f"products.{name}.{ENABLED}" in form for name in PRODUCTS},
+        products={name: f"products.{name}.{ENABLED}" in form for name in USUAL_PRODUCTS},
         bands=bands_of(form.get("catalog.source", "")),
         responses=responses_of(values[NAME]),
     )
@@ -211,7 +204,8 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
                 wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN))
     has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
     enabled = {
-        name: value_at(content, f"products.{name}.{ENABLED}") is not False for name in PRODUCTS
+        name: value_at(content, f"products.{name}.{ENABLED}") is not False
+        for name in USUAL_PRODUCTS
     }
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
@@ -313,7 +307,7 @@ def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
     if lens in _OF_LENS:
         _change_lens(edit, lens)
     if "products" in form:
-        for name in PRODUCTS:
+        for name in USUAL_PRODUCTS:
             is_wanted = f"products.{name}.{ENABLED}" in form
             if is_wanted != (value_at(content, f"products.{name}.{ENABLED}") is not False):
                 edit.put(f"products.{name}.{ENABLED}", None if is_wanted else False)

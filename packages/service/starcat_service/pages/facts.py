@@ -13,14 +13,14 @@ from typing import Any
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import rates_of
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
+from starcat_service.api.databases import REPORT
 from starcat_service.library import Database
 from starcat_service.service import Service
 
-REPORT = "report/report.json"
-MANIFEST_DIGEST = "manifest_sha256"  # key of a manifest with the digest of all the others
 NOT_LISTED = (Reason.beyond_read_limit.name,)
 """Reasons whose records are counted and not in the product ``rejected``."""
 
@@ -108,7 +108,7 @@ def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     for source in manifest["sources"]:
         if source["role"] == "stars":
             counts.update(source["rejected"])
-    words = {reason.name: reason.value for reason in Reason}
+    words = ALL_REASONS
     return [
         {
             "name": name.replace("_", " "),

@@ -14,6 +14,7 @@ from starlette.datastructures import UploadFile
 from starcat.catalog.source import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.pipeline.starter import advice
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.build_spec import CameraSpec
 from starcat.specs.reading import preset, preset_names
 from starcat_service.access import Reader, principal_of
@@ -28,7 +29,6 @@ from starcat_service.pages.design import (
     query_of,
 )
 from starcat_service.pages.draft import (
-    PRODUCTS,
     TEXT,
     Draft,
     draft_of_content,
@@ -198,7 +198,7 @@ def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
         "boresights.count": boresights.count,
         "boresights.brightest": boresights.brightest,
     }
-    for name in PRODUCTS:
+    for name in USUAL_PRODUCTS:
         changes[f"products.{name}.enabled"] = False if name in starter.left_out else None
     fov = camera.camera()
     told = (
@@ -216,20 +216,20 @@ def _shown(
     errors, problem = dict(draft.errors), None
     seen, found = _preview(service, draft)
     if found is not None:
-        key = found.key if found.key in draft.values else _key_in(found.detail, draft)
-        if key is None or found.status == 503:
+        field = draft.field_of(found.key)
+        if field is None or found.status == 503:
             problem = found
         else:
-            errors[key] = found.detail
+            errors[field] = found.detail
     if draft.spec is not None:
         errors |= _taken(service, draft)
     refusals = []
-    for text in seen.estimate.refusals if seen else ():
-        key = _key_in(text, draft)
-        if key is None:
-            refusals.append(text)
+    for error in seen.estimate.refusals if seen else ():
+        field = draft.field_of(error.key)
+        if field is None:
+            refusals.append(str(error))
         else:
-            errors.setdefault(key, text)
+            errors.setdefault(field, str(error))
     is_refused = seen is not None and bool(refusals or seen.verdict.will_fail)
     is_busy = problem is not None and problem.status == 503
     return {
@@ -245,14 +245,6 @@ def _shown(
         "pinned_query": form.get(PINNED, ""),
         **_pinned(service, draft, form),
     }
-
-
-def _key_in(message: str, draft: Draft) -> str | None:
-    """Return the first key of a message that the form has a field for."""
-    places = {key: message.find(key) for key in draft.values if "." in key and key in message}
-    if not places and "[selection]" in message:
-        return "selection.faint_limit_mag"
-    return min(places, key=places.__getitem__) if places else None
 
 
 def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
@@ -390,6 +382,6 @@ def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
     found = []
     for one in service.catalogs.offered():
-        told = one.source.identifier if one.is_here else "its files are not here"
-        found.append((one.source.name, f"{one.source.name} – {told}"))
+        told = data_source(one.name).identifier if one.is_here else "its files are not here"
+        found.append((one.name, f"{one.name} – {told}"))
     return found

@@ -10,7 +10,7 @@ from typing import Any
 from starcat.bands.response import response_from_text, shipped, shipped_names
 from starcat.errors import ConfigError
 from starcat.specs.camera_response import MOST_ROWS
-from starcat_service.pages.naming import value_at
+from starcat.specs.reading import value_at
 
 NAME = "camera.response.name"
 FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import threading
+import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as OutOfTime
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
-from starcat.errors import QueryError, QueryLimitError
+from starcat.errors import QueryError
 from starcat.query.engine import Allowance, warm_up
 from starcat.query.session import Limits, Session, open_session
 from starcat.storage.atomic import make_folder
 from starcat_service.paths import ServicePaths
-from starcat_service.sandbox.places import SHORT_PLACES, Lanes, Overdue, lease
+from starcat_service.sandbox.limiter import Limiter
 from starcat_service.settings import Settings
+
+SHORT_PLACES = 6
+"""Queries that run at the same time beside `Settings.queries` that take long."""
+
+SHORT_S = 0.25
+"""Seconds of a processor after which a query leaves the processors to others."""
 
 IDLE = 2 * SHORT_PLACES
 """Query sessions that are kept while nobody asks; those used longest ago are closed first. SQL and
@@ -65,21 +72,22 @@ class Pool(Generic[K, ProcessT]):
     """Processes that are kept for the next request with the same key.
 
     One that an error was raised with is closed, unless the error is one of ``harmless``; the
-    processes that were used longest ago are closed where more than ``most_idle`` are idle.
+    processes that were used longest ago are closed where more than ``max_idle`` are idle.
     """
 
     def __init__(
         self,
         begin: Callable[[K], AbstractContextManager[ProcessT]],
-        most_idle: int,
+        max_idle: int,
         harmless: tuple[type[Exception], ...] = (),
     ) -> None:
-        self._begin, self._most_idle, self._harmless = begin, most_idle, harmless
+        self._begin, self._max_idle, self._harmless = begin, max_idle, harmless
         self._idle: list[Lent[K, ProcessT]] = []
         self._lent: list[Lent[K, ProcessT]] = []
-        self._wanted: list[tuple[K, Future[Lent[K, ProcessT]]]] = []
-        self._beginning: list[K] = []  # keys of the processes that are being started
-        self._lock = threading.Lock()
+        self._wanted: Counter[K] = Counter()  # requests that wait for a process
+        self._beginning: Counter[K] = Counter()  # processes that are being started
+        self._failed: dict[K, list[BaseException]] = {}  # why some could not be started
+        self._changed = threading.Condition()
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
 
@@ -95,20 +103,20 @@ class Pool(Generic[K, ProcessT]):
             is_reusable = True
             raise
         finally:
-            with self._lock:
+            with self._changed:
                 self._lent.remove(lent)
-            self._give_back(lent, is_reusable and lent[1].is_running)
+            self._keep(lent, is_reusable and lent[1].is_running)
 
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
-        with self._lock:
+        with self._changed:
             gone = [one for one in self._idle if is_gone(one[0])]
             self._idle[:] = [one for one in self._idle if one not in gone]
         _close(gone)
 
     def close(self) -> None:
         """Close all processes; whoever uses one finds that it has ended."""
-        with self._lock:
+        with self._changed:
             self._is_closed = True
             lent = list(self._lent)
         self.forget(lambda _: True)
@@ -116,25 +124,28 @@ class Pool(Generic[K, ProcessT]):
 
     def _obtained(self, key: K) -> Lent[K, ProcessT]:
         """Return the process that is free first: one that others give back, or a new one."""
-        with self._lock:
-            found = self._idle_one(key)
-            if found is not None:
-                self._lent.append(found)
-                return found
-            waiting: Future[Lent[K, ProcessT]] = Future()
-            self._wanted.append((key, waiting))
-            is_used = key in self._beginning or any(one[0] == key for one in self._lent)
-        with suppress(OutOfTime):
-            return waiting.result(BACK_S if is_used else 0.0)
-        with self._lock:
-            self._begin_wanted(key)
-        return waiting.result()
-
-    def _begin_wanted(self, key: K) -> None:
-        wanted = sum(one == key for one, _ in self._wanted)
-        if self._beginning.count(key) < min(wanted, BEGINNING):
-            self._beginning.append(key)
-            threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+        with self._changed:
+            is_used = self._beginning[key] or any(one[0] == key for one in self._lent)
+            begins_s = time.monotonic() + (BACK_S if is_used else 0.0)
+            self._wanted[key] += 1
+            try:
+                while (found := self._idle_one(key)) is None:
+                    if self._failed.get(key):
+                        raise self._failed[key].pop()
+                    left_s = begins_s - time.monotonic()
+                    if left_s > 0.0:
+                        self._changed.wait(left_s)
+                        continue
+                    if self._beginning[key] < min(self._wanted[key], BEGINNING):
+                        self._beginning[key] += 1
+                        threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+                    self._changed.wait()
+            finally:
+                self._wanted -= Counter((key,))
+                if not self._wanted[key]:
+                    self._failed.pop(key, None)
+            self._lent.append(found)
+            return found
 
     def _begin_one(self, key: K) -> None:
         made: Lent[K, ProcessT] | BaseException
@@ -143,23 +154,14 @@ class Pool(Generic[K, ProcessT]):
                 made = key, closing.enter_context(self._begin(key)), closing.pop_all()
         except BaseException as error:
             made = error
-        with self._lock:
-            self._beginning.remove(key)
+        with self._changed:
+            self._beginning -= Counter((key,))
             if isinstance(made, BaseException):
-                waiting = self._next_wanted(key)
-                if waiting is not None:
-                    waiting.set_exception(made)
-        if not isinstance(made, BaseException):
-            self._give_back(made, True)
-        with self._lock:
-            self._begin_wanted(key)
-
-    def _next_wanted(self, key: K) -> Future[Lent[K, ProcessT]] | None:
-        for number, (one, waiting) in enumerate(self._wanted):
-            if one == key:
-                del self._wanted[number]
-                return waiting
-        return None
+                if self._wanted[key]:
+                    self._failed.setdefault(key, []).append(made)
+                self._changed.notify_all()
+                return
+        self._keep(made, True)
 
     def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
         for number in range(len(self._idle) - 1, -1, -1):
@@ -170,17 +172,16 @@ class Pool(Generic[K, ProcessT]):
                 _close([found])
         return None
 
-    def _give_back(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
+    def _keep(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
+        """Keep a process for whoever wants one with its key, or close it."""
         gone = [] if is_reusable else [lent]
-        with self._lock:
-            waiting = self._next_wanted(lent[0]) if is_reusable else None
-            if waiting is not None:
-                self._lent.append(lent)
-                waiting.set_result(lent)
-            elif is_reusable:
+        with self._changed:
+            if is_reusable:
                 self._idle.append(lent)
-            while len(self._idle) > (0 if self._is_closed else self._most_idle):
+            most = self._wanted[lent[0]] + (0 if self._is_closed else self._max_idle)
+            while len(self._idle) > most:
                 gone.append(self._idle.pop(0))
+            self._changed.notify_all()
         _close(gone)
 
 
@@ -207,14 +208,14 @@ class QueryPool:
         )
         # In the root: its disk is watched, and the folder is emptied at each start.
         self._scratch = ServicePaths(settings.root).scratch
-        self._lanes = Lanes(SHORT_PLACES, settings.queries)
-        # What was interrupted is lent again: a process that has not heard in time is gone.
-        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError, Overdue))
+        places = SHORT_PLACES + settings.queries
+        self._limiter = Limiter(places, places // 4)
+        self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
         self.close = self._open.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that only reads: where it takes long, it may be called again."""
-        return await self._lanes.run(self._limits.time_s, function, *args, **kwargs)
+        """Call a function in a thread, when a place is free for it."""
+        return await self._limiter.run(self._limits.time_s, partial(function, *args, **kwargs))
 
     @contextmanager
     def session(
@@ -225,18 +226,12 @@ class QueryPool:
         All that it is asked has one time together.
         """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
-        place = lease.get()
+        place = self._limiter.place.get()
         with (
             nullcontext() if place is None else place.used(),
             self._open.lend(tuple(map(_identity, targets))) as one,
         ):
-            time_of = Allowance if place is None else place.allowance
-            try:
-                yield replace(one, limits=limits, allowance=time_of(limits.time_s))
-            except QueryLimitError as error:
-                if place is not None and place.is_overdue:
-                    raise Overdue from error
-                raise
+            yield replace(one, limits=limits, allowance=Allowance(limits.time_s, SHORT_S))
 
     def forget(self, target: str | Path) -> None:
         """Close the sessions about a target that is to be removed and that nobody uses."""

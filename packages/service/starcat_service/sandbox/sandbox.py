@@ -7,22 +7,22 @@ time are limited by the operating system, and which may write into the scratch f
 
 from __future__ import annotations
 
-import json
 import signal
+import time
 from collections.abc import Callable, Mapping
-from contextlib import closing, nullcontext
-from contextvars import ContextVar
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from starcat.errors import QueryLimitError, error_of_kind
+from starcat.errors import QueryLimitError
 from starcat.exchange.columns import Label
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, WHOLE_FORMATS
+from starcat.workers.messages import DONE, MalformedMessage, error_of, from_json
+from starcat.workers.process import WorkerProcess
 from starcat_service.problems import Problem
-from starcat_service.sandbox.child import Child
-from starcat_service.sandbox.places import WAIT_S, Places, asker, held, in_thread
+from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
 from starcat_service.sandbox.pool import Pool
 from starcat_service.settings import Settings
 
@@ -30,8 +30,6 @@ GIB = 2**30
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
-_has_place: ContextVar[bool] = ContextVar("has_place", default=False)
 
 
 class _OutOfMemory(Problem):
@@ -45,45 +43,40 @@ class Sandbox:
         self._time_s = settings.query_time_s
         self._scratch = scratch
         self._memory_bytes = int(settings.query_memory_gib * GIB)
-        self._places = Places(settings.queries)
-        self._children: Pool[None, Child] = Pool(self._begin, settings.queries)
+        self._limiter = Limiter(settings.queries, settings.queries // 2)
+        self._children: Pool[None, WorkerProcess] = Pool(self._begin, settings.queries)
         self.close = self._children.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function that has tasks done in a thread, when there is a place for it."""
-        who = asker.get()
-        await self._places.take_later(who, WAIT_S)
-        token = _has_place.set(True)
-        try:
-            return await in_thread(partial(function, *args, **kwargs))
-        finally:
-            _has_place.reset(token)
-            self._places.release(who)
+        return await self._limiter.run(WAIT_S, partial(function, *args, **kwargs))
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Have a task of `starcat_service.sandbox.worker.TASKS` done; its error is raised here."""
-        place = nullcontext() if _has_place.get() else held(self._places, asker.get())
-        with place, self._children.lend(None) as child:
-            answer = self._answer(child, {"task": task, "arguments": arguments})
-            if answer.get("kind") == "MemoryError":
-                raise _OutOfMemory(
-                    413,
-                    "the request takes more memory than it may "
-                    f"({self._memory_bytes / GIB:g} GiB); send less or a smaller picture, or ask "
-                    "the operator to raise query_memory_gib",
-                )
-            if answer.get("kind") == "RecursionError":
-                raise Problem(
-                    422, "the file is nested too deep to be read; send it with fewer levels"
-                )
-        if "kind" not in answer:
-            return answer["found"]
-        if answer["errno"] is not None:
-            raise OSError(answer["errno"], answer["message"])
-        error = error_of_kind(
-            answer["kind"], answer["message"], key=answer["key"], fields=answer["fields"]
-        )
-        raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
+        has_place = self._limiter.place.get() is not None
+        place = nullcontext() if has_place else self._limiter.held(asker.get(), WAIT_S)
+        try:
+            with place, self._children.lend(None) as worker:
+                kind, content = self._answer(worker, [task, dict(arguments), self._time_s])
+                found = from_json(content)
+                error = None if kind == DONE else error_of(found)
+                # What ran out of memory, or of depth, is not asked again.
+                if isinstance(error, (MemoryError, RecursionError)):
+                    raise error
+        except MemoryError:
+            raise _OutOfMemory(
+                413,
+                "the request takes more memory than it may "
+                f"({self._memory_bytes / GIB:g} GiB); send less or a smaller picture, or ask the "
+                "operator to raise query_memory_gib",
+            ) from None
+        except RecursionError:
+            raise Problem(
+                422, "the file is nested too deep to be read; send it with fewer levels"
+            ) from None
+        if error is not None:
+            raise error
+        return found
 
     def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:
         """Have an Arrow stream made a file of some format: some need the table in memory."""
@@ -99,8 +92,8 @@ class Sandbox:
                 "written row by row, or ask for fewer rows",
             ) from None
 
-    def _begin(self, _: None) -> closing[Child]:
-        child = Child(
+    def _begin(self, _: None) -> closing[WorkerProcess]:
+        worker = WorkerProcess(
             "starcat_service.sandbox.worker:serve",
             # astropy tries out a temporary file where it writes FITS.
             environment={
@@ -109,20 +102,26 @@ class Sandbox:
                 "MALLOC_ARENA_MAX": "2",  # each arena keeps memory that the others cannot use
             },
         )
-        child.send({"scratch": str(self._scratch), "memory_bytes": self._memory_bytes})
-        return closing(child)
+        with suppress(OSError):  # that it ended is found out when it is asked
+            worker.send([str(self._scratch), self._memory_bytes])
+        return closing(worker)
 
-    def _answer(self, child: Child, request: Mapping[str, Any]) -> dict[str, Any]:
+    def _answer(self, worker: WorkerProcess, request: Any) -> tuple[str, bytes | bytearray]:
         late = QueryLimitError(f"stopped after {self._time_s:g} s; send less")
-        child.send({**request, "time_s": self._time_s})
+        until_s = time.monotonic() + self._time_s
         try:
-            return dict(json.loads(child.answer(self._time_s)))
+            worker.send(request, until_s)
+            reply = worker.receive(until_s - time.monotonic())
         except TimeoutError:
-            raise late from None
-        except EOFError:
-            if child.wait() == -signal.SIGXCPU:
+            reply = None
+        except (EOFError, OSError, MalformedMessage):
+            worker.kill()
+            if worker.wait() == -signal.SIGXCPU:
                 raise late from None
             raise Problem(
                 422,
                 "the process that read the file crashed, as it does on damaged files; send another",
             ) from None
+        if reply is None:
+            raise late
+        return reply

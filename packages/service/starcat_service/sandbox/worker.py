@@ -1,32 +1,28 @@
 """The process that reads uploads and makes files, for `starcat_service.sandbox.sandbox`.
 
-A request is a line of JSON, and so is the answer: nothing that was uploaded can make the server
-run anything.
+Requests and answers are JSON: nothing that was uploaded can make the server run anything.
 """
 
 from __future__ import annotations
 
-import errno
-import json
 import math
 import os
-import signal
-import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.query.confinement import forbid_writing, limit_memory, limit_time
+from starcat.workers.channel import Channel, return_free_memory
+from starcat.workers.confinement import forbid_writing, limit_memory, limit_time
+from starcat.workers.messages import DONE, ERROR, error_content
 from starcat_service.protocols.uploads import upload_facts
-from starcat_service.sandbox.child import own_output, return_free_memory
 
 if TYPE_CHECKING:
     from starcat.images.identify_options import IdentifyOptions
     from starcat.images.solve_files import FileAnswers, FrameAnswer
     from starcat.matcher.matcher import Matcher
 
-FULL = (errno.ENOSPC, errno.EDQUOT)
 MATCHERS = 4
 """Databases that are kept open with the options that they were opened with."""
 
@@ -123,49 +119,19 @@ TASKS: dict[str, Callable[..., Any]] = {
 
 def serve() -> None:
     """Answer requests until there are no more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    answers = own_output()
-    opening = json.loads(sys.stdin.buffer.readline() or b"{}")
-    if not opening:
-        return
-    home = Path(opening["scratch"])
-    forbid_writing(except_in=home)
-    limit_memory(opening["memory_bytes"])
-    for line in sys.stdin.buffer:
-        request = json.loads(line)
-        limit_time(request["time_s"] * (os.cpu_count() or 1) + 1.0)
-        content = _answer(TASKS[request["task"]], request["arguments"])
-        os.chdir(home)
-        try:
-            answers.write(json.dumps(content).encode() + b"\n")
-            answers.flush()
-        except BrokenPipeError:
-            return
-        # What one request has left must not be missing in the next.
-        return_free_memory()
-
-
-def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, Any]:
-    try:
-        return {"found": task(**arguments)}
-    except Exception as error:
-        kind = "MemoryError" if isinstance(error, MemoryError) else type(error).__name__
-        key = getattr(error, "key", None)
-        return {
-            "kind": kind,
-            "message": str(error)[:4000],
-            "key": None if key is None else str(key),
-            "fields": list(getattr(error, "fields", ())),
-            "errno": _system_error(error),
-        }
-
-
-def _system_error(error: BaseException) -> int | None:
-    """Return the number of the system's error; of a full disk also if another error tells of it."""
-    number = getattr(error, "errno", None)
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, OSError) and cause.errno in FULL:
-            return cause.errno
-        cause = cause.__cause__
-    return number
+    channel = Channel()
+    with suppress(EOFError, BrokenPipeError):
+        scratch, memory_bytes = channel.receive()
+        forbid_writing(except_in=Path(scratch))
+        limit_memory(memory_bytes)
+        while True:
+            name, arguments, time_s = channel.receive()
+            limit_time(time_s * (os.cpu_count() or 1) + 1.0)
+            try:
+                kind, content = DONE, TASKS[name](**arguments)
+            except Exception as error:
+                kind, content = ERROR, error_content(error)
+            os.chdir(scratch)
+            channel.send(kind, content)
+            # What one request has left must not be missing in the next.
+            return_free_memory()

@@ -31,7 +31,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from starcat_service.problems import Problem, as_json, outage_of, problem_response
-from starcat_service.sandbox.places import asker
+from starcat_service.sandbox.limiter import asker
 from starcat_service.security.metrics import Metrics
 from starcat_service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, address_of
 from starcat_service.settings import Settings

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import threading
-import time
 from collections.abc import AsyncIterator, Generator, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -26,7 +25,6 @@ from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
-from starcat.query.engine import CLOCK_TIMES
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
 from starcat_service.protocols.documents import (
@@ -41,7 +39,7 @@ from starcat_service.protocols.documents import (
     tableset,
 )
 from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, Question, question
-from starcat_service.sandbox.places import SHORT_S, Lease, Overdue, asker, lease
+from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service, TheService, service_of
 from starcat_service.transfers import body_type, scratch_folder
 
@@ -57,9 +55,6 @@ HELD_BYTES = 4 << 20
 
 LOOK_S = 1.0
 """How often a reader that waits looks whether the answer has ended."""
-
-TICK_S = 0.02
-"""How often it is looked whether an answer has got a place where it may take long."""
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
 """Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
@@ -236,20 +231,6 @@ class Spool:
             at += len(part)
             yield part
 
-    def settle(self, place: Lease) -> None:
-        """Wait until the answer is whole, or has a place where it may take long.
-
-        Until then it can still be begun again, for which `Overdue` is raised: nothing was sent.
-        """
-        until_s = time.monotonic() + CLOCK_TIMES * SHORT_S
-        with self._changed:
-            while not (self._is_done or place.is_long or time.monotonic() > until_s):
-                self._changed.wait(TICK_S)
-        if isinstance(self._error, Overdue):
-            raise self._error
-        if not (self._is_done or place.prolong()):
-            raise Overdue
-
     def close(self) -> None:
         """End the making, and forget what was made."""
         self._gone.set()
@@ -320,15 +301,7 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         parts = service.tap.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
         first = next(parts, b"")
-    rest = Spool(parts, service.paths.scratch, gone)
-    place = lease.get()
-    if place is not None:
-        try:
-            rest.settle(place)
-        except Overdue:
-            rest.close()
-            raise
-    return first, rest
+    return first, Spool(parts, service.paths.scratch, gone)
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")

@@ -24,7 +24,7 @@ from starcat_service.protocols.uws import (
     parameters_document,
     results_document,
 )
-from starcat_service.sandbox.places import asker
+from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service, TheService
 from starcat_service.vo.tap import FORM, PREFIX, TheRequest, VOTableRoute, base_url
 from starcat_service.vo.tap_jobs import RESULT

@@ -23,7 +23,7 @@ from starcat_service.problems import Problem, problem_of
 from starcat_service.protocols.parameters import Parameters, Upload, question
 from starcat_service.protocols.uws import JobFacts
 from starcat_service.records import Records
-from starcat_service.sandbox.places import asker
+from starcat_service.sandbox.limiter import asker
 from starcat_service.vo.tap_queries import Tap
 
 RESULT = "result"

@@ -1,0 +1,136 @@
+"""Compile the C matcher for Python when a wheel is built or starcat is installed in place.
+
+Hatchling runs the hook for both distributions. Into ``starcat-matcher`` it puts the modules that
+identifying imports; ``starcat-guide-stars`` has all of them. Where there is no compiler, or
+``STARCAT_WITHOUT_C`` is set, the wheel is a pure one, and the matcher of numpy serves alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+ROOT = Path(__file__).resolve().parents[3]
+ONBOARD = ROOT / "onboard"
+MODULE = "starcat.matcher._onboard"
+DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
+"""The ground has memory for wider and denser fields than an onboard computer."""
+
+BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
+"""Where ``starcat-matcher`` is entered, besides the modules of the matcher themselves."""
+
+
+class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
+    """Compiles the extension beside the module that imports it."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile, and make the wheel one for this platform if that went well."""
+        if self.target_name != "wheel":
+            return
+        if is_matcher := self.metadata.name == "starcat-matcher":
+            build_data["force_include"] |= files_of_the_matcher()
+        try:
+            compiled = compile_binding()
+        except Exception as error:
+            self.app.display_warning(
+                f"starcat: the C matcher was not compiled ({error}); that of numpy serves"
+            )
+            return
+        build_data["pure_python"] = False
+        build_data["tag"] = f"cp311-abi3-{re.sub('[-.]', '_', sysconfig.get_platform())}"
+        name = compiled.relative_to(ROOT).as_posix()
+        if is_matcher:
+            build_data["force_include"][str(compiled)] = name
+        else:
+            build_data["artifacts"].append(name)
+
+
+def files_of_the_matcher() -> dict[str, str]:
+    """Return the files of the distribution that only identifies, by path, with their new names."""
+    names = {"starcat/py.typed": "starcat/py.typed", "LICENSE": "starcat/LICENSE"}
+    names |= {name: name for name in sorted(modules_of_the_matcher())}
+    return {str(ROOT / old): new for old, new in names.items()}
+
+
+def modules_of_the_matcher() -> set[str]:
+    """Return the modules that the beginnings and the matcher import, as paths from the root."""
+    matcher = (ROOT / "starcat" / "matcher").rglob("*.py")
+    left = [*BEGINNINGS, *(path.relative_to(ROOT).as_posix() for path in matcher)]
+    found: set[str] = set()
+    while left:
+        name = left.pop()
+        if name in found or not (ROOT / name).is_file():
+            continue
+        found.add(name)
+        left += [str(Path(name).parent.as_posix()) + "/__init__.py"]
+        left += imported_by(ast.parse((ROOT / name).read_text(encoding="utf-8")))
+    return found
+
+
+def imported_by(tree: ast.Module) -> list[str]:
+    """Return what a module imports when it is imported itself: no types, nothing in functions."""
+    found = []
+    for node in tree.body:
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            if name.split(".")[0] == "starcat":
+                path = name.replace(".", "/")
+                found += [f"{path}.py", f"{path}/__init__.py"]
+    return found
+
+
+def compile_binding() -> Path:
+    """Compile the extension into the source tree.
+
+    Returns
+    -------
+    Path
+        The file, which any CPython from 3.11 on can import.
+
+    Raises
+    ------
+    Exception
+        Whatever a compiler that is missing or fails makes cffi or setuptools raise.
+    """
+    if os.environ.get("STARCAT_WITHOUT_C"):
+        raise RuntimeError("STARCAT_WITHOUT_C is set")
+    from cffi import FFI
+
+    ffi = FFI()
+    # The parser of cffi knows no #include: the few lines of the headers that Python uses.
+    ffi.cdef((ONBOARD / "bindings" / "python" / "binding.h").read_text(encoding="utf-8"))
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
+    ffi.set_source(
+        MODULE,
+        '#include "many.h"',
+        sources=[str(source) for source in sources],
+        include_dirs=[
+            str(ONBOARD / "include"),
+            str(ONBOARD / "src"),
+            str(ONBOARD / "bindings" / "python"),
+        ],
+        define_macros=list(DEFINED.items()),
+        extra_compile_args=[] if sys.platform == "win32" else ["-O3", "-std=gnu99"],
+        py_limited_api=True,
+    )
+    target = ROOT.joinpath(*MODULE.split("."))
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(ffi.compile(tmpdir=folder, verbose=False))
+        compiled = target.with_name(built.name)
+        # By another name first: a process that runs may have the present one mapped.
+        copy = compiled.with_suffix(".partial")
+        copy.write_bytes(built.read_bytes())
+        copy.replace(compiled)
+    return compiled

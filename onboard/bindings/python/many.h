@@ -1,0 +1,59 @@
+/* One frame or many in one call, for the ground: see many.c.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#ifndef STARCAT_MANY_H
+#define STARCAT_MANY_H
+
+#include "starcat.h"
+
+/* What every frame of a camera is asked with. */
+typedef struct {
+  const starcat_image *image;
+  const starcat_camera *camera;
+  const starcat_options *options;
+  const int32_t *rows;      /* of the image's stars in the database */
+  const double *directions; /* of the image's stars before they were rounded; null: the image's */
+} starcat_search;
+
+/* The answer to one frame. Python makes its record of these fields by their names. */
+typedef struct {
+  int32_t status;
+  int32_t n_matched;
+  int64_t steps;
+  double q_body_from_icrs[4];
+  double matrix[3][3];
+  double residual_rad;
+  double log_chance; /* if not identified, of the best agreement */
+  double share;
+  double focal_length_px;
+  int32_t reason;
+  int32_t n_usable;
+  double seconds; /* that the library took */
+} starcat_answer;
+
+/* Memory of one call at a time: what it works in, and what starcat_identify_one leaves in it. */
+typedef struct {
+  starcat_answer answer;
+  int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
+  double x_px[STARCAT_MAX_CENTROIDS];
+  double y_px[STARCAT_MAX_CENTROIDS];
+  double magnitudes[STARCAT_MAX_CENTROIDS];
+  starcat_workspace work;
+  starcat_result result;
+} starcat_memory;
+
+/* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
+ * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
+ * the status that the answer in the memory has too. */
+int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+                const void *magnitudes, const void *sigma_px, const void *q_prior,
+                double uncertainty_rad, starcat_memory *memory);
+
+/* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
+ * The centroids of frame n are those from starts[n] to starts[n + 1]. */
+void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
+                  const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                  const double *sigma_px, starcat_answer *answers, int32_t *stars, starcat_memory *memory);
+
+#endif

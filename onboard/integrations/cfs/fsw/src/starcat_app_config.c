@@ -1,0 +1,98 @@
+/* The table: checked by the library itself, and taken over.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "starcat_app.h"
+
+#define REFUSED ((CFE_Status_t)-1)
+#define WIDEST_PRIOR_RAD 0.35
+
+void STARCAT_APP_TakeCamera(const STARCAT_APP_Camera_t *From, starcat_camera *Camera) {
+  Camera->width_px = (starcat_real)From->Width_px;
+  Camera->height_px = (starcat_real)From->Height_px;
+  Camera->focal_length_px = (starcat_real)From->FocalLength_px;
+  Camera->x0_px = (starcat_real)From->X0_px;
+  Camera->y0_px = (starcat_real)From->Y0_px;
+  Camera->k1 = (starcat_real)From->K1;
+  Camera->k2 = (starcat_real)From->K2;
+  Camera->k3 = (starcat_real)From->K3;
+  Camera->p1 = (starcat_real)From->P1;
+  Camera->p2 = (starcat_real)From->P2;
+  Camera->fold_radius = (starcat_real)From->FoldRadius;
+}
+
+static void TakeOptions(const STARCAT_APP_Config_t *Config, starcat_options *Options) {
+  Options->tolerance_px = (starcat_real)Config->Tolerance_px;
+  Options->noise_px = (starcat_real)Config->Noise_px;
+  Options->noise_mag = (starcat_real)Config->Noise_mag;
+  Options->log_chance = (starcat_real)Config->LogChance;
+  Options->fov_error = (starcat_real)Config->FovError;
+  Options->max_steps = Config->MaxSteps;
+}
+
+/* What the library says to a camera and to options: with them it looks at a frame of no centroids,
+ * for which it needs no image. Options may be checked without a camera. */
+starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
+                                         const starcat_options *Options) {
+  static const starcat_image NoImage;
+  static const starcat_frame NoFrame;
+  static const starcat_camera AnyCamera = {1024, 1024, 2048, 512, 512, 0, 0, 0, 0, 0, 0};
+  const starcat_status Status =
+      starcat_identify_frame(&NoImage, Camera != NULL ? Camera : &AnyCamera, Options, &NoFrame,
+                       &STARCAT_APP_Data.Work, &STARCAT_APP_Data.Result);
+  return Status == STARCAT_TOO_FEW_STARS ? STARCAT_OK : Status;
+}
+
+CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
+  const STARCAT_APP_Config_t *Config = Table;
+  starcat_camera Camera;
+  starcat_options Options;
+  TakeOptions(Config, &Options);
+  STARCAT_APP_TakeCamera(&Config->Camera, &Camera);
+  const starcat_status Status =
+      STARCAT_APP_CheckSettings(Config->CameraOfImage == 0 ? &Camera : NULL, &Options);
+  const bool IsSound = (Config->Prior_rad > 0.0) && (Config->Prior_rad <= WIDEST_PRIOR_RAD) &&
+                       (Config->ScrubBlocks > 0) && (Config->LoadPieces > 0) &&
+                       (Config->CameraOfImage <= 1) && (Config->Tracking <= 1);
+  if ((Status == STARCAT_OK) && IsSound) {
+    return CFE_SUCCESS;
+  }
+  CFE_EVS_SendEvent(STARCAT_APP_TABLE_ERR_EID, CFE_EVS_EventType_ERROR,
+                    "STARCAT: the table is refused, status %d%s", (int)Status,
+                    IsSound ? "" : ", prior, blocks, pieces or flags out of range");
+  return REFUSED;
+}
+
+static void TakeConfig(const STARCAT_APP_Config_t *Config) {
+  STARCAT_APP_HkTlm_Payload_t *Hk = &STARCAT_APP_Data.HkTlm.Payload;
+  STARCAT_APP_Data.Config = *Config;
+  TakeOptions(Config, &STARCAT_APP_Data.Options);
+  Hk->MaxSteps = Config->MaxSteps;
+  Hk->Tracking = Config->Tracking;
+  STARCAT_APP_Data.HasPrior = false;
+  if (Config->CameraOfImage == 0) {
+    Hk->CameraSource = STARCAT_APP_CAMERA_OF_TABLE;
+    STARCAT_APP_TakeCamera(&Config->Camera, &STARCAT_APP_Data.Camera);
+  } else {
+    Hk->CameraSource = STARCAT_APP_CAMERA_OF_IMAGE;
+    if (STARCAT_APP_Data.HasImage) {
+      starcat_get_camera(&STARCAT_APP_Data.Image, &STARCAT_APP_Data.Camera);
+    }
+  }
+  CFE_EVS_SendEvent(STARCAT_APP_TABLE_INF_EID, CFE_EVS_EventType_INFORMATION,
+                    "STARCAT: the table was taken over");
+}
+
+/* Let table services validate, load and dump the table; take it over if it is a new one. */
+CFE_Status_t STARCAT_APP_ManageConfig(void) {
+  void *Address = NULL;
+  (void)CFE_TBL_Manage(STARCAT_APP_Data.Table);
+  const CFE_Status_t Status = CFE_TBL_GetAddress(&Address, STARCAT_APP_Data.Table);
+  if (Status == CFE_TBL_INFO_UPDATED) {
+    TakeConfig(Address);
+  }
+  if (Status >= CFE_SUCCESS) {
+    (void)CFE_TBL_ReleaseAddress(STARCAT_APP_Data.Table);
+  }
+  return Status < CFE_SUCCESS ? Status : CFE_SUCCESS;
+}

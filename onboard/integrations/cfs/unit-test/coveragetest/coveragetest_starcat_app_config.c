@@ -1,0 +1,107 @@
+/* SPDX-License-Identifier: MIT */
+#include "coveragetest_starcat.h"
+
+static STARCAT_APP_Config_t Sound(void) {
+  STARCAT_APP_Config_t Config;
+  memset(&Config, 0, sizeof Config);
+  Config.Prior_rad = 0.01;
+  Config.ScrubBlocks = 1;
+  Config.LoadPieces = 1;
+  Config.MaxSteps = 100;
+  return Config;
+}
+
+static int32 Validated(STARCAT_APP_Config_t Config) {
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
+  return STARCAT_APP_ValidateConfig(&Config);
+}
+
+static void TestCheckSettings(void) {
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
+  IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
+     STARCAT_OK);
+  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
+  IS(STARCAT_APP_CheckSettings(NULL, &STARCAT_APP_Data.Options), STARCAT_OK);
+  ONCE(starcat_identify_frame, STARCAT_E_CAMERA);
+  IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
+     STARCAT_E_CAMERA);
+}
+
+static void TestValidate(void) {
+  STARCAT_APP_Config_t Config = Sound();
+  IS(Validated(Config), CFE_SUCCESS);
+  Config.CameraOfImage = 1;
+  IS(Validated(Config), CFE_SUCCESS);
+  CALLED(CFE_EVS_SendEvent, 0);
+  ONCE(starcat_identify_frame, STARCAT_E_OPTIONS);
+  IS(STARCAT_APP_ValidateConfig(&Config), -1);
+  IS(LastEvent(), STARCAT_APP_TABLE_ERR_EID);
+}
+
+static void TestValidateRanges(void) {
+  STARCAT_APP_Config_t Bad[7];
+  for (uint32 n = 0; n < 7; n++) {
+    Bad[n] = Sound();
+  }
+  Bad[0].Prior_rad = 0.0;
+  Bad[1].Prior_rad = 0.36;
+  Bad[2].Prior_rad = (double)__builtin_nan("");
+  Bad[3].ScrubBlocks = 0;
+  Bad[4].LoadPieces = 0;
+  Bad[5].CameraOfImage = 2;
+  Bad[6].Tracking = 2;
+  for (uint32 n = 0; n < 7; n++) {
+    IS(Validated(Bad[n]), -1);
+  }
+  CALLED(CFE_EVS_SendEvent, 7);
+}
+
+static void Manage(STARCAT_APP_Config_t *Config) {
+  void *Address = Config;
+  UT_SetDataBuffer(UT_KEY(CFE_TBL_GetAddress), &Address, sizeof Address, true);
+  ONCE(CFE_TBL_GetAddress, CFE_TBL_INFO_UPDATED);
+  IS(STARCAT_APP_ManageConfig(), CFE_SUCCESS);
+}
+
+static void TestManage(void) {
+  STARCAT_APP_Config_t Config = Sound();
+  Config.Camera.FocalLength_px = 500.0;
+  Config.Tolerance_px = 3.0;
+  Config.Tracking = 1;
+  STARCAT_APP_Data.HasPrior = true;
+  Manage(&Config);
+  IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_TABLE);
+  IS(STARCAT_APP_Data.Camera.focal_length_px, 500);
+  IS(STARCAT_APP_Data.Options.tolerance_px, 3);
+  IS(STARCAT_APP_Data.Options.max_steps, 100);
+  IS(HK.MaxSteps, 100);
+  IS(HK.Tracking, 1);
+  IS(STARCAT_APP_Data.HasPrior, false);
+  IS(LastEvent(), STARCAT_APP_TABLE_INF_EID);
+  Config.CameraOfImage = 1;
+  Manage(&Config);
+  IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_IMAGE);
+  IS(STARCAT_APP_Data.Camera.focal_length_px, 1234);
+  STARCAT_APP_Data.HasImage = false;
+  Manage(&Config);
+  CALLED(starcat_get_camera, 1);
+  CALLED(CFE_TBL_Manage, 3);
+  CALLED(CFE_TBL_ReleaseAddress, 3);
+}
+
+static void TestManageNothingNew(void) {
+  IS(STARCAT_APP_ManageConfig(), CFE_SUCCESS);
+  CALLED(CFE_TBL_ReleaseAddress, 1);
+  CALLED(CFE_EVS_SendEvent, 0);
+  ONCE(CFE_TBL_GetAddress, CFE_TBL_ERR_NEVER_LOADED);
+  IS(STARCAT_APP_ManageConfig(), CFE_TBL_ERR_NEVER_LOADED);
+  CALLED(CFE_TBL_ReleaseAddress, 1);
+}
+
+void UtTest_Setup(void) {
+  ADD(TestCheckSettings);
+  ADD(TestValidate);
+  ADD(TestValidateRanges);
+  ADD(TestManage);
+  ADD(TestManageNothingNew);
+}

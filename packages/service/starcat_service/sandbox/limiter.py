@@ -1,0 +1,137 @@
+"""How much runs at the same time, for one client and for all together.
+
+Those who wait are served in turn: a place is for the client who holds fewest, and who was served
+is behind the others. A client gets another place only where more are free than it holds, so that
+nobody who comes later finds all of them taken by one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as OutOfTime
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from typing import TypeVar
+
+from anyio import CapacityLimiter, to_thread
+
+from starcat_service.problems import Problem
+
+WAIT_S = 30.0
+"""Seconds that a request waits while others are answered."""
+
+asker: ContextVar[str] = ContextVar("asker", default="")
+"""Who is counted as one client: the name of a token, or the address of somebody without one."""
+
+T = TypeVar("T")
+
+
+class Place:
+    """A place that is held as long as something uses it, perhaps beyond the call of a request."""
+
+    def __init__(self, release: Callable[[], None]) -> None:
+        self._release = release
+        self._users = 0
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """Keep the place meanwhile; it is given back when nothing uses it any more."""
+        with self._lock:
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                is_over = not self._users
+            if is_over:
+                self._release()
+
+
+class Limiter:
+    """So many places for all clients, of which one client may hold ``each``."""
+
+    def __init__(self, count: int, each: int) -> None:
+        self._free, self._each = count, max(1, each)
+        self._held: Counter[str] = Counter()
+        self._waiting: list[tuple[str, Future[Place]]] = []
+        self._lock = threading.Lock()
+        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # of a request
+
+    @contextmanager
+    def held(self, who: str, patience_s: float) -> Iterator[None]:
+        """Hold a place in this thread; a `Problem` where none was free in time."""
+        wanted = self._wanted(who)
+        try:
+            place = wanted.result(patience_s)
+        except OutOfTime:
+            place = self._given_up(who, wanted, patience_s)
+        with place.used():
+            yield
+
+    async def run(self, patience_s: float, call: Callable[[], T]) -> T:
+        """Call a function in a thread when a place is free; no thread is held meanwhile."""
+        who = asker.get()
+        wanted = self._wanted(who)
+        try:
+            async with asyncio.timeout(None if wanted.done() else patience_s):
+                place = await asyncio.shield(asyncio.wrap_future(wanted))
+        except TimeoutError:
+            place = self._given_up(who, wanted, patience_s)
+        except BaseException:
+            if not wanted.cancel():
+                self._release(who)
+            raise
+        with place.used():
+            token = self.place.set(place)
+            try:
+                return await in_thread(call)
+            finally:
+                self.place.reset(token)
+
+    def _wanted(self, who: str) -> Future[Place]:
+        wanted: Future[Place] = Future()
+        with self._lock:
+            self._waiting.append((who, wanted))
+            self._give()
+        return wanted
+
+    def _given_up(self, who: str, wanted: Future[Place], waited_s: float) -> Place:
+        """Wait no longer: return a place that was given meanwhile, or say by whose doing not."""
+        if not wanted.cancel():
+            return wanted.result()
+        own = self._held[who]
+        after = "ask again later"
+        why = f"the service was busy for {waited_s:g} s: too many requests at once; {after}"
+        if own:
+            why = f"{own} of your requests took more than {waited_s:g} s; {after}, one at a time"
+        raise Problem(429 if own else 503, why, headers={"Retry-After": "10"})
+
+    def _release(self, who: str) -> None:
+        with self._lock:
+            self._free += 1
+            self._held[who] -= 1
+            self._give()
+
+    def _give(self) -> None:
+        waiting = [one for one in self._waiting if not one[1].cancelled()]
+        while able := [one for one in waiting if self._held[one[0]] < min(self._each, self._free)]:
+            who, wanted = chosen = min(able, key=lambda one: self._held[one[0]])
+            waiting.remove(chosen)
+            waiting.sort(key=lambda one: one[0] == who)  # the others come first
+            if wanted.set_running_or_notify_cancel():
+                self._free -= 1
+                self._held[who] += 1
+                wanted.set_result(Place(partial(self._release, who)))
+        self._waiting, self._held = waiting, +self._held
+
+
+async def in_thread(call: Callable[[], T]) -> T:
+    """Call a function in a thread; that one is free is seen to by whoever has a place."""
+    return await to_thread.run_sync(call, limiter=CapacityLimiter(1))

@@ -1,0 +1,197 @@
+"""The stages that make products and finish a database: written, tested, reported and verified."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
+from starcat.artifact.verify import check_artifact
+from starcat.artifact.writer import Product, write_manifest, write_products
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.span import validity
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
+from starcat.pipeline.draft import Draft, stage
+from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
+from starcat.pipeline.report_data import coverage_report, filter_coverages
+from starcat.products.coverage import field_coverage
+from starcat.products.table import PRODUCTS
+from starcat.progress import Progress
+from starcat.report.report import count_magnitudes, coverage_warnings, write_report
+from starcat.report.sensor_band import band_content
+from starcat.selection.ruleset import ALL_REASONS
+from starcat.simulation.selftest import Rates, self_test
+from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, floats_of, sort_rows
+from starcat.storage.schema import product_schema
+
+MAX_FRAMES_WITHOUT_MAGNITUDES = 50
+"""Frames of each kind that are also identified without magnitudes: where that is hopeless, each
+takes half a second."""
+
+_logger = logging.getLogger(__name__)
+
+
+def _products_task(spec: BuildSpec) -> str:
+    names = (name for name, kind in PRODUCTS.items() if kind.make is not None)
+    made = [name for name in names if name in spec.products.wanted]
+    return f"make {', '.join(('stars', 'rejected', 'boresights', *made))}"
+
+
+@stage("products", "products", _products_task)
+def make_products(draft: Draft) -> None:
+    """Make the products that need nothing but guide stars and their fields."""
+    spec, selected, fields = draft.spec, draft.selected, draft.fields
+    rejected = pa.concat_tables([draft.rejected, selected.rejected]).combine_chunks()
+    order = product_schema("rejected").order
+    draft.sources = [_with_guide_stars(facts, draft) for facts in draft.sources]
+    draft.products += [
+        Product("stars", selected.guide_stars),
+        Product("rejected", sort_rows(rejected, order), in_database=False),
+    ]
+    given = product_inputs(selected.guide_stars, fields, spec)
+    for name in recipe_names(given):
+        draft.progress(f"product {name}", 0, None)
+        draft.products.append(make_product(name, given))
+
+
+def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:
+    """Return what the manifest says of a source, after the selection."""
+    if facts.role != "stars":
+        return facts
+    tables = [draft.selected.guide_stars, draft.selected.rejected]
+    if draft.spec.catalog.merged:
+        tables = [table.filter(pc.equal(table["catalog"], facts.source)) for table in tables]
+    rejected = dict(facts.rejected)  # in the order in which reasons came up
+    for reason, count in count_by_reason(tables[1]).items():
+        rejected[reason] = rejected.get(reason, 0) + count
+    return replace(facts, kept=len(tables[0]), rejected=rejected)
+
+
+@stage("write", "write", lambda spec: "write database.h5 and a Parquet file of each product")
+def write_database(draft: Draft) -> None:
+    """Write the products."""
+    draft.facts = write_products(draft.folder, draft.products, database_facts(draft.spec))
+
+
+def database_facts(spec: BuildSpec) -> dict[str, str | float]:
+    """Return the attributes of the database as a whole."""
+    camera = spec.camera.camera()
+    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    content = spec.recorded()
+    return {
+        "name": spec.name,
+        "version": spec.version,
+        "frame": "ICRS",
+        "epoch_jyear": spec.middle_jyear,
+        "camera": json.dumps({**size, "focal_length_px": camera.focal_length_px}, sort_keys=True),
+        "spec": json.dumps(content, sort_keys=True),
+    }
+
+
+def _test_plan(spec: BuildSpec) -> str:
+    return f"identify {spec.self_test.frames:,} clean and as many hard simulated fields"
+
+
+@stage("self-test", "self-test", _test_plan)
+def prove_database(draft: Draft) -> None:
+    """Identify simulated fields with the database as it was written."""
+    draft.rates = run_self_test(draft.folder, draft.spec, draft.progress)
+
+
+def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, ...]:
+    """Identify simulated fields with a database."""
+    test = spec.self_test
+    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px), engine="numpy")
+    return self_test(
+        matcher,
+        test.frames,
+        test.noise_px,
+        test.seed,
+        progress,
+        noise_mag=test.noise_mag,
+        without_magnitudes=MAX_FRAMES_WITHOUT_MAGNITUDES,
+    )
+
+
+@stage(
+    "report",
+    "report",
+    lambda spec: "write the page, plots and figures of report/",
+    is_announced=True,
+)
+def report_database(draft: Draft) -> None:
+    """Write the report of the build."""
+    spec, fields, guide_stars = draft.spec, draft.fields, draft.selected.guide_stars
+    draft.validity = validity(guide_stars, spec.span_jyear)
+    draft.note("apply_span", str(draft.validity or ""))
+    draft.filters = filter_coverages(draft.selected.steps, fields, spec)
+    counted = field_coverage(fields, spec.boresights.brightest)
+    draft.coverage = coverage_report(counted, fields, directions_of(guide_stars), spec)
+    content = report_content(draft)
+    folder = draft.folder / "report"
+    folder.mkdir()
+    write_report(folder, content, draft.coverage, draft.in_band)
+    for warning in content["warnings"]:
+        _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
+    advice = advice_without_magnitudes(draft.rates, spec)
+    draft.note("report_database", *content["warnings"], advice or "")
+
+
+@stage("manifest", "verify", lambda spec: "write manifest.json with digests of all files")
+def describe_database(draft: Draft) -> None:
+    """Write the manifest."""
+    recorded = draft.spec.recorded()
+    draft.manifest = write_manifest(draft.folder, recorded, draft.sources, draft.facts)
+
+
+@stage(
+    "verify",
+    "verify",
+    lambda spec: "read all files again and check them, and the self-test",
+    is_announced=True,
+)
+def verify_database(draft: Draft) -> None:
+    """Check every file, and that enough simulated fields were identified."""
+    check_artifact(draft.folder)
+    check_rates(draft.rates, draft.spec, draft.coverage.gap)
+
+
+def report_content(draft: Draft) -> dict[str, Any]:
+    """Return the report of a build, whose products have been written, as JSON holds it."""
+    spec, coverage = draft.spec, draft.coverage
+    recorded = spec.recorded()
+    products = {
+        name: {**facts, "bytes": (draft.folder / facts["parquet"]).stat().st_size}
+        for name, facts in draft.facts.items()
+    }
+    sources = [source.as_dict() for source in draft.sources]
+    found = {name for source in sources for name in source["rejected"]}
+    mags = (floats_of(draft.product(name), "mag") for name in ("stars", "rejected"))
+    band, held, tally = draft.in_band, draft.validity, draft.selected.neighbours
+    return {
+        **{name: recorded[name] for name in ("name", "version", "description")},
+        "epoch_jyear": spec.middle_jyear,
+        **({} if held is None else {"validity": asdict(held)}),
+        "frame": "ICRS",
+        "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
+        "sources": sources,
+        "reasons": {name: words for name, words in ALL_REASONS.items() if name in found},
+        "products": products,
+        "database_bytes": (draft.folder / DATABASE_NAME).stat().st_size,
+        "filters": [asdict(step) for step in draft.filters],
+        **({"neighbours": asdict(tally)} if tally else {}),
+        "coverage": coverage.as_dict(),
+        "magnitudes": {"band": str(draft.product("stars")["band"][0]), **count_magnitudes(*mags)},
+        "self_test": [rates.as_dict() for rates in draft.rates],
+        **({} if band is None else {"band": band_content(band, spec.selection)}),
+        "spec": recorded,
+        "software": software_versions(),
+    }

@@ -1,0 +1,253 @@
+"""The stages that read: several catalogs become one, and other sources say more of its stars.
+
+The stars of several catalogs are those of the first, and of each later one those that it lacks. A
+record that is the counterpart of a star is rejected with the reason ``counterpart``, and so is the
+likeliest of several that may be it (``ambiguous_counterpart``). The others near a star stay stars
+of their own: as close pairs they are left to the rules of the selection. Every value of a row is
+from its ``catalog``; a magnitude that was in another band is in that of the first catalog, and
+``mag_source`` says from what it was made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial, reduce
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.artifact.manifest import SourceFacts
+from starcat.bands.response import shipped, shipped_names
+from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
+from starcat.catalog.observed import with_observed
+from starcat.catalog.sensor_band import in_sensor_band
+from starcat.catalog.source import map_of
+from starcat.catalog.source_files import locate
+from starcat.catalog.span import with_span
+from starcat.errors import ConfigError
+from starcat.pipeline.counterparts import match_tables
+from starcat.pipeline.draft import Draft, Inputs, stage
+from starcat.products.crossmatch import Crossmatch, matched_stars
+from starcat.progress import Progress, no_progress
+from starcat.selection.rules.distrust import Observed
+from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import add_nearest_neighbours, reject_rows, sort_rows, with_columns
+from starcat.stars.verdict import Reason
+from starcat.storage.schema import product_schema
+from starcat.store.reading import read_catalog
+
+
+def _read_plan(spec: BuildSpec) -> str:
+    limit = spec.catalog.read_limit_mag
+    depth = "whole" if limit is None else f"down to {limit:g} mag"
+    return f"read {', '.join(spec.catalog.catalogs)} {depth}, positions at J{spec.middle_jyear:g}"
+
+
+def _merge_plan(spec: BuildSpec) -> str:
+    first, *others = spec.catalog.catalogs
+    if not others:
+        return f"take the stars of {first}"
+    return f"take the stars of {first}, and those of {', '.join(others)} that it lacks"
+
+
+@stage("read catalogs", "read", _read_plan, lambda spec: spec.catalog.catalogs)
+def read_catalogs(draft: Draft) -> None:
+    """Find the files of all sources, and read the star catalogs.
+
+    A source that is missing is known before any is read.
+    """
+    spec = draft.spec
+    check_inputs(spec, draft.inputs)
+    draft.paths = {name: locate(name, draft.inputs) for name in spec.sources}
+    draft.read = read_all(
+        spec.catalog.catalogs,
+        draft.paths,
+        band=spec.catalog.band,
+        epoch_jyear=spec.middle_jyear,
+        read_limit_mag=spec.catalog.read_limit_mag,
+        neighbours=not spec.catalog.motions,  # found where the stars will be
+        workers=draft.workers,
+        progress=draft.progress,
+    )
+
+
+@stage("merge", "read", _merge_plan, is_announced=True)
+def merge_catalogs(draft: Draft) -> None:
+    """Make the star catalogs one, with a row a star."""
+    spec = draft.spec
+    neighbours = not spec.catalog.motions
+    whole = merged_catalog(
+        draft.read, spec.products.crossmatch, draft.workers, neighbours=neighbours
+    )
+    draft.read = []
+    draft.stars, draft.rejected, draft.problems = whole.stars, whole.rejected, whole.problems
+    draft.catalog_bytes = whole.stars.nbytes + whole.rejected.nbytes
+    draft.note("merge_catalogs", *whole.notes)
+    for part in whole.parts or (CatalogPart.of(whole),):
+        stars, rejected = (
+            table.filter(pc.equal(table["catalog"], part.source)) if whole.parts else table
+            for table in (whole.stars, whole.rejected)
+        )
+        rows = sum(file.rows for file in part.files)
+        reasons = count_by_reason(rejected, part.beyond_read_limit)
+        facts = SourceFacts(part.source, "stars", part.files, rows, len(stars), reasons)
+        draft.sources.append(replace(facts, map=map_of(part.source)))
+
+
+def _flight_plan(spec: BuildSpec) -> str | None:
+    done = []
+    if spec.selection.observed != Observed():
+        done.append("correct magnitudes by what was observed in flight")
+    if spec.exposure_notes:
+        done.append("compare limits with the exposure")
+    return ", ".join(done) or None
+
+
+@stage("flight terms", "read", _flight_plan)
+def apply_flight_terms(draft: Draft) -> None:
+    """Correct magnitudes and limits by what is known of the camera."""
+    draft.stars = with_observed(draft.stars, draft.spec.selection.observed)
+    draft.note("apply_flight_terms", *draft.spec.exposure_notes)
+
+
+def _span_plan(spec: BuildSpec) -> str:
+    begin, end = spec.span_jyear
+    if begin == end:
+        return f"compute the errors of positions at J{begin:g}"
+    return f"compute errors and drifts of positions from J{begin:g} to J{end:g}"
+
+
+@stage("span", "read", _span_plan)
+def apply_span(draft: Draft) -> None:
+    """Compute how exact positions are at both ends of the span, and how far stars drift."""
+    draft.stars = with_span(draft.stars, draft.spec.span_jyear)
+
+
+def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
+    """Check that the spec uses every source that an input is given for."""
+    for name in inputs:
+        if name not in spec.sources:
+            item = f'inputs["{name}"]'
+            raise ConfigError(
+                f"{item}: {spec.name} does not read {name} but "
+                f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
+                key="input",
+                value=name,
+                fields=(item,),
+            )
+
+
+def read_all(
+    names: Sequence[str],
+    paths: Mapping[str, Sequence[Path]],
+    *,
+    band: str | None = None,
+    epoch_jyear: float | None = None,
+    read_limit_mag: float | None = None,
+    neighbours: bool = True,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> list[Ingested]:
+    """Read several catalogs, the better one first, to be merged.
+
+    The band is that of the first; the read limit is in each catalog's own. Nearest neighbours are
+    found only where there is one catalog.
+    """
+    return [
+        read_catalog(
+            name,
+            paths[name],
+            band=None if number else band,
+            epoch_jyear=epoch_jyear,
+            read_limit_mag=read_limit_mag,
+            neighbours=neighbours and len(names) == 1,
+            workers=workers,
+            progress=progress,
+        )
+        for number, name in enumerate(names)
+    ]
+
+
+def merged_catalog(
+    read: Sequence[Ingested], wanted: Crossmatch, workers: int, *, neighbours: bool = True
+) -> Ingested:
+    """Return several catalogs as one with a row a star; of a single one nothing changes."""
+    whole = reduce(partial(_joined, wanted=wanted), read)
+    if len(read) == 1 or not neighbours:
+        return whole
+    return replace(whole, stars=add_nearest_neighbours(whole.stars, workers))
+
+
+def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
+    """Return a catalog with the stars of another that it lacks."""
+    own = _in_band(read, whole.band)
+    matches = match_tables(whole.stars, own, wanted)[0]
+    added, again = _split(whole.stars, own, matches.take(pa.array(matched_stars(matches))))
+    stars = pa.concat_tables([whole.stars, added])
+    _check_numbers(whole, read, stars)
+    rejected = pa.concat_tables([whole.rejected, read.rejected, again]).combine_chunks()
+    return replace(
+        whole,
+        stars=sort_rows(stars, ("star_id",)).combine_chunks(),
+        rejected=sort_rows(rejected, product_schema("rejected").order),
+        files=(*whole.files, *read.files),
+        problems=(*whole.problems, *read.problems),
+        notes=(*whole.notes, *read.notes),
+        beyond_read_limit=whole.beyond_read_limit + read.beyond_read_limit,
+        parts=(*(whole.parts or (CatalogPart.of(whole),)), CatalogPart.of(read)),
+    )
+
+
+def _in_band(read: Ingested, band: str) -> pa.Table:
+    """Return the stars of a catalog with their magnitudes in a band."""
+    if read.band == band or not len(read.stars):
+        return read.stars
+    if band not in shipped_names():
+        raise ConfigError(
+            f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of "
+            f"{read.source} in {read.band} cannot be taken to it; "
+            "choose a band that 'starcat bands' lists",
+            key="catalog.band",
+            value=band,
+        )
+    made = in_sensor_band(read.stars, read.source, shipped(band)).stars
+    told = pc.binary_join_element_wise(read.source, made["mag_source"], " ")
+    return with_columns(made, {"band": band, "mag_source": told})
+
+
+def _split(stars: pa.Table, own: pa.Table, matches: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """Return the rows of a catalog that are no star's counterpart, and those that are, rejected."""
+    # A record may be that of two stars, which its catalog does not tell apart: the first is named.
+    order = np.lexsort((matches["star_rank"].to_numpy(), matches["counterpart_id"].to_numpy()))
+    matches = matches.take(pa.array(order))
+    number, first = np.unique(matches["counterpart_id"].to_numpy(), return_index=True)
+    matches = matches.take(pa.array(first))
+    is_again = np.isin(own["star_id"].to_numpy(), number)
+    again = sort_rows(own.filter(pa.array(is_again)), ("star_id",))
+    ambiguous = pc.equal(matches["verdict"], "ambiguous")
+    reasons = pc.if_else(
+        ambiguous, Reason.ambiguous_counterpart.name, Reason.counterpart.name
+    ).cast(pa.string())
+    rejected = reject_rows(again, reasons)
+    names = stars["designation"].take(matches["star"].combine_chunks()).to_pylist()
+    apart = matches["separation_arcsec"].to_pylist()
+    detail = [f"{name}, {angle:.3f} arcsec" for name, angle in zip(names, apart, strict=True)]
+    rejected = with_columns(rejected, {"detail": pa.array(detail, pa.string())})
+    return own.filter(pa.array(~is_again)), rejected
+
+
+def _check_numbers(whole: Ingested, read: Ingested, stars: pa.Table) -> None:
+    number = np.sort(stars["star_id"].to_numpy())
+    twice = number[1:][number[1:] == number[:-1]]
+    if len(twice):
+        names = " and ".join(part.source for part in whole.parts or (whole,))
+        raise ConfigError(
+            f"catalog.merged: {read.source} and {names} number stars alike ({len(twice):,} "
+            f"numbers, such as {twice[0]}); star_id would not tell them apart. Merge catalogs "
+            "whose numbers differ, such as hipparcos, tycho2 and gaia",
+            key="catalog.merged",
+            value=read.source,
+        )

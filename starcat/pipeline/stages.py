@@ -1,0 +1,82 @@
+"""The stages of a build, in order, and what they will do for a spec."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from starcat.pipeline.counterparts import find_counterparts
+from starcat.pipeline.draft import Inputs, Stage
+from starcat.pipeline.finish import (
+    describe_database,
+    make_products,
+    prove_database,
+    report_database,
+    verify_database,
+    write_database,
+)
+from starcat.pipeline.guide_stars import check_cost, select, thin, tile
+from starcat.pipeline.reading import (
+    apply_flight_terms,
+    apply_span,
+    check_inputs,
+    merge_catalogs,
+    read_catalogs,
+)
+from starcat.pipeline.supply import (
+    list_motions,
+    supply_amplitudes,
+    supply_doubles,
+    supply_motions,
+    to_sensor_band,
+)
+from starcat.specs.build_spec import BuildSpec
+
+READ = (
+    read_catalogs,
+    merge_catalogs,
+    supply_motions,
+    supply_amplitudes,
+    supply_doubles,
+    to_sensor_band,
+    apply_flight_terms,
+    apply_span,
+)
+"""From files to a star table: what an estimate keeps."""
+
+CHOOSE = (select, thin, tile, check_cost)
+"""From the star table to guide stars, their fields and the cost of the rest."""
+
+PRODUCTS = (make_products, list_motions, find_counterparts)
+"""From guide stars to products."""
+
+FINISH = (write_database, prove_database, report_database, describe_database, verify_database)
+"""From products to a database that is proven to work."""
+
+BUILD = (*READ, *CHOOSE, *PRODUCTS, *FINISH)
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """What a stage will do for a spec."""
+
+    name: str  # of the stage's function
+    title: str  # in a word or two
+    does: str | None  # None where it does nothing for the spec
+    reads: Mapping[str, tuple[str, ...]]  # what was given of each source that it reads, by name
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return asdict(self)
+
+
+def explain(spec: BuildSpec, inputs: Inputs) -> tuple[PlannedStage, ...]:
+    """Return what each stage of a build will do; no source is looked for or read."""
+    check_inputs(spec, inputs)
+    return tuple(_planned(each, spec, inputs) for each in BUILD)
+
+
+def _planned(each: Stage, spec: BuildSpec, inputs: Inputs) -> PlannedStage:
+    reads = {name: tuple(map(str, inputs.get(name, ()))) for name in each.reads(spec)}
+    return PlannedStage(each.name, each.title, each.plan(spec), reads)

@@ -1,0 +1,303 @@
+"""The stages that take from other sources what the catalogs of the stars lack.
+
+Motions and photometry are those of entries that are matched by the cross-identification of the
+product ``crossmatch``, one catalog at a time. An entry is moved by its own motion to the epoch of
+the star's position and compared there. The star keeps its position and gets the motion, which takes
+it to the epoch of the build. Photometry is that of the entry that is a star's only or by far
+likeliest one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.arrays import Array
+from starcat.artifact.manifest import SourceFacts
+from starcat.artifact.writer import Product
+from starcat.bands.response import Response
+from starcat.catalog.doubles import PairTable, read_wds
+from starcat.catalog.ingest import unmoved_stars
+from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
+from starcat.catalog.variability import AmplitudeTable, read_amplitudes
+from starcat.geometry.sphere import separation
+from starcat.pipeline.counterparts import match_source, read_and_match, source_facts
+from starcat.pipeline.draft import Draft, stage
+from starcat.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
+from starcat.specs.build_spec import BuildSpec
+from starcat.stars.proper_motion import Motion, propagate
+from starcat.stars.star_table import (
+    add_nearest_neighbours,
+    directions_of,
+    floats_of,
+    move_to_epoch,
+    with_columns,
+)
+from starcat.stars.verdict import Quality
+from starcat.storage.schema import product_schema
+
+OF_ENTRY = (
+    "catalog", "counterpart_id", "designation", "separation_arcsec", "delta_mag", "n_candidates",
+    "probability",
+)  # fmt: skip
+"""Columns of the crossmatch product that the product ``motions`` has too."""
+
+
+def _motions_plan(spec: BuildSpec) -> str | None:
+    if not spec.catalog.motions:
+        return None
+    names = ", ".join(spec.catalog.motions)
+    return f"take proper motions from {names}, and move stars to J{spec.middle_jyear:g}"
+
+
+@stage("motions", "read", _motions_plan, lambda spec: spec.catalog.motions)
+def supply_motions(draft: Draft) -> None:
+    """Give stars without a proper motion that of other catalogs, and move them to the epoch."""
+    spec, stars = draft.spec, draft.stars
+    found = _Found.of(stars)
+    for name in spec.catalog.motions:
+        found.note(match_source(name, supply_motions, stars, draft))
+    moved = _with_motions(stars, found, spec.middle_jyear)
+    draft.motions = found.table(stars, moved)
+    # What reading said of stars that stay behind is no longer so.
+    stale = unmoved_stars(spec.catalog.source, stars, spec.middle_jyear)
+    notes = draft.notes["merge_catalogs"]
+    draft.notes["merge_catalogs"] = [note for note in notes if note not in stale]
+    draft.stars = add_nearest_neighbours(moved, draft.workers)
+    draft.catalog_bytes = draft.stars.nbytes + draft.rejected.nbytes
+
+
+def guide_star_motions(draft: Draft) -> list[Product]:
+    """Return the motions of guide stars as a product; none where the spec asks for no motions."""
+    if draft.motions is None:
+        return []
+    number = draft.stars["star_id"].to_numpy()
+    guide_stars = draft.selected.guide_stars
+    rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
+    table = draft.motions.take(pa.array(rows)).combine_chunks()
+    own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
+    return [Product("motions", table.set_column(0, table.schema.field(0), own), in_database=False)]
+
+
+@stage(
+    "product motions",
+    "products",
+    lambda spec: "list where each motion is from" if spec.catalog.motions else None,
+)
+def list_motions(draft: Draft) -> None:
+    """List where the motions of guide stars are from, and count the stars of each catalog."""
+    (product,) = guide_star_motions(draft)
+    draft.products.append(product)
+    table = product.table
+    for number, facts in enumerate(draft.sources):
+        if facts.role != "motions":
+            continue
+        own = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], facts.source))
+        way, moved = floats_of(table.filter(own), "moved_arcsec"), None
+        if len(way):
+            largest, median = float(way.max()), float(np.median(way))
+            moved = {"median": round(median, 6), "largest": round(largest, 6)}
+        draft.sources[number] = replace(facts, joined=len(way), moved_arcsec=moved)
+    counts, spec = Counter(table["outcome"].to_pylist()), draft.spec
+    unmoved = sorted(counts.keys() - {JOINED, OWN_MOTION})
+    if unmoved:
+        reasons = ", ".join(f"{name} {counts[name]:,}" for name in unmoved)
+        draft.note(
+            "supply_motions",
+            f"{spec.catalog.source}: {sum(counts[name] for name in unmoved):,} of "
+            f"{counts.total():,} guide stars have no motion in {', '.join(spec.catalog.motions)} "
+            f"and are not moved to J{spec.middle_jyear:g} ({reasons}); the product motions lists "
+            "them",
+        )
+
+
+def _join_plan(what: str, names: Sequence[str]) -> str | None:
+    return f"take {what} from {', '.join(names)}" if names else None
+
+
+@stage(
+    "amplitudes",
+    "read",
+    lambda spec: _join_plan("amplitudes of variable stars", spec.selection.variables.join),
+    lambda spec: spec.selection.variables.join,
+)
+def supply_amplitudes(draft: Draft) -> None:
+    """Give stars the amplitudes that other sources know."""
+    for name in draft.spec.selection.variables.join:
+        _join(draft, "supply_amplitudes", read_amplitudes(name, draft.paths[name], draft.progress))
+
+
+@stage(
+    "doubles",
+    "read",
+    lambda spec: _join_plan("companions", spec.selection.doubles.join),
+    lambda spec: spec.selection.doubles.join,
+)
+def supply_doubles(draft: Draft) -> None:
+    """Flag stars with the companions that other sources know."""
+    for name in draft.spec.selection.doubles.join:
+        _join(draft, "supply_doubles", read_wds(draft.paths[name], draft.progress))
+
+
+def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:
+    """Join what a source says to the stars that it knows."""
+    draft.stars, joined = table.join(draft.stars, draft.spec.selection)
+    rows = sum(file.rows for file in table.files)
+    facts = (table.source, table.role, table.files, rows, table.kept, table.rejected, joined)
+    draft.sources.append(SourceFacts(*facts))
+    if not joined:
+        draft.note(
+            stage_name,
+            f"{table.source} says nothing of any star of {draft.spec.catalog.source}: a joined "
+            "source knows stars by their numbers in other catalogs or by place. Join a file that "
+            "has what these stars have, or leave it out",
+        )
+
+
+def _band_plan(spec: BuildSpec) -> str | None:
+    wanted = spec.camera.response
+    if wanted.name is None:
+        return None
+    others = f", also from {', '.join(wanted.photometry)}" if wanted.photometry else ""
+    return f"predict magnitudes in {wanted.name}{others}"
+
+
+@stage("photometry", "read", _band_plan, lambda spec: spec.camera.response.photometry)
+def to_sensor_band(draft: Draft) -> None:
+    """Predict the magnitudes of stars in the band of the sensor."""
+    spec, stars = draft.spec, draft.stars
+    response = spec.camera.response.response()
+    if response is None:
+        return
+    others: list[Other] = []
+    for name in spec.camera.response.photometry:
+        others.append(_photometry(name, response, draft))
+    draft.in_band = in_sensor_band(stars, spec.catalog.source, response, others)
+    # The neighbours' differences of magnitude are the sensor's too.
+    draft.stars = add_nearest_neighbours(draft.in_band.stars, draft.workers)
+    draft.note(to_sensor_band.name, *_band_notes(draft.in_band, spec))
+
+
+def _photometry(name: str, response: Response, draft: Draft) -> Other:
+    """Return what a source says of the magnitudes of stars, and add what was read to the draft."""
+    read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
+    is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
+    best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
+    place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
+    rows = best["star"].to_numpy().astype(np.int64)
+    draft.sources.append(replace(source_facts(read, "photometry"), joined=len(best)))
+    draft.note(to_sensor_band.name, *read.notes)
+    return other_of(read.stars.take(pa.array(place)), rows, name, response)
+
+
+def _band_notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
+    notes = []
+    alone = made.counts.get(f"{made.band}{ALONE}", 0)
+    if alone:
+        notes.append(
+            f"{spec.catalog.source}: {alone:,} of {len(made.stars):,} stars have neither colour "
+            f"nor spectral type; their magnitudes in {made.response.name} are those of a star of "
+            "the mean colour, with an error to match; camera.response.photometry names catalogs "
+            "that know more of them"
+        )
+    if spec.catalog.read_limit_mag is not None:
+        notes.append(
+            f"catalog.read_limit_mag {spec.catalog.read_limit_mag:g} is in the catalog's band "
+            f"{made.band}, the limits of [selection] are in {made.response.name}: it has to be so "
+            "faint that no star that the sensor sees is left out"
+        )
+    return tuple(notes)
+
+
+@dataclass
+class _Found:
+    """The entry that each star has so far, its motion and what is said of it.
+
+    ``rows`` are rows of all matches so far, -1 where a star has none.
+    """
+
+    outcome: NDArray[np.object_]
+    epoch_jyear: Array
+    pm_ra: Array
+    pm_dec: Array
+    rows: NDArray[np.int64]
+    matches: list[pa.Table]
+
+    @classmethod
+    def of(cls, stars: pa.Table) -> _Found:
+        """Return what is known before any catalog has been read."""
+        pm_ra, pm_dec = (floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec"))
+        own = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
+        outcome = np.where(own, OWN_MOTION, NO_CANDIDATE).astype(object)
+        rows = np.full(len(stars), -1, dtype=np.int64)
+        return cls(outcome, floats_of(stars, "epoch_jyear"), pm_ra, pm_dec, rows, [])
+
+    def note(self, matches: pa.Table) -> None:
+        """Take the motions that a catalog has, and its verdict on stars that none had so far."""
+        best = matches.filter(pc.equal(matches["rank"], 1))
+        start = sum(map(len, self.matches))
+        self.matches.append(best)
+        star = best["star"].to_numpy()
+        motion = Motion(
+            *(floats_of(best, name) for name in ("ra_deg", "dec_deg")),
+            *(floats_of(best, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
+        )
+        # The motion at the epoch of the star's position, as its straight line has it there.
+        motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
+        known = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
+        outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
+        named = (outcome == "unique") | (outcome == "best")
+        outcome[named] = np.where(known[named], JOINED, NO_MOTION)
+        before = self.outcome[star]
+        better = (outcome == JOINED) & (before != JOINED) & (before != OWN_MOTION)
+        chosen = better | (before == NO_CANDIDATE)
+        self.outcome[star[chosen]] = outcome[chosen]
+        self.rows[star[chosen]] = start + np.flatnonzero(chosen)
+        self.pm_ra[star[better]] = motion.pm_ra_cosdec_mas_yr[better]
+        self.pm_dec[star[better]] = motion.pm_dec_mas_yr[better]
+
+    def table(self, stars: pa.Table, moved: pa.Table) -> pa.Table:
+        """Return what was found for stars and how far each moved, as the product has it."""
+        schema = product_schema("motions").arrow_schema
+        entries = pa.concat_tables([table.select(OF_ENTRY) for table in self.matches])
+        entries = entries.take(pa.array(self.rows, mask=self.rows < 0))
+        way = np.degrees(separation(directions_of(stars), directions_of(moved))) * 3600.0
+        columns = {name: entries[name] for name in OF_ENTRY}
+        columns |= {
+            "star": pa.array(np.arange(len(stars), dtype=np.int32)),
+            "outcome": pa.array(self.outcome, pa.string()),
+            "n_candidates": pc.fill_null(entries["n_candidates"], 0),
+            "from_jyear": pa.array(self.epoch_jyear),
+            "moved_arcsec": pa.array(way, mask=self.outcome != JOINED),
+        }
+        arrays = [columns[field.name].cast(field.type) for field in schema]
+        return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _with_motions(stars: pa.Table, found: _Found, epoch_jyear: float) -> pa.Table:
+    """Return stars with the motions that were found for them, moved to an epoch."""
+    rows = np.flatnonzero(found.outcome == JOINED)
+    flags = stars["quality_flags"].to_numpy()[rows] & ~np.int32(Quality.NO_PROPER_MOTION)
+    moved = move_to_epoch(
+        {
+            "ra_deg": floats_of(stars, "ra_deg")[rows],
+            "dec_deg": floats_of(stars, "dec_deg")[rows],
+            "epoch_jyear": found.epoch_jyear[rows],
+            "pm_ra_cosdec_mas_yr": found.pm_ra[rows],
+            "pm_dec_mas_yr": found.pm_dec[rows],
+            "quality_flags": flags,
+        },
+        epoch_jyear,
+    )
+    columns = {}
+    for name, values in moved.items():
+        before = stars[name].to_numpy() if name == "quality_flags" else floats_of(stars, name)
+        columns[name] = before.copy()
+        columns[name][rows] = values
+    return with_columns(stars, columns)

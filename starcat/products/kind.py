@@ -1,0 +1,213 @@
+"""What the module of a product says of it: one `ProductKind`, which all other rooms read.
+
+A module of this room that defines ``POSITION`` and ``KIND`` is a product
+(`starcat.products.table`). Its schema says what the columns mean. Only what differs from the usual
+has to be given: a product that is made from the guide stars alone has a name, a section of the
+spec, a function that makes it and one that counts its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field
+
+from starcat.arrays import Array, Directions
+from starcat.geometry.camera import Camera
+from starcat.products.counting import Neighbourhoods
+from starcat.products.layouts import ProductLayout
+from starcat.products.tiling import FieldSize, FieldStars
+from starcat.sections import Section
+from starcat.storage.schema import ProductSchema, product_schema
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+HALF_FIELD = "default: half of the camera's narrower field"
+"""What the description of a radius says of its default."""
+
+
+@dataclass(frozen=True)
+class SpecFacts:
+    """What the rest of a spec says that a section of a product has to agree with."""
+
+    catalog: str  # name of the catalog of the stars
+    camera: Camera
+    half_field_deg: float  # half of the narrower full angle
+    enabled: tuple[str, ...]  # names of the products that the database has
+
+
+class ProductSection(Section):
+    """The section of a spec for a product that can be left out."""
+
+    enabled: bool = Field(True, description="whether the database has this product")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the catalogs that the product is made from beside that of the stars."""
+        return ()
+
+    def widest_field_deg(self, own_deg: float) -> float:
+        """Return the widest horizontal field that the product serves; usually the camera's own."""
+        return own_deg
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check the section against the rest of the spec.
+
+        Raises
+        ------
+        ValueError
+            If the two contradict each other. The message begins with ``products.`` and the name.
+        """
+
+
+@dataclass(frozen=True)
+class ProductInputs:
+    """What every product is made from."""
+
+    directions: Directions  # shape (N, 3): guide stars, ICRS
+    mag: Array  # shape (N,)
+    fields: FieldStars  # the tiling of the sphere and the stars in each field
+    field_size: FieldSize  # size of the tiling's fields
+    boresights: int  # number of the tiling's fields
+    brightest: int  # stars of a field that make its triangles
+    half_field_deg: float  # half of the camera's narrower full angle
+    diagonal_rad: float  # of the camera's field
+    wanted: Mapping[str, ProductSection]  # sections of the products that are asked for
+
+    def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
+        """Return a radius of a spec; None is half of the field, times a factor."""
+        if radius_deg is not None:
+            return float(np.radians(radius_deg))
+        return factor * float(np.radians(self.half_field_deg))
+
+    @cached_property
+    def neighbourhoods(self) -> Neighbourhoods:
+        """Numbers of neighbours around some of the stars, for the estimate."""
+        return Neighbourhoods(self.directions)
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How large a product will be."""
+
+    rows: float  # rows of its table
+    lists: Mapping[str, float] = field(default_factory=dict)  # entries of each list, all rows
+    bins: float = 0.0  # bins of its look-up table; each entry of a list is in one, or else each row
+    # neighbours that are gone through to make it; its rows where these are what it lists
+    reached: float = 0.0
+    records: float = 0.0  # triangles over all fields, repeats included; 0 for other products
+
+    @property
+    def values(self) -> float:
+        """Entries of all lists."""
+        return sum(self.lists.values())
+
+
+def one_row_a_star(inputs: ProductInputs, _: Any) -> Extent:
+    """Return the extent of a product that has a row for every star."""
+    stars = float(len(inputs.directions))
+    return Extent(stars, reached=stars)
+
+
+@dataclass(frozen=True)
+class RowCost:
+    """What a row of a product costs."""
+
+    held_bytes: float  # while the other products are made and written
+    working_bytes: float  # beside that, while it is made itself
+    micros: float  # microseconds to make, write and check it
+
+
+USUAL_COST = RowCost(24.0, 60.0, 1.2)
+"""What a row costs of which nothing else was measured."""
+
+STAR_ROW_IN_ORDER = 2.3
+"""Bytes of a row of the star table in a Parquet file, ascending and each once."""
+
+SEPARATION_OF_STAR = 8.1
+"""Bytes of a neighbour with one separation or ratio, ascending within each star."""
+
+
+def star_row_bytes(stars: float) -> float:
+    """Return the bytes of a row of the star table in a Parquet file, in no order."""
+    return float(1.3 * np.log2(max(stars, 2.0)) / 8.0)
+
+
+def neighbour_extent(inputs: ProductInputs, radius_rad: float, bins: float = 0.0) -> Extent:
+    """Return the extent of a product whose rows are the neighbours of each star."""
+    rows = inputs.neighbourhoods.total(radius_rad)
+    return Extent(rows, bins=bins, reached=rows)
+
+
+def rows_by_star_bytes(extent: Extent, stars: int, each: float) -> float:
+    """Return the bytes of rows that are side by side for each star, whose number is about once."""
+    return min(2.1 * stars, 2.0 * extent.rows) + extent.rows * each
+
+
+@dataclass(frozen=True)
+class ProductKind:
+    """Everything that is known of a product.
+
+    The functions take the product's own section of the spec as their last argument. Sizes of
+    Parquet files were measured on skies of 200 to 170,000 stars, costs with numpy 2 on products of
+    0.5 to 6 million rows.
+    """
+
+    name: str  # as in its schema, the spec and the database
+    # Makes the product: attributes are named as the columns of the schema, and ``index`` is an
+    # `Index`. None where the pipeline makes it from more than guide stars.
+    make: Callable[[ProductInputs, Any], Any] | None = None
+    section: type[ProductSection] | None = None  # None where every database has the product
+    in_database: bool = True  # whether the matcher's HDF5 file has it
+    # Its indices, and its columns where the matcher opens it.
+    layout: ProductLayout = field(default_factory=ProductLayout)
+    # Counts it without making it. None where guide stars do not tell.
+    count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
+    # What a row costs, or a neighbour or triangle that `Extent.reached` counts. None where the
+    # estimate leaves its memory and time out.
+    cost: RowCost | None = USUAL_COST
+    # Bytes of its columns in a Parquet file, from the number of stars. None where values are
+    # written as they are.
+    file_bytes: Callable[[Extent, int, Any], float] | None = None
+    # Yields what contradicts itself or the stars, from the tables of the product and of the stars.
+    problems: Callable[[pa.Table, pa.Table], Iterator[str]] | None = None
+    # Counts the stars that the product has from a catalog, and what these stars have.
+    joined: tuple[Callable[[pa.Table, str], int], str] | None = None
+
+    @property
+    def schema(self) -> ProductSchema:
+        """The newest schema."""
+        return product_schema(self.name)
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether a spec that does not speak of the product asks for it, and it can be left out."""
+        return self.section is not None and self.section().enabled
+
+    def is_wanted(self, inputs: ProductInputs) -> bool:
+        """Return whether a database has the product."""
+        return self.section is None or self.name in inputs.wanted
+
+    def values_bytes(self, extent: Extent, stars: int, wanted: Any) -> float:
+        """Return about how many bytes the columns take in a Parquet file."""
+        if self.file_bytes is not None:
+            return self.file_bytes(extent, stars, wanted)
+        return sum(
+            extent.lists.get(column.name, extent.rows) * np.dtype(column.item_dtype).itemsize
+            for column in self.schema.columns
+            if column.item_dtype != "string"
+        )
+
+    def index_bytes(self, extent: Extent, stars: int) -> float:
+        """Return how many bytes stand beside the columns in the database."""
+        layout = self.layout
+        total = 8.0 * stars * (layout.by_star + len(layout.per_star))
+        total += 4.0 * extent.rows * layout.kvector
+        if layout.bins:
+            total += 8.0 * extent.bins + 4.0 * (extent.values if extent.lists else extent.rows)
+        return total

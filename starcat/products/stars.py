@@ -1,0 +1,10 @@
+"""The product ``stars``: the guide stars, which the selection makes."""
+
+from __future__ import annotations
+
+from starcat.products.kind import ProductKind
+from starcat.products.layouts import LAYOUTS
+
+POSITION = 10
+
+KIND = ProductKind(name="stars", layout=LAYOUTS["stars"], cost=None)

@@ -1,0 +1,30 @@
+"""The rules of selection, one module per rule; the module is all that a rule needs.
+
+A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
+
+``POSITION``
+    A number. Rules reject in its order, and the first reason that applies to a star is its verdict.
+``STEP``
+    Name of the row in the report's table of filters. Neighbouring rules can share a row.
+``REASONS``
+    `RuleReason` of everything that the rule can reject a star for.
+``COLUMNS``
+    Columns of the star table that the rule reads.
+``KEYS``, ``TABLE``
+    The `Section` with the keys of the rule, and the name of its table in ``[selection]``. Without
+    ``TABLE`` the keys stand in ``[selection]`` itself, in the order of ``KEYS_POSITION``, or else
+    of ``POSITION``. Rules can share a table. A new section has ``is_later = True``, and keys that
+    stand in ``[selection]`` itself are in ``later_keys``, so that specs without them are recorded
+    as before.
+``FORM``
+    A `FormField` for each key that the form of the service shows, by the name of the key.
+``reject(context, keys)``
+    Returns a `Rejection` for each reason, or None if the spec does not use the rule. ``keys`` is
+    the section ``KEYS``.
+``combine(context, keys)``
+    Changes the star table before any rule rejects stars, as merging does.
+``check(selection)``, ``check_spec(spec)``
+    Raise a `ValueError` if keys of ``[selection]``, or of the whole spec, contradict each other.
+
+All names but ``POSITION``, ``STEP``, ``REASONS``, ``COLUMNS`` and ``reject`` can be left out.
+"""

@@ -1,0 +1,62 @@
+"""Stars that fields of the tiling have too many of, and which stars stay where a spec thins."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from starcat.sections import Section
+from starcat.selection.rule import Context, FormField, RuleReason
+
+POSITION = 120
+STEP = "density"
+COLUMNS = ("mag", "star_id", "x", "y", "z")
+DENSITY = RuleReason(
+    "density",
+    "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says",
+)
+REASONS = (DENSITY,)
+FORM = {
+    "thinning": FormField(
+        "A field's stars are thinned by",
+        "choice",
+        hint="as many stay by every rule",
+        choices=(
+            ("brightest", "brightness"),
+            ("voronoi", "the room around each"),
+            ("information", "the attitude of the worst fields"),
+        ),
+    )
+}
+
+
+class Thinning(Section):
+    """Which stars stay where a spec thins."""
+
+    later_keys = ("thinning",)
+
+    thinning: Literal["brightest", "voronoi", "information"] = Field(
+        "brightest",
+        description="which stars stay where max_stars or max_stars_per_field thins, as many by "
+        "every rule: the brightest; those whose cell (what is nearer to them than to any other) is "
+        "large for their brightness; or those that the attitude of the worst fields needs most",
+    )
+
+
+KEYS = Thinning
+
+
+def check(selection: Any) -> None:
+    """Check that a spec which says how to thin also says to how many stars."""
+    if selection.thinning != "brightest" and (
+        selection.max_stars is None is selection.max_stars_per_field
+    ):
+        raise ValueError(
+            f"thinning is {selection.thinning}, but nothing says how many stars stay; give "
+            "max_stars or max_stars_per_field"
+        )
+
+
+def reject(_: Context, __: Thinning) -> None:
+    """Reject no star: the build thins afterwards, when it has the tiling of the sphere."""

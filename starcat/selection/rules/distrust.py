@@ -1,0 +1,85 @@
+"""Stars to distrust, because frames of the sensor contradict the catalog."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, StringConstraints
+
+from starcat.sections import Section
+from starcat.selection.rule import Context, Rejection, RuleReason
+
+POSITION = 90
+STEP = "distrust"
+COLUMNS = ("star_id",)
+DISTRUSTED = RuleReason("distrusted", "distrusted by what flew: [selection.observed] lists it")
+REASONS = (DISTRUSTED,)
+
+SHA256_PATTERN = r"^[0-9a-f]{64}$"
+Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
+
+
+class Observed(Section):
+    """What frames of the sensor say of it and of its stars, as 'starcat learn' writes it."""
+
+    is_later = True
+
+    zero_point_mag: float | None = Field(
+        None,
+        ge=-100.0,
+        le=100.0,
+        description="measured magnitude of a star of colour 0 minus the catalog's; told, not "
+        "applied",
+        examples=[0.2],
+    )
+    colour_term: float = Field(
+        0.0,
+        ge=-5.0,
+        le=5.0,
+        description="mag becomes mag + colour_term x (colour_mag - reference_colour_mag)",
+    )
+    colour_bands: str | None = Field(
+        None, max_length=40, description="the colour that the term is for", examples=["BP-RP"]
+    )
+    reference_colour_mag: float = Field(
+        0.0,
+        ge=-20.0,
+        le=20.0,
+        description="stars of this colour keep their mag, as do those of unknown colour",
+    )
+    reject: tuple[int, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        max_length=4000,
+        description="star_id of the stars to distrust, which are rejected",
+        examples=[[3, 17]],
+    )
+    frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
+    database: str | None = Field(
+        None,
+        max_length=200,
+        description="database that they were identified with",
+        examples=["mycam-1.0.0"],
+    )
+    manifest_sha256: str | None = Field(
+        None, pattern=SHA256_PATTERN, description="digest of its manifest", examples=["0" * 64]
+    )
+    results_sha256: tuple[Sha256, ...] = Field(
+        (),
+        strict=False,
+        max_length=1000,
+        description="digests of the files of identified frames",
+        examples=[["0" * 64]],
+    )
+
+
+TABLE, KEYS = "observed", Observed
+
+
+def reject(context: Context, keys: Observed) -> list[Rejection] | None:
+    """Reject the stars that the spec says to distrust."""
+    if not keys.reject:
+        return None
+    wanted = np.array(keys.reject, dtype=np.int64)
+    return [Rejection(np.isin(context.stars["star_id"].to_numpy(), wanted), DISTRUSTED)]

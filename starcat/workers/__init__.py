@@ -1,0 +1,1 @@
+"""Child processes that answer requests: one protocol, and the limits that a system sets to them."""

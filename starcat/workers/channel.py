@@ -1,0 +1,69 @@
+"""The other end of `starcat.workers.process`: what a worker itself calls."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import signal
+import sys
+import threading
+from contextlib import suppress
+from typing import Any
+
+from starcat.workers.messages import HEAD, from_json, json_content
+
+
+class Channel:
+    """Requests that a worker reads and replies that it writes; several threads may write.
+
+    Whatever a library prints goes to the standard error of the process.
+    """
+
+    def __init__(self) -> None:
+        # Ctrl-C reaches every process of a terminal; the one that asks decides what becomes of
+        # this.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        self.sending = threading.RLock()
+
+    def receive(self) -> Any:
+        """Return the next request; EOFError if there is none any more."""
+        _, size = HEAD.unpack(self._exactly(HEAD.size))
+        return from_json(self._exactly(size))
+
+    def send(self, kind: str, content: Any, *, more: bool = False) -> None:
+        """Send a reply: plain values, or bytes as they are; if more follow, it may wait for them.
+
+        OSError if the one that asked is gone.
+        """
+        found = content if isinstance(content, bytes) else json_content(content)
+        with self.sending:
+            self._replies.write(HEAD.pack(kind.encode(), len(found)))
+            self._replies.write(found)
+            if not more:
+                self._replies.flush()
+
+    def wait_for_end(self) -> None:
+        """Wait until the one that asks closes its end; what else it sends is dropped."""
+        while sys.stdin.buffer.read(1):
+            pass
+
+    def _exactly(self, size: int) -> bytes:
+        found = sys.stdin.buffer.read(size)
+        if len(found) < size:
+            raise EOFError
+        return found
+
+
+def return_free_memory() -> None:
+    """Return memory of this process that is not used any more to the system.
+
+    Figures of matplotlib and exceptions refer to themselves in circles, and keep large arrays
+    until the garbage is collected.
+    """
+    gc.collect()
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # of another C library than that of GNU
+            ctypes.CDLL(None).malloc_trim(0)

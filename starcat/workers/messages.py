@@ -1,0 +1,103 @@
+"""Messages between a process and its workers: queries, uploads, estimates and jobs have the same.
+
+A message is one letter for its kind, the length of its content, and the content: JSON, or an Arrow
+stream. Nothing in it can make the reader run code, and the reader refuses what is longer than it
+allows before it takes memory for it. JSON that is nested too deep for Python is refused too.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import struct
+from typing import Any
+
+from starcat.errors import QueryError, error_of_kind
+
+HEAD = struct.Struct(">cQ")
+"""Kind and length of a message."""
+
+REQUEST = "?"  # what is wanted
+PROGRESS = "%"  # how far it is; more replies follow
+PART = "p"  # a part of the answer; more replies follow
+DONE = "d"  # the answer, or the end of it
+ARROW = "a"  # the answer, as an Arrow stream
+ERROR = "e"  # why there is no answer: `error_content`
+ENDINGS = frozenset({DONE, ARROW, ERROR})
+
+MAX_ERROR_CHARACTERS = 4000
+FULL = (errno.ENOSPC, errno.EDQUOT)
+PLAIN_ERRORS: tuple[type[Exception], ...] = (MemoryError, RecursionError)
+"""Errors of Python's own that a worker reports; its others are those of `starcat.errors`."""
+
+_JSON = json.JSONEncoder(separators=(",", ":"), default=lambda value: value.tolist())
+"""Numbers and arrays of numpy are numbers and lists."""
+
+
+class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact
+    """A process sent bytes that are not a message, or a message that is too long."""
+
+
+def json_content(found: Any) -> bytes:
+    """Return plain values as the content of a message."""
+    return _JSON.encode(found).encode()
+
+
+def from_json(content: bytes | bytearray) -> Any:
+    """Return the plain values of a message; MalformedMessage if it is not JSON."""
+    try:
+        return json.loads(str(content, "utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise malformed(error) from error
+
+
+def malformed(error: Exception) -> MalformedMessage:
+    """Return the error for data that cannot be read, by what reading them led to."""
+    return MalformedMessage(
+        f"the process sent data that cannot be read ({type(error).__name__}), and was ended; "
+        "ask again"
+    )
+
+
+def error_content(error: Exception) -> dict[str, Any]:
+    """Return an error as plain values, for `error_of`."""
+    plain = next((kind for kind in PLAIN_ERRORS if isinstance(error, kind)), type(error))
+    key = getattr(error, "key", None)
+    return {
+        "kind": plain.__name__,
+        "message": (str(error).strip() or plain.__name__)[:MAX_ERROR_CHARACTERS],
+        "key": None if key is None else str(key),
+        "fields": list(getattr(error, "fields", ())),
+        "errno": _system_error(error),
+    }
+
+
+def error_of(content: Any) -> Exception:
+    """Return the error that a worker has reported, one of a fixed set of classes.
+
+    They are those of `starcat.errors`, `PLAIN_ERRORS`, OSError, and RuntimeError for all others. A
+    content that is no error gives a `MalformedMessage`.
+    """
+    try:
+        kind, message, number = str(content["kind"]), str(content["message"]), content["errno"]
+        key, fields = content["key"], tuple(map(str, content["fields"]))
+        if number is not None:
+            return OSError(int(number), message)
+    except (TypeError, ValueError, LookupError) as error:
+        return malformed(error)
+    for plain in PLAIN_ERRORS:
+        if kind == plain.__name__:
+            return plain(message)
+    found = error_of_kind(kind, message, key=None if key is None else str(key), fields=fields)
+    return found or RuntimeError(f"{kind}: {message}")
+
+
+def _system_error(error: BaseException) -> int | None:
+    """Return the number of the system's error; of a full disk also if another error tells of it."""
+    number = getattr(error, "errno", None)
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in FULL:
+            return cause.errno
+        cause = cause.__cause__
+    return number if isinstance(number, int) else None

@@ -1,0 +1,126 @@
+"""The stages of a build: their order, what they say that they will do, and what they share."""
+
+import json
+
+import pytest
+from drafts import chosen
+
+from starcat.errors import BuildError, ConfigError
+from starcat.pipeline.draft import Draft, run, stage
+from starcat.pipeline.estimate import estimate_spec
+from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
+from starcat.specs.reading import preset, preset_names, spec_from_dict
+
+EVERYTHING = {
+    "catalog.motions": '["hipparcos"]',
+    "camera.response.name": '"silicon-cmos"',
+    "camera.response.photometry": '["2mass"]',
+    "selection.variables.join": '["gcvs"]',
+    "selection.doubles.join": '["wds"]',
+    "selection.observed.colour_term": "0.01",
+    "selection.max_stars_per_field": "12",
+    "products.levels.enabled": "true",
+    "products.crossmatch.enabled": "true",
+    "products.crossmatch.catalogs": '["sao"]',
+}
+"""Keys with which every stage has something to do."""
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_stages_read_the_sources_of_a_spec(name):
+    spec = preset(name)
+    read = dict.fromkeys(source for each in explain(spec, {}) for source in each.reads)
+    assert set(read) == set(spec.sources)
+    for each in explain(spec, {}):
+        assert each.does is not None or not each.reads
+
+
+def test_every_stage_has_something_to_do_for_some_spec():
+    spec = preset("gaia-12deg", EVERYTHING)
+    stages = explain(spec, {"gcvs": ["there/gcvs.tsv"]})
+    assert [each.name for each in stages if each.does is None] == []
+    read = {source: files for each in stages for source, files in each.reads.items()}
+    assert list(read) == ["gaia", "hipparcos", "gcvs", "wds", "2mass", "sao"]
+    assert (read["gcvs"], read["wds"]) == (("there/gcvs.tsv",), ())
+
+
+def test_stages_have_names_titles_and_summaries_of_their_own():
+    for values in ({s.name for s in BUILD}, {s.title for s in BUILD}, {s.summary for s in BUILD}):
+        assert len(values) == len(BUILD)
+        assert all(values)
+
+
+def test_a_build_is_explained_without_files(starcat, monkeypatch, tmp_path):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    asked = ["build", "--preset", "sao-12deg", "--explain", "--input", "sao=/nowhere/sao.dat"]
+    shown = starcat(asked)
+    assert shown.code == 0, shown.err
+    lines = [line.rstrip() for line in shown.out.splitlines()]
+    assert max(map(len, lines)) <= 100
+    assert len([line for line in lines if line.startswith(tuple(s.title for s in BUILD))]) == 20
+    assert any("amplitudes of variable stars from hipparcos" in line for line in lines)
+    assert any(line.endswith("sao sao.dat") for line in lines)
+    told = json.loads(starcat([*asked, "--json"]).out)
+    assert [one["name"] for one in told] == [each.name for each in BUILD]
+    assert told[0]["reads"] == {"sao": ["/nowhere/sao.dat"]}
+    assert {one["title"]: one["does"] for one in told}["motions"] is None
+
+
+def test_an_input_that_no_stage_reads_is_refused():
+    with pytest.raises(ConfigError, match="does not read gcvs"):
+        explain(preset("gaia-12deg"), {"gcvs": []})
+
+
+def test_what_has_nothing_to_do_is_skipped_and_notes_are_in_the_order_of_stages():
+    called, events = [], []
+
+    @stage("one", "read", lambda spec: "begin")
+    def begin(draft: Draft) -> None:
+        """Begin."""
+        called.append("begin")
+
+    @stage("two", "read", lambda spec: None)
+    def never(draft: Draft) -> None:
+        """Do nothing."""
+        called.append("never")
+
+    @stage("three", "write", lambda spec: "end", is_announced=True)
+    def end(draft: Draft) -> None:
+        """End, and say more of the beginning."""
+        called.append("end")
+        draft.note("end", "last", "", "first")
+        draft.note("begin", "first")
+
+    draft = Draft(preset("gaia-12deg"), progress=lambda *event: events.append(event))
+    run(draft, (begin, never, end))
+    assert called == ["begin", "end"]
+    assert events == [("three", 0, None)]
+    assert draft.warnings == ("first", "last")
+    assert list(draft.clock.times_s) == ["read", "write", "total"]
+
+
+def test_a_branch_leaves_the_draft_as_it_was():
+    draft = Draft(preset("gaia-12deg"), refusals=[])
+    draft.note("begin", "first")
+    other = draft.branch(preset("sao-12deg"))
+    other.note("begin", "second")
+    other.refusals.append("never")
+    other.sources.append(None)
+    assert (draft.spec.name, draft.warnings) == ("gaia-12deg", ("first",))
+    assert (draft.refusals, draft.sources) == ([], [])
+
+
+def test_a_build_ends_where_an_estimate_goes_on(small_spec, sao_file):
+    import tomllib
+
+    content = tomllib.loads(small_spec)
+    content["boresights"] = {"count": 200, "min_stars_per_field": 10_000}
+    spec = spec_from_dict(content, "small.toml")
+    inputs = {"sao": [sao_file]}
+    read = run(Draft(spec, inputs), READ)
+    with pytest.raises(BuildError, match="min_stars_per_field"):
+        run(read, CHOOSE)
+    with pytest.raises(BuildError, match="min_stars_per_field"):
+        chosen(read.stars, spec)
+    [refusal] = estimate_spec(spec, inputs).refusals
+    assert "(boresights.min_stars_per_field)" in refusal
