@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
-from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.artifact.reader import open_artifact
 from starcat.catalog.ingest import count_by_reason, ingest
 from starcat.errors import BuildError
@@ -31,6 +30,7 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
+from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 

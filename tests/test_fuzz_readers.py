@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from starcat.catalog.doubles import WDS_COLUMNS, PairTable, read_wds
 from starcat.catalog.ingest import ingest
-from starcat.catalog.parts import CATALOGS
+from starcat.catalog.parts import archive_of
 from starcat.catalog.source import Column, RecordFile, data_source, source_names
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
 from starcat.errors import StarcatError
@@ -107,7 +107,7 @@ def columns_read(source_name: str, layout: RecordFile) -> list[Column]:
     if source_name in JOINED:
         names: Sequence[str] = JOINED[source_name][layout.name]
     else:
-        names = CATALOGS[source_name].COLUMNS[layout.name]
+        names = archive_of(source_name).COLUMNS[layout.name]
     return [layout.column(name) for name in names]
 
 

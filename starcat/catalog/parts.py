@@ -7,24 +7,25 @@ joining of files is `starcat.catalog.ingest`.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from operator import itemgetter
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, cast
 
 import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
-from starcat.catalog.archives import gaia, hipparcos, hipparcos2, sao, twomass, tycho1, tycho2
 from starcat.catalog.archives.mapped import MappedTable, names_wanted, records_of
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
 from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.readers.tables import read_tables
+from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts, InputFile
 from starcat.errors import ParseError, SourceError
 from starcat.progress import Progress, no_progress
@@ -71,16 +72,10 @@ class Archive(Protocol):
         """Return the star-table columns of records, and reject those that are no stars."""
 
 
-CATALOGS: dict[str, Archive] = {
-    "sao": sao,
-    "hipparcos": hipparcos,
-    "hipparcos2": hipparcos2,
-    "tycho1": tycho1,
-    "tycho2": tycho2,
-    "2mass": twomass,
-    "gaia": gaia,
-}
-"""The star catalogs that are archives, by the name of their data source."""
+def archive_of(source_name: str) -> Archive:
+    """Return the module that gives the records of an archive their meaning, as its TOML says."""
+    module: object = importlib.import_module(data_source(source_name).python)
+    return cast(Archive, module)
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,7 @@ def _records(block: Block, options: IngestOptions) -> tuple[Archive, Records]:
     layout = block.file.layout
     if layout.table is not None and block.rows is not None:
         return MappedTable(layout.table, {}), records_of(layout.table, block.rows, block.file)
-    catalog = CATALOGS[options.source_name]
+    catalog = archive_of(options.source_name)
     parse = _PARSERS[layout.layout]
     return catalog, parse(block.data, layout, catalog.COLUMNS[layout.name], block.first_line)
 

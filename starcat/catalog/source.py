@@ -49,6 +49,8 @@ SOURCES_VARIABLE = "STARCAT_SOURCES"
 
 _ENDINGS = ("csv", "tsv", "ecsv", "fits", "vot", "xml", "parquet", "arrow", "feather")
 
+_MOTIONS = ("mas/yr", "arcsec/yr", "s/yr", "cas/yr")
+
 _FORMAT = re.compile(r"^(?:(?P<text>A)\d*|(?P<int>I)\d*|(?P<float>[FDE])(?:\d+\.(?P<dec>\d+))?)$")
 _BINARY = re.compile(r"^<[if][1248]$")
 
@@ -173,6 +175,7 @@ class DataSource(_Model):
     citation: str
     licence: str
     reference: str = ""  # the document that the layout was taken from
+    python: str = ""  # of an archive of stars: the module that gives its records their meaning
     kind: Literal["stars", "variability", "doubles"] = (
         "stars"  # a catalog, or a table joined to one
     )
@@ -187,6 +190,13 @@ class DataSource(_Model):
         """Records in the whole archive, where every file states its own."""
         counts = [file.rows for file in self.files]
         return None if None in counts else sum(filter(None, counts))
+
+    @property
+    def has_motions(self) -> bool:
+        """Whether its records have proper motions."""
+        if self.table is not None:
+            return self.table.columns.pm_dec is not None
+        return any(column.unit in _MOTIONS for file in self.files for column in file.columns)
 
     @property
     def table(self) -> TableMap | None:
@@ -265,6 +275,25 @@ def star_sources() -> tuple[str, ...]:
     return tuple(found)
 
 
+def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> None:
+    """Check that a source has what a key of a spec wants of it.
+
+    Raises
+    ------
+    ConfigError
+        If the source lists no stars, or its records have no proper motions. The message names the
+        sources that have them.
+    """
+    source = data_source(name)
+    if source.kind == "stars" and (what == "stars" or source.has_motions):
+        return
+    others = (one for one in star_sources() if what == "stars" or data_source(one).has_motions)
+    lacking = "lists no stars" if source.kind != "stars" else "has no proper motions"
+    raise ConfigError(
+        f"{key}: {name} {lacking}; choose one of {', '.join(others)}", key=key, value=name
+    )
+
+
 def data_source(name: str) -> DataSource:
     """Return the data source of a name; never reads a path, as names may come from anybody."""
     if name in _shipped_names():
@@ -308,6 +337,7 @@ def give_map(path: Path) -> DataSource:
 def _own(path: Path) -> DataSource:
     """Return the source of a map of the user's."""
     source = read_source(path)
+    _check_without_hook(source, str(path))
     if source.table is None:
         raise ConfigError(f"{path}: describes an archive; a map has [columns] and [magnitudes]")
     if source.name in _shipped_names():
@@ -319,12 +349,24 @@ def _own(path: Path) -> DataSource:
     return source
 
 
+def _check_without_hook(source: DataSource, where: str) -> None:
+    """Check that a map names no function: a file of data from elsewhere must not choose code."""
+    if source.python or (source.table is not None and source.table.python):
+        raise ConfigError(
+            f"{where}: python: only the maps that ship with starcat name a function; write "
+            "expressions of columns, or give a table that has the values",
+            key="python",
+        )
+
+
 @contextmanager
 def known_maps(contents: Iterable[Mapping[str, Any]]) -> Iterator[None]:
     """Know the sources of maps, as a manifest has them, for a while."""
     before = dict(_given)
     try:
-        _given.update({source.name: source for source in map(mapped, contents)})
+        for source in map(mapped, contents):
+            _check_without_hook(source, "manifest")
+            _given[source.name] = source
         yield
     finally:
         _given.clear()

@@ -171,6 +171,11 @@ class TableMap(_Model):
     )
     quality: dict[str, str] = Field({}, description=f"conditions by bit: {', '.join(QUALITIES)}")
     remote: Remote | None = Field(None, description="where the table is served")
+    python: str = Field(
+        "",
+        pattern=r"^$|^[a-z_][a-z0-9_.]*:[a-z_][a-z0-9_]*$",
+        description="of a shipped map: function, as module:function, that completes its records",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> TableMap:

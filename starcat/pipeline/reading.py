@@ -24,7 +24,7 @@ from starcat.bands.response import shipped, shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
 from starcat.catalog.observed import with_observed
 from starcat.catalog.sensor_band import in_sensor_band
-from starcat.catalog.source import map_of
+from starcat.catalog.source import check_supplies, map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import with_span
 from starcat.errors import ConfigError
@@ -127,7 +127,13 @@ def apply_span(draft: Draft) -> None:
 
 
 def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
-    """Check that the spec uses every source that an input is given for."""
+    """Check that every source has what the spec wants of it, and that every input is used."""
+    for name in spec.catalog.motions:
+        check_supplies(name, "motions", "catalog.motions")
+    for name in spec.camera.response.photometry:
+        check_supplies(name, "stars", "camera.response.photometry")
+    for name in spec.products.crossmatch.catalogs if spec.products.crossmatch.enabled else ():
+        check_supplies(name, "stars", "products.crossmatch.catalogs")
     for name in inputs:
         if name not in spec.sources:
             item = f'inputs["{name}"]'

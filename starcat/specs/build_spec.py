@@ -58,7 +58,7 @@ class Catalog(Section):
         "their magnitudes become those of the source's band, found as [products.crossmatch] says",
         examples=[["tycho2", "gaia"]],
     )
-    motions: tuple[Literal["hipparcos", "hipparcos2", "tycho2"], ...] = Field(
+    motions: tuple[CatalogName, ...] = Field(
         (),
         strict=False,  # a list in TOML
         description="catalogs that supply missing proper motions, in order of preference; found "

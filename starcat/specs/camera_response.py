@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from starcat.bands.response import Response, checked_response, read_response, shipped, shipped_names
 from starcat.bands.synthetic import checked_zero_point
 from starcat.errors import ConfigError
-from starcat.sections import Section
+from starcat.sections import CatalogName, Section
 from starcat.specs.local_files import LocalFile
 
 MOST_ROWS = 2000
@@ -55,9 +55,7 @@ class CameraResponse(Section):
     )
     optics_wavelength_nm: Column = Field((), description="wavelengths of the optics, rising")
     optics_transmission: Column = Field((), description="transmission at each, of any scale")
-    photometry: tuple[
-        Literal["gaia", "hipparcos", "hipparcos2", "tycho1", "tycho2", "2mass"], ...
-    ] = Field(
+    photometry: tuple[CatalogName, ...] = Field(
         (),
         strict=False,  # a list in TOML
         description="catalogs whose bands and colours are used as well, found as "

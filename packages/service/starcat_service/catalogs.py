@@ -18,7 +18,6 @@ import numpy as np
 from cachetools import LRUCache
 from pydantic import BaseModel, Field
 
-from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import data_source, star_sources
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
@@ -119,7 +118,9 @@ class Catalogs:
     def offered(self) -> list[Offered]:
         """Return the catalogs that a spec may name."""
         known, found = self.known(), []
-        for name in (*CATALOGS, *filter(is_here, set(star_sources()) - set(CATALOGS))):
+        for name in star_sources():
+            if data_source(name).table is not None and not is_here(name):
+                continue  # there is no end of tables that somebody could have
             read = tuple(one for one in known if one.source == name)
             found.append(_offered(name, read))
         return sorted(found, key=lambda one: not one.is_here)

@@ -7,6 +7,7 @@ in the frame of the map; then positions and proper motions become ICRS.
 from __future__ import annotations
 
 import hashlib
+import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -315,7 +316,15 @@ def records_of(table: TableMap, rows: Rows, file: InputFile) -> Records:
         else:
             columns[key] = reading.numbers(key)
     records = Records(table.name, rows.number, columns, rows.problems)
-    return records.without(reading.bad, reading.problems)
+    records = records.without(reading.bad, reading.problems)
+    return hook_of(table)(records) if table.python else records
+
+
+def hook_of(table: TableMap) -> Callable[[Records], Records]:
+    """Return the function that a shipped map names, for what expressions cannot say."""
+    module, _, name = table.python.partition(":")
+    hook: Callable[[Records], Records] = getattr(importlib.import_module(module), name)
+    return hook
 
 
 @dataclass(frozen=True)
