@@ -26,12 +26,13 @@ from starcat.catalog.selection import select_guide_stars
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import (
-    match_catalogs,
+    find_counterparts,
     match_files,
     match_tables,
     read_star_table,
     with_rivals,
 )
+from starcat.pipeline.draft import Draft
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
 from starcat.products.match_figures import ARCSEC
@@ -229,13 +230,15 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
     both = with_rivals(stars, selected, 10.0 * ARCSEC)
     assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
-    found = match_catalogs(stars, selected, spec, {"gaia": [files]})
-    table = found.products[0].table
+    draft = Draft(spec)
+    draft.paths, draft.stars, draft.selected = {"gaia": [files]}, stars, selected
+    find_counterparts(draft)
+    table = draft.product("crossmatch")
     row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
     assert table["star"][row].as_py() == 9
     assert (table["n_stars"][row].as_py(), table["verdict"][row].as_py()) == (2, "best")
     assert table["star"].to_numpy().max() < len(selected.guide_stars)
-    assert found.sources[0].joined == len(matched_stars(table)) == len(table)
+    assert draft.sources[0].joined == len(matched_stars(table)) == len(table)
 
 
 def test_a_missing_catalog_is_known_before_anything_is_read(
