@@ -249,9 +249,7 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
 def test_a_source_that_lists_no_stars_has_no_counterparts(files, small_spec, tmp_path):
     spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
     inputs = {"sao": [files / "sao.dat"], "gcvs": [files / "sao.dat"]}
-    with pytest.raises(
-        ConfigError, match="gcvs lists no stars; choose one of 2mass"
-    ):
+    with pytest.raises(ConfigError, match="gcvs lists no stars; choose one of 2mass"):
         build(spec, inputs, tmp_path)
 
 
