@@ -50,6 +50,7 @@ SINGLE_MODULES = {
         "arrays",
         "errors",
         "failures",
+        "local_files",
         "plugins",
         "progress",
         "resources",

@@ -12,6 +12,7 @@ import pytest
 from astropy import units as u
 from astropy.coordinates import angular_separation
 from cdshealpix.nested import lonlat_to_healpix
+from mocpy import MOC
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -79,6 +80,18 @@ def test_healpix_cells_are_those_of_cdshealpix(tmp_path, places, order):
     different = (found != expected.astype(np.int64)).sum()
     assert different <= (len(POLES_AND_SEAMS) + 4 if order == 29 else 4)
     assert different == 0 or order > 0
+
+
+@pytest.mark.parametrize("cells", ["0/1 1/20-22", "3/5-7 100 4/9", "29/0-1000000000000000000", "0/"])
+def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
+    ra_deg, dec_deg = places.T
+    text = f"SELECT in_moc(ra, dec, '{cells}')::INT"
+    found = numbers_of(tmp_path, text, ra=ra_deg, dec=dec_deg)
+    moc = MOC.from_string(cells, "ascii")
+    expected = moc.contains_lonlat(ra_deg * u.deg, dec_deg * u.deg)
+    # A place on the line between two cells belongs to either.
+    assert (found != expected).sum() <= 4
+    assert found.sum() > 0 or cells == "0/"
 
 
 def test_a_healpix_cell_is_a_quarter_of_one_of_the_order_before(session):

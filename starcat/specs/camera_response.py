@@ -6,6 +6,7 @@ which is read with it, so that the spec is whole wherever it travels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,13 +15,27 @@ from pydantic import Field, model_validator
 from starcat.bands.response import Response, checked_response, read_response, shipped, shipped_names
 from starcat.bands.synthetic import checked_zero_point
 from starcat.errors import ConfigError
+from starcat.local_files import LocalFile
 from starcat.sections import CatalogName, Section
-from starcat.specs.local_files import LocalFile
 
 MOST_ROWS = 2000
 """Of a table that travels in a spec."""
 
 Column = Annotated[tuple[float, ...], Field(max_length=MOST_ROWS, strict=False)]
+
+
+def _response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
+    made = read_response(path, section.get("per"))
+    table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
+    return {"name": section.get("name", path.stem), "per": made.counts, **table}
+
+
+def _optics_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
+    made = read_response(path, "photon")
+    return {
+        "optics_wavelength_nm": made.wavelength_nm.tolist(),
+        "optics_transmission": made.value.tolist(),
+    }
 
 
 class CameraResponse(Section):
@@ -35,7 +50,7 @@ class CameraResponse(Section):
         "of the one that follows; default: magnitudes stay in the catalog's band",
         examples=["silicon-cmos"],
     )
-    file: Annotated[str, LocalFile("wavelength_nm and value")] | None = Field(
+    file: Annotated[str, LocalFile("wavelength_nm and value", _response_of_file)] | None = Field(
         None,
         description="CSV of wavelengths in nm and responses, beside the spec; the built spec has "
         "its numbers",
@@ -47,7 +62,8 @@ class CameraResponse(Section):
     wavelength_nm: Column = Field((), description="wavelengths of the response, rising")
     value: Column = Field((), description="response at each wavelength, of any scale")
     optics_file: (
-        Annotated[str, LocalFile("optics_wavelength_nm and optics_transmission")] | None
+        Annotated[str, LocalFile("optics_wavelength_nm and optics_transmission", _optics_of_file)]
+        | None
     ) = Field(
         None,
         description="CSV of wavelengths in nm and transmissions of the lens and filters",
@@ -113,26 +129,3 @@ class CameraResponse(Section):
                 f"name is missing and {', '.join(stated)} stated; name a response, such as "
                 "silicon-cmos, or your own"
             )
-
-
-def with_files_read(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the content of a spec with the numbers of the files that its response names.
-
-    This is the only function that opens a file that a spec names. Only `read_spec` and
-    `local_preset` call it, for specs that the user of this machine has written.
-    """
-    camera = content.get("camera")
-    if not isinstance(camera, dict) or not isinstance(camera.get("response"), dict):
-        return content
-    section = dict(camera["response"])
-    if isinstance(section.get("file"), str):
-        path = folder / section.pop("file")
-        made = read_response(path, section.get("per"))
-        table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
-        section = {"name": path.stem, **section, "per": made.counts, **table}
-    if isinstance(section.get("optics_file"), str):
-        path = folder / section.pop("optics_file")
-        made = read_response(path, "photon")
-        section["optics_wavelength_nm"] = made.wavelength_nm.tolist()
-        section["optics_transmission"] = made.value.tolist()
-    return {**content, "camera": {**camera, "response": section}}

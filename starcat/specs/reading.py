@@ -12,9 +12,9 @@ from pydantic import BaseModel, ValidationError
 
 from starcat.arguments import path_of
 from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
+from starcat.local_files import with_files_read
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.camera_response import with_files_read
 from starcat.storage.regular_files import read_regular_file
 
 
@@ -66,7 +66,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     path = path_of("path", path, "the path of a spec")
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     content = changed(content_of_toml(text, str(path)), changes or {})
-    return spec_from_dict(with_files_read(content, path.parent), path.name)
+    return spec_from_dict(with_files_read(BuildSpec, content, path.parent), path.name)
 
 
 def text_of_toml(path: Path, missing: str) -> str:
@@ -264,7 +264,7 @@ def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
     Relative names are taken from the current folder. It is for the user of this machine only: the
     service must never call it.
     """
-    content = with_files_read(changed(_preset_content(name), changes or {}), Path())
+    content = with_files_read(BuildSpec, changed(_preset_content(name), changes or {}), Path())
     return spec_from_dict(content, f"{name}.toml")
 
 

@@ -23,8 +23,8 @@ from served import Served, serve
 from services import SPEC, add_database, client_of
 
 import starcat_service
+from starcat.local_files import keys_of_files
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.local_files import keys_of_files
 from starcat.specs.reading import local_preset, preset, put_key
 from starcat_service.app import API, OTHERS, RESOURCES
 

@@ -1,15 +1,16 @@
 """Keys of a spec that name a file on the machine of whoever writes the spec.
 
 Such a key is of the type ``Annotated[str, LocalFile(...)]``. A spec that is checked never holds a
-value of it: `with_files_read` replaces the name by the content of the file, and only the functions
-that read a spec from a file of this machine call it. Everywhere else, as in a request to the
-service, the check of the spec refuses the key, and no file is opened.
+value of it: `with_files_read` replaces the name by the content of the file. Only `read_spec` and
+`local_preset` call it, for specs that the user of this machine has written. Everywhere else, as
+in a request to the service, the check of the spec refuses the key, and no file is opened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -23,6 +24,8 @@ class LocalFile:
     """Marks the type of a key that names a file."""
 
     instead: str  # the keys that state the content of the file in the spec itself
+    # Reads the file, given the other keys of the section; returns the keys that state its content.
+    read: Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -53,17 +56,41 @@ def keys_of_files(model: type[BaseModel]) -> tuple[str, ...]:
     >>> keys_of_files(BuildSpec)
     ('camera.response.file', 'camera.response.optics_file')
     """
-    return tuple(_keys(model, ()))
+    return tuple(".".join(path) for path, _ in _local_files(model, ()))
 
 
-def _keys(model: type[BaseModel], above: tuple[str, ...]) -> Iterator[str]:
+def with_files_read(
+    model: type[BaseModel], content: dict[str, Any], folder: Path
+) -> dict[str, Any]:
+    """Return the content of a spec with that of the files that it names, relative to a folder."""
+    for (*above, name), local in _local_files(model, ()):
+        section: Any = content
+        for key in above:
+            section = section.get(key) if isinstance(section, dict) else None
+        if not isinstance(section, dict) or not isinstance(section.get(name), str):
+            continue
+        others = {key: value for key, value in section.items() if key != name}
+        read = {**others, **local.read(folder / section[name], others)}
+        for depth in range(len(above), 0, -1):
+            outer: Any = content
+            for key in above[: depth - 1]:
+                outer = outer[key]
+            read = {**outer, above[depth - 1]: read}
+        content = read
+    return content
+
+
+def _local_files(
+    model: type[BaseModel], above: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], LocalFile]]:
     for name, field in model.model_fields.items():
         parts = list(_parts(field.annotation))
-        if any(isinstance(part, LocalFile) for part in (*field.metadata, *parts)):
-            yield ".".join((*above, name))
+        for part in (*field.metadata, *parts):
+            if isinstance(part, LocalFile):
+                yield (*above, name), part
         for part in parts:
             if isinstance(part, type) and issubclass(part, BaseModel):
-                yield from _keys(part, (*above, name))
+                yield from _local_files(part, (*above, name))
 
 
 def _parts(annotation: Any) -> Iterator[Any]:

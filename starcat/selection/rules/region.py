@@ -1,0 +1,134 @@
+"""Stars outside a region of the sky: a cone, a zone of declination, or a MOC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from starcat.errors import ConfigError
+from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.local_files import LocalFile
+from starcat.sections import Section
+from starcat.selection.rule import Context, Rejection, RuleReason
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.storage.regular_files import check_regular_file
+
+POSITION = 15
+STEP = "region"
+COLUMNS = ("ra_deg", "dec_deg", "x", "y", "z")
+OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
+REASONS = (OUTSIDE,)
+
+MAX_MOC_CHARACTERS = 200_000
+MAX_MOC_BYTES = 16 << 20
+
+
+def _moc_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the key ``moc`` of a file: FITS, JSON or ASCII."""
+    from mocpy import MOC
+
+    check_regular_file(path)
+    if path.stat().st_size > MAX_MOC_BYTES:
+        raise ConfigError(
+            f"{path}: {path.stat().st_size:,} bytes; a MOC of a spec has at most {MAX_MOC_BYTES:,}"
+        )
+    form = {".json": "json", ".txt": "ascii", ".moc": "ascii"}.get(path.suffix.lower(), "fits")
+    try:
+        return {"moc": MOC.load(str(path), form).to_string("ascii").strip()}
+    except Exception as error:  # the library raises whatever its parsers do
+        raise ConfigError(
+            f"{path}: is not a MOC in {form} ({error}); name it .fits, .json, or .txt for ASCII"
+        ) from error
+
+
+def _moc(text: str) -> Any:
+    from mocpy import MOC
+
+    try:
+        return MOC.from_string(text, "ascii")
+    except Exception as error:
+        raise ValueError(
+            f"is not a MOC in ASCII ({error}); write orders, slashes and cells, such as '3/5-7 4/9'"
+        ) from error
+
+
+class Region(Section):
+    """The region of the sky that guide stars are in; of several, all hold."""
+
+    is_later = True
+
+    cone: tuple[float, float, float] | None = Field(
+        None,
+        strict=False,  # a list in TOML
+        description="right ascension and declination of the centre, and the radius, degrees",
+        examples=[[266.4, -29.0, 20.0]],
+    )
+    zone: tuple[float, float] | None = Field(
+        None,
+        strict=False,  # a list in TOML
+        description="least and largest declination, degrees, ends included",
+        examples=[[-30.0, 30.0]],
+    )
+    moc: str | None = Field(
+        None,
+        min_length=1,
+        max_length=MAX_MOC_CHARACTERS,
+        description="MOC (Multi-Order Coverage map of the IVOA) in ASCII: orders and nested "
+        "HEALPix cells",
+        examples=["0/0-3"],
+    )
+    moc_file: Annotated[str, LocalFile("moc", _moc_of_file)] | None = Field(
+        None,
+        description="file of a MOC (FITS, JSON or ASCII), beside the spec; the built spec has its "
+        "cells",
+        examples=["survey.fits"],
+    )
+
+    @model_validator(mode="after")
+    def _is_on_the_sky(self) -> Region:
+        if self.cone is not None and not (
+            abs(self.cone[1]) <= 90.0 and 0.0 < self.cone[2] <= 180.0
+        ):
+            raise ValueError(
+                f"cone: found {list(self.cone)}; give a declination from -90 to 90 and a radius "
+                "above 0, at most 180 deg"
+            )
+        if self.zone is not None and not -90.0 <= self.zone[0] < self.zone[1] <= 90.0:
+            raise ValueError(
+                f"zone: found {list(self.zone)}; give two declinations from -90 to 90, the smaller "
+                "first"
+            )
+        return self
+
+    @field_validator("moc")
+    @classmethod
+    def _is_moc(cls, value: str | None) -> str | None:
+        if value is not None:
+            _moc(value)
+        return value
+
+
+TABLE, KEYS = "region", Region
+
+
+def reject(context: Context, keys: Region) -> list[Rejection] | None:
+    """Reject the stars outside the region."""
+    if keys == Region():
+        return None
+    outside = np.zeros(len(context.stars), dtype=bool)
+    if keys.cone is not None:
+        ra_deg, dec_deg, radius_deg = keys.cone
+        centre = directions_from_radec(np.array([ra_deg]), np.array([dec_deg]))
+        outside |= separation(directions_of(context.stars), centre) > np.radians(radius_deg)
+    ra, dec = (floats_of(context.stars, name) for name in ("ra_deg", "dec_deg"))
+    if keys.zone is not None:
+        outside |= (dec < keys.zone[0]) | (dec > keys.zone[1])
+    if keys.moc is not None:
+        from astropy import units
+
+        outside |= ~_moc(keys.moc).contains_lonlat(ra * units.deg, dec * units.deg)
+    return [Rejection(outside, OUTSIDE)]
