@@ -29,15 +29,15 @@ from starcat.geometry.sphere import (
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
-from starcat.pipeline.recipes import ProductInputs, make_product
+from starcat.pipeline.recipes import make_product, product_inputs
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.coverage import TilingGap
+from starcat.products.kind import ProductInputs
 from starcat.products.tiling import stars_in_fields, tile_sphere
 from starcat.products.triangles import find_triangles
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
-from starcat.stars.star_table import directions_of
 
 GIB = 2**30
 
@@ -111,19 +111,19 @@ def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
 @pytest.mark.parametrize("name", ["pairs", "triangles", "neighbours", "hausdorff_angular"])
 @pytest.mark.parametrize("limit_mag", [5.0, 6.0])
 def test_rows_are_estimated(name, limit_mag, sky_of):
-    given = sky_of(limit_mag)
+    given, spec = sky_of(limit_mag)
     made = make_product(name, given)
-    assert product_cost(given, 0.0).rows[name] == pytest.approx(len(made.table), rel=0.1)
+    assert product_cost(given, spec, 0.0).rows[name] == pytest.approx(len(made.table), rel=0.1)
 
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    def make(limit_mag: float) -> ProductInputs:
+    def make(limit_mag: float) -> tuple[ProductInputs, BuildSpec]:
         spec = preset(
             "gaia-12deg", {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"}
         )
         draft = chosen(embedded_stars(), spec)
-        return ProductInputs(directions_of(draft.selected.guide_stars), draft.fields, spec)
+        return product_inputs(draft.selected.guide_stars, draft.fields, spec), spec
 
     return make
 

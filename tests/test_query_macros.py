@@ -82,7 +82,9 @@ def test_healpix_cells_are_those_of_cdshealpix(tmp_path, places, order):
     assert different == 0 or order > 0
 
 
-@pytest.mark.parametrize("cells", ["0/1 1/20-22", "3/5-7 100 4/9", "29/0-1000000000000000000", "0/"])
+@pytest.mark.parametrize(
+    "cells", ["0/1 1/20-22", "3/5-7 100 4/9", "29/0-1000000000000000000", "0/"]
+)
 def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
     ra_deg, dec_deg = places.T
     text = f"SELECT in_moc(ra, dec, '{cells}')::INT"

@@ -386,11 +386,11 @@ def print_problems(problems: Sequence[str]) -> None:
 
 def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     """Rows read, kept and rejected by reason: the two sides are equal."""
-    from starcat.stars.verdict import Reason
+    from starcat.selection.ruleset import ALL_REASONS
 
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
     for name, count in facts["rejected"].items():
-        rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
+        rows.append((f"rejected: {name} ({ALL_REASONS[name]})", f"{count:,}"))
     if facts.get("role") == "crossmatch":
         rows.append(("guide stars with a counterpart", f"{facts['joined']:,}"))
     if facts.get("role") == "photometry":

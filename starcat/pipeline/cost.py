@@ -20,14 +20,12 @@ import pyarrow.compute as pc
 
 from starcat.artifact.database import stored_dtype
 from starcat.artifact.writer import Product
-from starcat.catalog.ingest import Ingested
 from starcat.errors import BuildError
 from starcat.pipeline.log import available_memory_bytes
 from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
 from starcat.products.kind import Extent, ProductInputs, RowCost
 from starcat.products.table import PRODUCTS
 from starcat.products.tiling import FieldStars
-from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
 from starcat.storage.schema import product_schema
@@ -88,19 +86,6 @@ class Cost:
             f"{', '.join(named) or 'no products'}; {written}{self.memory_bytes / GIB:.1f} GiB of "
             f"memory, {max(1, round(self.seconds)):,} s"
         )
-
-
-def estimate_cost(
-    catalog: Ingested,
-    selected: Selected,
-    fields: FieldStars,
-    spec: BuildSpec,
-    others: Sequence[Product] = (),
-) -> Cost:
-    """Estimate what the products of a build will cost."""
-    rejected = pa.concat_tables([catalog.rejected, selected.rejected])
-    base = base_memory(catalog.stars.nbytes + catalog.rejected.nbytes)
-    return whole_cost(selected.guide_stars, fields, spec, table_bytes(rejected), base, others)
 
 
 def base_memory(catalog_bytes: float) -> float:
