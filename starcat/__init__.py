@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from starcat.api.artifact import connect
-    from starcat.api.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
+    from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.api.functions import (
         build,
         calibrate,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
         simulate,
         verify,
     )  # fmt: skip
-    from starcat.api.matcher import Matcher
+    from starcat.api.matcher import PublicMatcher
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
     from starcat.matcher.tracking import Tracker
@@ -113,9 +113,9 @@ def __getattr__(name: str) -> Any:
     try:
         found = globals()[name] = getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
-        from starcat.version import lacking
+        from starcat.version import missing_packages
 
-        text = lacking(f"starcat.{name}", error)
+        text = missing_packages(f"starcat.{name}", error)
         raise ModuleNotFoundError(text, name=error.name) from error
     return found
 

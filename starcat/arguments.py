@@ -36,7 +36,7 @@ class HasFolder(Protocol):
         """Return where the database is."""
 
 
-def unit_of(name: str) -> str:
+def unit_of_argument(name: str) -> str:
     """Return the unit that the name of a parameter states, as astropy writes it.
 
     Examples
@@ -110,7 +110,7 @@ def _in_unit(name: str, values: Any) -> Any:
         unit = getattr(values, "units", None)  # as other libraries of units have it
     if unit is None:
         return values
-    expected = unit_of(name)
+    expected = unit_of_argument(name)
     try:
         quantity = getattr(values, "quantity", values)  # of a column of a table
         plain = quantity.to_value(expected)

@@ -17,7 +17,7 @@ from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
 from starcat.artifact.verify import check_artifact
 from starcat.errors import DownloadError, ServiceError, error_of_kind
 from starcat.progress import Progress, no_progress
-from starcat.releases.tree import Release, files_of
+from starcat.releases.tree import Release, tree_files
 from starcat.storage.atomic import move_into_place, whole_folder
 
 Content = dict[str, Any]
@@ -132,7 +132,7 @@ class Client:
         data = self._answer("GET", f"{where}/manifest").content
         manifest = parse_manifest(data, f"{self.url}/api/v1/{where}/manifest", "try again")
         # Before a name becomes part of a path it is checked, as is every file's.
-        files = files_of(manifest, where)
+        files = tree_files(manifest, where)
         release = Release.model_validate(
             {name: manifest[name] for name in ("name", "version")}
             | {"manifest": {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}}

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 from typer import Abort, TyperException
 
 from starcat.errors import StarcatError, reason, worded
-from starcat.version import lacking
+from starcat.version import missing_packages
 
 DEFECT = 70
 """Exit code of a defect of starcat: that of an internal error among those of BSD."""
@@ -69,7 +69,7 @@ def failure_of(
             error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
         )
     if isinstance(error, ModuleNotFoundError) and _is_outsider(error.name):
-        text = lacking(doing, error)
+        text = missing_packages(doing, error)
         return Failure(2, kind, text, hint_in(text))
     if isinstance(error, MemoryError):
         hint = "ask for less at a time, or use a machine with more memory"

@@ -54,7 +54,7 @@ def _installed_from() -> str:
     return str(origin.get("url", ""))
 
 
-def lacking(what: str, error: ModuleNotFoundError) -> str:
+def missing_packages(what: str, error: ModuleNotFoundError) -> str:
     """Return the sentence for what cannot run because a module is not there.
 
     Examples

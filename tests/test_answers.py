@@ -28,7 +28,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
 from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 needs_c = pytest.mark.skipif(
     not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
@@ -59,12 +59,14 @@ def sky(sky_of, random_directions) -> Database:
     return sky_of(random_directions(1200, 1))
 
 
-def a_frame(sky: Database, camera: Camera, noise: Noise | None = None, seed: int = 5) -> Frame:
+def a_frame(
+    sky: Database, camera: Camera, noise: Noise | None = None, seed: int = 5
+) -> SimulatedFrame:
     frames = simulate_frames(sky.directions, camera, 1, noise or Noise(), seed, sky.mag)
     return next(iter(frames))
 
 
-def answer(sky: Database, **stated: object) -> tuple[Frame, MatchResult]:
+def answer(sky: Database, **stated: object) -> tuple[SimulatedFrame, MatchResult]:
     frame = a_frame(sky, sky.camera, Noise(0.4, 0.1, 3, noise_mag=0.2))
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
     return frame, matcher.identify(frame.centroids_px, magnitudes=frame.mag)

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent / "builders"))
 
 from rendered import picture_of
 
-from starcat.cli.astap import run
+from starcat.cli.astap import run_astap
 from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -43,7 +43,7 @@ def test_a_picture_is_solved_into_the_files_that_programs_read(
     (tmp_path / "a.fits").write_bytes(picture_of(frame, camera))
     given = f"{camera.fov_y_deg:.2f}" if fov_deg == "own" else fov_deg
     options = ["-f", str(tmp_path / "a.fits"), "-fov", given, "-r", "180", "-z", "0", "-s", "500"]
-    code = run([*options, "-d", str(small_artifact), "-o", str(tmp_path / "out"), form])
+    code = run_astap([*options, "-d", str(small_artifact), "-o", str(tmp_path / "out"), form])
     assert code == 0
     keys = keys_of(tmp_path / "out.ini")
     assert keys["PLTSOLVD"] == "T"
@@ -80,7 +80,7 @@ def test_what_fails_has_its_code_and_its_reason(
     (tmp_path / "broken" / "manifest.json").chmod(0o644)
     (tmp_path / "broken" / "manifest.json").write_text("{}")
     folder = str(small_artifact if database == "small" else database and tmp_path / database)
-    assert run(["-f", str(tmp_path / name), "-d", folder]) == code
+    assert run_astap(["-f", str(tmp_path / name), "-d", folder]) == code
     keys = keys_of(tmp_path / f"{Path(name).stem}.ini")
     assert keys["PLTSOLVD"] == "F"
     assert said in keys["ERROR"]

@@ -14,7 +14,7 @@ from starcat.storage.atomic import (
     make_folder,
     move_into_place,
     replace_file,
-    sync,
+    sync_to_disk,
     whole_file,
     whole_folder,
     write_file,
@@ -156,7 +156,7 @@ def test_what_the_system_refuses_becomes_an_output_error(tmp_path):
 
 def test_folders_above_are_made_and_synchronised(tmp_path, monkeypatch):
     seen: list[Path] = []
-    monkeypatch.setattr("starcat.storage.atomic.sync", seen.append)
+    monkeypatch.setattr("starcat.storage.atomic.sync_to_disk", seen.append)
     make_folder(tmp_path / "a" / "b")
     make_folder(tmp_path / "a" / "b")
     assert seen == [tmp_path, tmp_path / "a"]
@@ -168,9 +168,9 @@ def test_nothing_is_synchronised_where_the_system_cannot(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(PermissionError):
-        sync(tmp_path)
+        sync_to_disk(tmp_path)
     monkeypatch.setattr(os, "name", "nt")
-    sync(tmp_path)
+    sync_to_disk(tmp_path)
 
 
 def test_the_files_of_a_built_artifact_can_only_be_read(small_artifact):

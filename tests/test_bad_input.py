@@ -49,7 +49,7 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import check_blocks
-from starcat.onboard.reading import read_image
+from starcat.onboard.reading import read_onboard_image
 from starcat.releases.publishing import publish_artifact
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.sky.observer import Observer
@@ -1209,8 +1209,8 @@ ONBOARD_IMAGES: Cases = {
     ),
     "C source under another name": run("export {artifact} --to c -o {out}/db"),
     "name too long for an onboard image": lambda place: lambda: make_image(three_stars("x" * 97)),
-    "onboard image missing": lambda place: lambda: read_image(place.folder / "db.img"),
-    "folder read as an onboard image": lambda place: lambda: read_image(place.folder),
+    "onboard image missing": lambda place: lambda: read_onboard_image(place.folder / "db.img"),
+    "folder read as an onboard image": lambda place: lambda: read_onboard_image(place.folder),
     "file that is no onboard image": run(INSPECT_IMAGE, {"db.img": "star_id\n1\n"}),
     "onboard image cut off": image(lambda data: data[:5000]),
     "onboard image cut off in its header": image(lambda data: data[:100]),

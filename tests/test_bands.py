@@ -30,12 +30,12 @@ from starcat.bands.response import (
     shipped_names,
 )
 from starcat.bands.spectra import library, parsed_type
-from starcat.bands.synthetic import checked_zero_point, magnitudes
+from starcat.bands.synthetic import checked_zero_point, synthetic_magnitudes
 from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.cli.specs import with_sensor
 from starcat.errors import ConfigError, FileMissing
 from starcat.images.render import Optics, star_electrons
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.starter import advice, starter_spec
 from starcat.resources import resource_folder
@@ -61,7 +61,9 @@ genuine = pytest.mark.skipif(
 def spectrum(name: str, first: str, second: str) -> float:
     """Return a colour of a type of the library, without reddening."""
     row = library().types.index(name)
-    return float((magnitudes(shipped(first)) - magnitudes(shipped(second)))[0, row])
+    return float(
+        (synthetic_magnitudes(shipped(first)) - synthetic_magnitudes(shipped(second)))[0, row]
+    )
 
 
 @pytest.mark.parametrize(
@@ -84,13 +86,13 @@ def test_every_shipped_response_is_sound_and_says_where_it_is_from():
         checked_response(name, one.wavelength_nm, one.value, one.counts, one.zero_point)
         assert one.source
         assert one.title
-        assert np.isfinite(magnitudes(one)).all()
+        assert np.isfinite(synthetic_magnitudes(one)).all()
 
 
 def test_extinction_reddens_and_dims():
-    b_v = magnitudes(shipped("B")) - magnitudes(shipped("V"))
+    b_v = synthetic_magnitudes(shipped("B")) - synthetic_magnitudes(shipped("V"))
     assert (np.diff(b_v, axis=0) > 0).all()
-    dimmed = magnitudes(shipped("V"))[-1] - magnitudes(shipped("V"))[0]
+    dimmed = synthetic_magnitudes(shipped("V"))[-1] - synthetic_magnitudes(shipped("V"))[0]
     assert np.median(dimmed) == pytest.approx(3.1 * 0.8, abs=0.1)  # A(V) = 3.1 E(B-V)
 
 
@@ -100,7 +102,9 @@ def test_a_zero_point_is_vega_or_a_type():
         "own", own.wavelength_nm, own.value, own.counts, checked_zero_point("G2V")
     )
     row = library().types.index("g2v")
-    assert magnitudes(sunlike)[0, row] == pytest.approx(magnitudes(shipped("V"))[0, row])
+    assert synthetic_magnitudes(sunlike)[0, row] == pytest.approx(
+        synthetic_magnitudes(shipped("V"))[0, row]
+    )
     assert checked_zero_point("Vega") == "vega 0"
     with pytest.raises(ConfigError, match=r"the library has A0I, .*A2V"):
         checked_zero_point("A1V")
@@ -112,7 +116,9 @@ def test_a_response_per_energy_is_turned_into_photons():
     wavelength = np.linspace(400.0, 900.0, 51)
     per_photon = checked_response("a", wavelength, np.ones(51), "photon")
     per_energy = checked_response("b", wavelength, wavelength, "energy")
-    assert magnitudes(per_photon) == pytest.approx(magnitudes(per_energy), abs=1e-9)
+    assert synthetic_magnitudes(per_photon) == pytest.approx(
+        synthetic_magnitudes(per_energy), abs=1e-9
+    )
 
 
 BAD = {
@@ -477,7 +483,7 @@ def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path):
     asked = 'name = "silicon-cmos"\nphotometry = ["hipparcos"]\n'
     spec = spec_of(tmp_path, asked + "[boresights]\ncount = 500\n[self_test]\nframes = 20\n")
     inputs = {"hipparcos": [CATALOGS / "hip_main.dat.gz"]}
-    built = build(spec, inputs, tmp_path / "dist")
+    built = build_database(spec, inputs, tmp_path / "dist")
     assert built.manifest["manifest_version"] == "1.3.0"
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)
@@ -499,7 +505,7 @@ def test_a_build_in_the_band_of_its_sensor(tmp_path):
     spec = spec_of(
         tmp_path, 'name = "red-ccd"\n[boresights]\ncount = 500\n[self_test]\nframes = 20\n'
     )
-    built = build(spec, {}, tmp_path / "dist")
+    built = build_database(spec, {}, tmp_path / "dist")
     stars = read_parquet(built.folder / "stars.parquet")
     assert set(stars["band"].to_pylist()) == {"red-ccd"}
     assert max(stars["mag"].to_pylist()) <= 4.5 < max(stars["catalog_mag"].to_pylist())
@@ -507,7 +513,9 @@ def test_a_build_in_the_band_of_its_sensor(tmp_path):
     page = (built.folder / "report" / "index.html").read_text(encoding="utf-8")
     assert "Band of the sensor" in page
     assert (built.folder / "report" / "sensor_band.svg").is_file()
-    again = build(spec_from_dict(built.manifest["spec"], "manifest"), {}, tmp_path / "again")
+    again = build_database(
+        spec_from_dict(built.manifest["spec"], "manifest"), {}, tmp_path / "again"
+    )
     assert again.manifest["products"] == built.manifest["products"]
 
 

@@ -23,7 +23,7 @@ from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.images.centroiding import centres_of_mass, find_spots
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.estimate import choose_stars, count_rejected, read_draft
 from starcat.pipeline.guide_stars import depth_notes
 from starcat.products.blends import Blends, blends, widths_px
@@ -531,7 +531,7 @@ def test_a_catalog_that_ends_too_early_is_named(faintest, rule, words):
 
 @pytest.mark.slow
 def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path):
-    built = build(wide_spec(small_spec, "merge"), {"sao": [sao_file]}, tmp_path)
+    built = build_database(wide_spec(small_spec, "merge"), {"sao": [sao_file]}, tmp_path)
     check_artifact(built.folder)
     report = json.loads((built.folder / "report" / "report.json").read_bytes())
     assert set(report["neighbours"]) == {"regained", "lost", "absorbed"}

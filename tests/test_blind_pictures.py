@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source_files import locate
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.images.centroiding import find_spots
 from starcat.images.render import Optics, render_image
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import CameraSpec
 from starcat.stars.star_table import directions_of, floats_of
@@ -27,12 +27,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 def matcher(tmp_path_factory):
     camera = CameraSpec(width_px=SIZE_PX[0], height_px=SIZE_PX[1], fov_x_deg=RANGE_DEG[0])
     spec = starter_spec("range", camera, widest_fov_x_deg=RANGE_DEG[1]).spec
-    return Matcher.open(build(spec, {}, tmp_path_factory.mktemp("range")).folder)
+    return Matcher.open(build_database(spec, {}, tmp_path_factory.mktemp("range")).folder)
 
 
 @pytest.fixture(scope="module")
 def sky():
-    stars = ingest("gaia", locate("gaia", {})).stars
+    stars = ingest_catalog("gaia", locate("gaia", {})).stars
     return directions_of(stars), floats_of(stars, "mag")
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from starcat.catalog import source
-from starcat.catalog.ingest import ingest
-from starcat.catalog.readers.records import Records
+from starcat.catalog.ingest import ingest_catalog
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source import known_maps, read_source, source_given
 from starcat.errors import ConfigError
 
@@ -33,7 +33,7 @@ V = "v"
 TABLE = "number,ra,dec,v\n7,10.0,-89.5,3.5\n7,20.0,0.5,4.5\n"
 
 
-def add_zone(records: Records) -> Records:
+def add_zone(records: ParsedRecords) -> ParsedRecords:
     """Number stars by their zone of declination, in which the catalog counts them."""
     zone = np.floor(np.asarray(records["columns.dec"]) + 90.0).astype(np.int64)
     number = zone * 1_000_000 + records["columns.star_id"]
@@ -52,7 +52,7 @@ def test_a_shipped_map_completes_its_records_with_a_function(tmp_path, monkeypat
     hook = SimpleNamespace(add_zone=add_zone)
     monkeypatch.setitem(sys.modules, "invented_hook", hook)
     monkeypatch.setitem(source._given, "invented", read_source(path))
-    read = ingest("invented", [tmp_path / "invented.csv"])
+    read = ingest_catalog("invented", [tmp_path / "invented.csv"])
     assert read.stars["star_id"].to_pylist() == [7, 90_000_007]
 
 

@@ -16,7 +16,7 @@ from genuine_records import PSC, SAO, SUPPL_1, TYC2, TYC_MAIN
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR
-from starcat.catalog.ingest import Ingested, StarTables, ingest
+from starcat.catalog.ingest import Ingested, StarTables, ingest_catalog
 from starcat.catalog.source import data_source
 from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
@@ -46,7 +46,7 @@ def read(tmp_path: Path) -> Callable[..., Ingested]:
     def run(source: str, *lines: bytes, name: str | None = None, **options: Any) -> Ingested:
         path = tmp_path / (name or FILES[source])
         path.write_bytes(b"\n".join(lines) + b"\n")
-        return ingest(source, [path], **options)
+        return ingest_catalog(source, [path], **options)
 
     return run
 
@@ -120,7 +120,7 @@ def test_every_record_is_kept_or_rejected(
 
 
 def test_the_embedded_sky_of_gaia():
-    read = ingest("gaia", [embedded_sky()], neighbours=False)
+    read = ingest_catalog("gaia", [embedded_sky()], neighbours=False)
     assert len(read.stars) == read.rows_read == 482_176
     assert read.rejected_by_reason == {}
     assert read.files[0].sha256 == data_source("gaia").files[0].sha256
@@ -189,7 +189,7 @@ def test_sao_positions_are_those_of_the_fk5(catalogs, ingested, expected):
 )
 def test_epoch_moves_every_star_by_its_own_years(catalogs, ingested, source, name):
     own = ingested(source, name).stars
-    moved = ingest(source, [catalogs / name], epoch_jyear=2026.5).stars
+    moved = ingest_catalog(source, [catalogs / name], epoch_jyear=2026.5).stars
     start = Motion(*(floats_of(own, field.name) for field in fields(Motion)))
     in_space = [floats_of(own, name) for name in ("parallax_mas", "radial_velocity_km_s")]
     end, _ = propagate_in_space(start, *in_space, floats_of(own, "epoch_jyear"), np.array(2026.5))
@@ -647,7 +647,9 @@ def test_tycho2_and_its_supplement_are_one_table(tmp_path, is_supplement_first):
     (tmp_path / "tyc2.dat").write_bytes(b"\n".join(TYC2) + b"\n")
     (tmp_path / "suppl_1.dat").write_bytes(b"\n".join(SUPPL_1) + b"\n")
     paths = [tmp_path / "tyc2.dat", tmp_path / "suppl_1.dat"]
-    read = ingest("tycho2", paths[::-1] if is_supplement_first else [tmp_path], epoch_jyear=2010.0)
+    read = ingest_catalog(
+        "tycho2", paths[::-1] if is_supplement_first else [tmp_path], epoch_jyear=2010.0
+    )
     stars = read.stars
     assert stars["star_id"].to_pylist() == [1_000_081, 1_000_131, 1_000_331, 2_005_801, 2_011_272]
     assert [file.rows for file in read.files] == ([2, 3] if is_supplement_first else [3, 2])
@@ -666,7 +668,7 @@ def test_a_star_in_both_files_is_read_once(tmp_path):
     again = with_fields("tycho2", SUPPL_1[0], tyc1="0001", tyc2="00008")
     (tmp_path / "tyc2.dat").write_bytes(TYC2[0] + b"\n")
     (tmp_path / "suppl_1.dat").write_bytes(again + b"\n")
-    read = ingest("tycho2", [tmp_path])
+    read = ingest_catalog("tycho2", [tmp_path])
     assert read.stars["mag"].to_pylist() == [12.146]
     assert read.rejected_by_reason == {"duplicate_record": 1}
     assert read.rejected["source_file"].to_pylist() == [1]
@@ -734,7 +736,7 @@ def test_a_block_without_a_good_record(tmp_path, monkeypatch, source):
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 600)
     path = tmp_path / FILES[source]
     path.write_bytes((GENUINE[source][0] + b"\n") * 4 + b"bad\n" * 9)
-    read = ingest(source, [path])
+    read = ingest_catalog(source, [path])
     assert read.rejected_by_reason == {"malformed_record": 9, "duplicate_record": 3}
 
 
@@ -854,7 +856,7 @@ def test_nearest_neighbours_are_those_of_all_that_was_read(read):
 def test_blocks_do_not_matter(catalogs, ingested, monkeypatch):
     whole = ingested("sao", "sao.dat.gz")
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 200_001)
-    parts = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
+    parts = ingest_catalog("sao", [catalogs / "sao.dat.gz"], neighbours=False)
     for name in ("star_id", "source_line", "mag", "designation", "double_flag"):
         assert parts.stars[name].equals(whole.stars[name]), name
     found, expected = directions_of(parts.stars), directions_of(whole.stars)
@@ -864,7 +866,7 @@ def test_blocks_do_not_matter(catalogs, ingested, monkeypatch):
 def test_progress_ends_with_all_bytes(catalogs):
     calls: list[tuple[str, int, int | None]] = []
     path = catalogs / "sao.dat.gz"
-    ingest("sao", [path], neighbours=False, progress=lambda *call: calls.append(call))
+    ingest_catalog("sao", [path], neighbours=False, progress=lambda *call: calls.append(call))
     assert calls[-1] == ("read sao", path.stat().st_size, path.stat().st_size)
 
 
@@ -881,13 +883,13 @@ def test_progress_ends_with_all_bytes(catalogs):
 )
 def test_sources_and_bands_that_there_are_not(tmp_path, source, band, message):
     with pytest.raises(ConfigError) as caught:
-        ingest(source, [tmp_path], band=band)
+        ingest_catalog(source, [tmp_path], band=band)
     assert message in str(caught.value)
 
 
 def test_no_files():
     with pytest.raises(SourceMissing, match="no input files"):
-        ingest("sao", [])
+        ingest_catalog("sao", [])
 
 
 def test_a_missing_supplement_is_told(ingested):

@@ -29,7 +29,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
 
@@ -403,7 +403,9 @@ def narrow_sky(random_directions) -> Database:
     return pair_sky(random_directions(4500, 16), NARROW, magnitudes(4500))
 
 
-def six_of_nine(sky: Database, noise_px: float, astray_px: float, seed: int) -> Iterator[Frame]:
+def six_of_nine(
+    sky: Database, noise_px: float, astray_px: float, seed: int
+) -> Iterator[SimulatedFrame]:
     """Yield frames of six true spots and three false ones, one of the six out of its place."""
     generator = np.random.default_rng(seed)
     stars = Sky(sky.directions, sky.mag, np.arange(len(sky.mag)))
@@ -418,14 +420,14 @@ def six_of_nine(sky: Database, noise_px: float, astray_px: float, seed: int) -> 
         mag = np.concatenate([whole.mag[kept], generator.choice(sky.mag, 3)])
         if len(kept) == 6 and sky.camera.contains(centroids_px).all():
             star = np.concatenate([whole.star_index[kept], np.full(3, -1)])
-            yield Frame(matrix, centroids_px, star, mag, star < 0)
+            yield SimulatedFrame(matrix, centroids_px, star, mag, star < 0)
 
 
 def withheld(
     sky: Database, count: int, noise_px: float, astray_px: float, most: float
-) -> list[Frame]:
+) -> list[SimulatedFrame]:
     """Return such frames of which five spots match, with a bound from 1e-9 to another one."""
-    found: list[Frame] = []
+    found: list[SimulatedFrame] = []
     for frame in six_of_nine(sky, noise_px, astray_px, 17):
         right = agreement_of(frame.matrix, observe(frame.centroids_px, sky.camera, 2.0), sky)
         if right.n_matched == 5 and 1e-9 < right.false_match_probability <= most:
@@ -435,7 +437,7 @@ def withheld(
     return found
 
 
-def accepted(matcher: Matcher, frames: list[Frame]) -> int:
+def accepted(matcher: Matcher, frames: list[SimulatedFrame]) -> int:
     """Return how many frames are identified, all of them rightly."""
     count = 0
     for frame in frames:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import count_by_reason, ingest
+from starcat.catalog.ingest import count_by_reason, ingest_catalog
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.guide_stars import check_fields
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.coverage import (
@@ -206,7 +206,9 @@ def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built
         content = tomllib.loads(small_spec)
         for section, keys in changes.items():
             content[section] = {**content[section], **keys}
-        return build(spec_from_dict(content, "small.toml"), {"sao": [sao_file]}, tmp_path / folder)
+        return build_database(
+            spec_from_dict(content, "small.toml"), {"sao": [sao_file]}, tmp_path / folder
+        )
 
     return run
 
@@ -291,7 +293,7 @@ def test_thinning_makes_a_real_sky_even(catalogs):
     base = preset("sao-12deg")
     selection = base.selection.model_copy(update={"max_stars_per_field": 10})
     spec = base.model_copy(update={"selection": selection})
-    catalog = ingest("sao", [catalogs / "sao.dat.gz"], epoch_jyear=spec.epoch_jyear)
+    catalog = ingest_catalog("sao", [catalogs / "sao.dat.gz"], epoch_jyear=spec.epoch_jyear)
     selected = select_guide_stars(catalog.stars, spec.selection)
     before = tile_guide_stars(selected.guide_stars, spec)
     thinned = reject_dense(selected, before.brightest(10)[1])

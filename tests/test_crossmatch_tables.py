@@ -20,9 +20,9 @@ from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.counterparts import (
     find_counterparts,
     match_files,
@@ -32,12 +32,7 @@ from starcat.pipeline.counterparts import (
 )
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import (
-    Crossmatch,
-    counterpart_problems,
-    matched_stars,
-    moving_stars,
-)
+from starcat.products.crossmatch import Crossmatch, counterpart_problems, matched_rows, moving_stars
 from starcat.products.match_figures import ARCSEC
 from starcat.products.match_stars import VERDICTS
 from starcat.products.table import Products
@@ -65,7 +60,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
     """SAO as the small database has it, and 500 of the 600 stars as Gaia would: at J2016."""
     folder = tmp_path_factory.mktemp("crossmatch")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
-    stars = ingest("sao", [folder / "sao.dat"]).stars
+    stars = ingest_catalog("sao", [folder / "sao.dat"]).stars
     then = propagate(Motion(*(stars[field.name].to_numpy() for field in fields(Motion))), 16.0)
     generator = np.random.default_rng(16)
     records = []
@@ -82,7 +77,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 @pytest.fixture(scope="module")
 def artifact(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
-    return build(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+    return build_database(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
 
 
 @pytest.fixture
@@ -204,7 +199,7 @@ def test_an_empty_product_has_no_problems(artifact):
     opened = open_artifact(artifact)
     none = opened.table("crossmatch").slice(0, 0)
     assert list(counterpart_problems(none, opened.table("stars"))) == []
-    assert len(matched_stars(none)) == 0
+    assert len(matched_rows(none)) == 0
 
 
 @pytest.mark.slow
@@ -215,7 +210,9 @@ def test_the_radius_of_the_spec_is_kept(files, small_spec):
         catalogs=["sao"],
         radius_arcsec=3.0,
     )
-    folder = build(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+    folder = build_database(
+        spec, {name: [files] for name in ("sao", "gaia")}, files / "dist"
+    ).folder
     table = open_artifact(folder).table("crossmatch")
     assert set(table["catalog"].to_pylist()) == {"sao"}
     assert table["separation_arcsec"].to_numpy().max() <= 3.0
@@ -229,7 +226,7 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     dec = float(sao_lines[9][193:204]) + 3.0 * ARCSEC
     line = b"   601" + sao_lines[9][6:80] + b" 6.3" + sao_lines[9][84:193]
     (tmp_path / "sao.dat").write_bytes(b"".join([*sao_lines, line + f"{dec:+11.8f}\n".encode()]))
-    stars = ingest("sao", [tmp_path / "sao.dat"]).stars
+    stars = ingest_catalog("sao", [tmp_path / "sao.dat"]).stars
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     selected = select_guide_stars(stars, spec.selection)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
@@ -243,14 +240,14 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     assert table["star"][row].as_py() == 9
     assert (table["n_stars"][row].as_py(), table["verdict"][row].as_py()) == (2, "best")
     assert table["star"].to_numpy().max() < len(selected.guide_stars)
-    assert draft.sources[0].joined == len(matched_stars(table)) == len(table)
+    assert draft.sources[0].joined == len(matched_rows(table)) == len(table)
 
 
 def test_a_source_that_lists_no_stars_has_no_counterparts(files, small_spec, tmp_path):
     spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
     inputs = {"sao": [files / "sao.dat"], "gcvs": [files / "sao.dat"]}
     with pytest.raises(ConfigError, match="gcvs lists no stars; choose one of 2mass"):
-        build(spec, inputs, tmp_path)
+        build_database(spec, inputs, tmp_path)
 
 
 def test_a_missing_catalog_is_known_before_anything_is_read(
@@ -261,7 +258,7 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
     spec = spec_of(small_spec, enabled=True, catalogs=["hipparcos"])
     stages: list[str] = []
     with pytest.raises(SourceMissing, match="hipparcos"):
-        build(
+        build_database(
             spec,
             {"sao": [files / "sao.dat"]},
             tmp_path / "out",
@@ -295,7 +292,7 @@ def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
 def tables(files: Path) -> tuple[Path, Path]:
     made = []
     for name in ("sao", "gaia"):
-        write_parquet(ingest(name, [files]).stars, files / f"{name}.parquet")
+        write_parquet(ingest_catalog(name, [files]).stars, files / f"{name}.parquet")
         made.append(files / f"{name}.parquet")
     return made[0], made[1]
 

@@ -20,11 +20,11 @@ import pytest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
-from starcat.pipeline.build import build
+from starcat.catalog.ingest import ingest_catalog
+from starcat.pipeline.build import build_database
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import Crossmatch, matched_stars, moving_stars
+from starcat.products.crossmatch import Crossmatch, matched_rows, moving_stars
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.products.match_stars import VERDICTS, crossmatch
 from starcat.specs.reading import spec_from_dict
@@ -36,7 +36,9 @@ FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.da
 @pytest.fixture(scope="module")
 def skies(catalogs: Path) -> dict[str, pa.Table]:
     paths = {name: catalogs / file for name, file in FILES.items()} | {"gaia": embedded_sky()}
-    return {name: ingest(name, [path], neighbours=False).stars for name, path in paths.items()}
+    return {
+        name: ingest_catalog(name, [path], neighbours=False).stars for name, path in paths.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +143,7 @@ def test_sao_in_hipparcos_by_the_fk5_index(catalogs, skies, sao_in_hipparcos):
 def test_tycho2_in_hipparcos_by_its_own_numbers(skies, expected):
     stars, hipparcos = skies["tycho2"], skies["hipparcos"]
     table, _ = match_tables(stars, hipparcos, Crossmatch())
-    rows = matched_stars(table)
+    rows = matched_rows(table)
     own = floats_of(stars, "hip_number")
     named = own[table["star"].to_numpy()[rows]]
     found = table["counterpart_id"].to_numpy()[rows]
@@ -155,7 +157,7 @@ def test_tycho2_in_hipparcos_by_its_own_numbers(skies, expected):
 def test_the_brightest_of_gaia_s_sky_carry_their_hipparcos_number(skies):
     hipparcos = skies["hipparcos"]
     table, found = match_tables(hipparcos, skies["gaia"], Crossmatch())
-    best = table.take(matched_stars(table))
+    best = table.take(matched_rows(table))
     named = best["counterpart_id"].to_numpy()
     own = hipparcos["star_id"].to_numpy()[best["star"].to_numpy()]
     # They have no proper motion and are at J2016: Hipparcos has to be moved there.
@@ -218,7 +220,7 @@ def test_an_artifact_with_three_catalogs(catalogs, tmp_path):
     spec = spec_from_dict(tomllib.loads(SPEC), "bright.toml")
     inputs = {name: [catalogs / file] for name, file in FILES.items()}
     inputs["2mass"] = [catalogs / "psc_measured.gz"]
-    built = build(spec, inputs, tmp_path)
+    built = build_database(spec, inputs, tmp_path)
     opened = open_artifact(built.folder)
     table, stars = opened.table("crossmatch"), opened.table("stars")
     assert set(table["catalog"].to_pylist()) == {"2mass", "hipparcos", "tycho2"}
@@ -227,7 +229,7 @@ def test_an_artifact_with_three_catalogs(catalogs, tmp_path):
         of_catalog = table.filter(
             pa.array(np.array(table["catalog"].to_pylist()) == source["source"])
         )
-        assert len(matched_stars(of_catalog)) == source["joined"] > 0
+        assert len(matched_rows(of_catalog)) == source["joined"] > 0
     names = [source["source"] for source in opened.manifest["sources"]]
     assert names == ["sao", "hipparcos", "tycho2", "hipparcos", "2mass"]
     # 2MASS has no proper motions: the guide stars were moved back to the day of each scan.

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from starcat.catalog.readers import delimited
 from starcat.catalog.readers.delimited import parse_delimited
-from starcat.catalog.readers.records import Problem, Records
-from starcat.catalog.source import Column, RecordFile, data_source
+from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
+from starcat.catalog.source import RecordFile, SourceColumn, data_source
 
 PSC = data_source("2mass").files[0]
 GCVS = data_source("gcvs").files[0]
@@ -25,9 +25,9 @@ TINY = RecordFile(
     delimiter=",",
     comment="#",
     columns=(
-        Column(name="name", format="A3", required=True),
-        Column(name="mag", format="F5.2", null=("none", "99.99")),
-        Column(name="code", format="A1", null=("?",)),
+        SourceColumn(name="name", format="A3", required=True),
+        SourceColumn(name="mag", format="F5.2", null=("none", "99.99")),
+        SourceColumn(name="code", format="A1", null=("?",)),
     ),
 )
 
@@ -74,7 +74,7 @@ def test_no_value_is_nan(old, new, column):
 def test_letters_in_a_number_cost_only_that_line(names, text):
     bad = RECORD.replace(b"|12.467|", b"|" + text.encode() + b"|")
     parsed = parse_delimited(b"\n".join([RECORD, bad, RECORD]), PSC, names, first_line=50)
-    assert parsed.problems == [Problem(51, "j_m", None, repr(text), "a number like F")]
+    assert parsed.problems == [MalformedRecord(51, "j_m", None, repr(text), "a number like F")]
     assert parsed.line.tolist() == [50, 52]
     assert parsed["j_m"].tolist() == [12.467, 12.467]
     assert parsed["ra"].tolist() == [1.119851, 1.119851]
@@ -92,7 +92,7 @@ def test_a_line_with_two_bad_numbers_has_one_problem():
 )
 def test_wrong_number_of_fields(line, found):
     parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra"], first_line=7)
-    assert parsed.problems == [Problem(7, "record", None, found, "60 fields")]
+    assert parsed.problems == [MalformedRecord(7, "record", None, found, "60 fields")]
     assert parsed.line.tolist() == [8]
 
 
@@ -107,7 +107,7 @@ def test_wrong_number_of_fields(line, found):
 )
 def test_a_required_field_that_is_blank(line, column):
     parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra", "dec", "designation"])
-    assert parsed.problems == [Problem(1, column, None, "a blank field", "a value")]
+    assert parsed.problems == [MalformedRecord(1, column, None, "a blank field", "a value")]
     assert parsed.line.tolist() == [2]
 
 
@@ -192,7 +192,7 @@ LINES = st.one_of(
 ENDS = st.sampled_from([b"\n", b"\n", b"\n", b"\n", b"\r\n", b"\n\n", b"\n#", b"\r"])
 
 
-def same(one: Records, other: Records) -> None:
+def same(one: ParsedRecords, other: ParsedRecords) -> None:
     assert one.line.dtype == other.line.dtype
     assert one.line.tolist() == other.line.tolist()
     assert one.problems == other.problems

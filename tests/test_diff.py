@@ -13,26 +13,26 @@ import pytest
 from artifact_copies import copied, seal
 
 from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import check_artifact
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.schema import product_schema
 
-Make = Callable[..., Artifact]
+Make = Callable[..., DatabaseFolder]
 
 
 @pytest.fixture
 def make(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Make:
     """Build the small spec from some lines, with some of its keys replaced."""
 
-    def run(name: str, lines: list[bytes] = sao_lines, **changes: Any) -> Artifact:
+    def run(name: str, lines: list[bytes] = sao_lines, **changes: Any) -> DatabaseFolder:
         folder = tmp_path / name
         folder.mkdir()
         (folder / "sao.dat").write_bytes(b"".join(lines))
         content = {**tomllib.loads(small_spec), **changes}
         spec = spec_from_dict(content, "small.toml")
-        return check_artifact(build(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+        return check_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
 
     return run
 

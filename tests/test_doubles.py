@@ -18,14 +18,14 @@ from drafts import merged
 
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.doubles import PairTable, join_pairs, read_wds
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
 from starcat.catalog.source import data_source
 from starcat.catalog.variability import read_amplitudes
 from starcat.errors import ParseError
 from starcat.geometry.sphere import directions_from_radec
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.estimate import reading_keys
 from starcat.pipeline.supply import supply_doubles
 from starcat.resources import resource_folder
@@ -253,7 +253,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Path
 
 def test_wds_by_number_and_by_place_flag_the_same_stars(made):
     folder, _ = made
-    stars = ingest("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
+    stars = ingest_catalog("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
     tables = [read_wds([folder / name]) for name in ("wds_hip.dat", "wdsweb_summ2.txt")]
     by_number, by_place = (join_pairs(stars, table, LIMIT)[0] for table in tables)
     assert tables[0].kept == tables[1].kept > 50
@@ -268,7 +268,7 @@ def test_wds_by_number_and_by_place_flag_the_same_stars(made):
 
 def test_vsx_by_place(made):
     folder, others = made
-    stars = ingest("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
+    stars = ingest_catalog("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
     table = read_amplitudes("vsx", [folder / "vsx.dat"])
     sky = others["sky"]
     varies = sky.amplitude_mag > 0
@@ -317,9 +317,11 @@ def test_a_build_with_joined_doubles(tmp_path, catalogs):
         "boresights.count": "500", "self_test.frames": "10", "self_test.min_identified": "0.0",
     }  # fmt: skip
     inputs = {name: [catalogs / file] for name, file in FILES.items()}
-    plain = build(preset("gaia-12deg", changes), {"hipparcos": inputs["hipparcos"]}, tmp_path)
+    plain = build_database(
+        preset("gaia-12deg", changes), {"hipparcos": inputs["hipparcos"]}, tmp_path
+    )
     joined = {**changes, "name": "joined", "selection.doubles.join": '["wds"]'}
-    built = build(preset("gaia-12deg", joined), inputs, tmp_path)
+    built = build_database(preset("gaia-12deg", joined), inputs, tmp_path)
     check_artifact(built.folder)
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)
@@ -343,7 +345,7 @@ def test_a_build_of_hipparcos2_with_everything_by_place(tmp_path, made):
     }  # fmt: skip
     inputs = {name: [folder] for name in ("hipparcos2", "vsx")}
     inputs["wds"] = [folder / "wdsweb_summ2.txt"]
-    built = build(preset("gaia-12deg", changes), inputs, tmp_path)
+    built = build_database(preset("gaia-12deg", changes), inputs, tmp_path)
     check_artifact(built.folder)
     stars, variables, doubles = built.manifest["sources"]
     assert [one["role"] for one in (variables, doubles)] == ["variability", "doubles"]

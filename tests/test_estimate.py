@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.errors import BuildError, ConfigError
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.cost import PART_ROWS, PARTS, table_bytes
 from starcat.pipeline.draft import Draft, Inputs
 from starcat.pipeline.estimate import (
     Estimate,
     choose_stars,
     count_rejected,
-    estimate,
+    estimate_draft,
     estimate_spec,
     read_draft,
     reading_keys,
@@ -100,7 +100,7 @@ def check(found: Estimate, folder: Path, least_bytes: int = 0, *, is_small: bool
 )
 def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
     spec = spec_of(small_spec, **sections)
-    built = build(spec, small[1], tmp_path)
+    built = build_database(spec, small[1], tmp_path)
     check(estimate_spec(spec, small[1]), built.folder, is_small=True)
 
 
@@ -113,9 +113,9 @@ def test_every_preset_is_as_estimated(name, catalogs, expected, tmp_path, monkey
     spec = preset(name)
     if name in expected(generated=DEEP_PRESETS, genuine=()):
         with pytest.raises(BuildError, match="identifies"):
-            build(spec, inputs, tmp_path)
+            build_database(spec, inputs, tmp_path)
         return
-    built = build(spec, inputs, tmp_path)
+    built = build_database(spec, inputs, tmp_path)
     check(estimate_spec(spec, inputs), built.folder)
 
 
@@ -142,7 +142,7 @@ def test_every_preset_is_as_estimated(name, catalogs, expected, tmp_path, monkey
 )
 def test_other_specs_are_as_estimated(changes, tmp_path):
     spec = preset("gaia-12deg", {**changes, "self_test.frames": "20"})
-    built = build(spec, {}, tmp_path)
+    built = build_database(spec, {}, tmp_path)
     check(estimate_spec(spec, {}), built.folder, least_bytes=2000)
 
 
@@ -210,7 +210,7 @@ def test_too_few_stars_are_told_in_the_words_of_the_build(read, small_spec):
 
 def test_fields_that_fall_short_and_memory_are_refusals(read, small_spec):
     spec = spec_of(small_spec, boresights={"count": 200, "min_stars_per_field": 10_000})
-    found = estimate(read, choose_stars(read, spec), spec, max_memory_bytes=1)
+    found = estimate_draft(read, choose_stars(read, spec), spec, max_memory_bytes=1)
     assert "(boresights.min_stars_per_field)" in str(found.refusals[0])
     assert "more than the limit that was given" in str(found.refusals[1])
 

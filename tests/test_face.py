@@ -242,9 +242,9 @@ def test_everything_public_says_what_it_is_in_one_line(small_artifact):
 def test_a_star_name_is_no_html():
     import pyarrow as pa
 
-    from starcat.query.result import Answer
+    from starcat.query.result import QueryResult
 
-    shown = Answer(pa.table({"<b>": ["<script>"]}))._repr_html_()
+    shown = QueryResult(pa.table({"<b>": ["<script>"]}))._repr_html_()
     assert "<script>" not in shown
     assert "<b>" not in shown
 

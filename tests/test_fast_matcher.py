@@ -22,7 +22,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import TriangleOrder
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 pytestmark = pytest.mark.skipif(
     not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
@@ -234,7 +234,7 @@ def test_threads_that_share_a_matcher_get_the_answers_of_one(sky):
     matcher = Matcher(sky, engine="c")
     some = frames(sky, 200, HARD, seed=7)
 
-    def ask(frame: Frame) -> MatchResult:
+    def ask(frame: SimulatedFrame) -> MatchResult:
         return matcher.identify(frame.centroids_px, magnitudes=frame.mag)
 
     expected = [told(ask(frame)) for frame in some]

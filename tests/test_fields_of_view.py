@@ -15,7 +15,7 @@ import pytest
 from drafts import chosen
 from scipy.spatial import cKDTree
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
@@ -27,7 +27,7 @@ from starcat.geometry.sphere import (
     zones_of,
 )
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.cost import Cost, product_cost
 from starcat.pipeline.recipes import make_product, product_inputs
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
@@ -45,7 +45,7 @@ GIB = 2**30
 @cache
 def embedded_stars() -> pa.Table:
     """The stars that `init` and the presets take, read once for all tests."""
-    return ingest("gaia", locate("gaia", {})).stars
+    return ingest_catalog("gaia", locate("gaia", {})).stars
 
 
 def started(fov_deg: float) -> Starter:
@@ -55,7 +55,7 @@ def started(fov_deg: float) -> Starter:
 
 def built(spec: BuildSpec, folder: Path) -> tuple[Built, Cost]:
     told: list[Cost] = []
-    made = build(spec, {}, folder, announce=told.append)
+    made = build_database(spec, {}, folder, announce=told.append)
     return made, told[0]
 
 
@@ -149,7 +149,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_made(tmp_path):
     stages: list[str] = []
     spec = preset("gaia-12deg", {"products.triangles.enabled": "false"})
     with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most") as refused:
-        build(
+        build_database(
             spec, {}, tmp_path, max_memory_bytes=GIB // 4,
             progress=lambda stage, *_: stages.append(stage),
         )  # fmt: skip

@@ -14,8 +14,15 @@ sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
 from twomass_parts import PARTS, part_bytes
 
-from starcat.catalog.ingest import Ingested, ingest
-from starcat.catalog.parts import FileReading, IngestOptions, Part, merged, parse_block, read_files
+from starcat.catalog.ingest import Ingested, ingest_catalog
+from starcat.catalog.parts import (
+    FilePart,
+    FileReading,
+    IngestOptions,
+    merged,
+    parse_block,
+    read_files,
+)
 from starcat.catalog.readers import blocks as blocks_module
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import InputFile
@@ -46,7 +53,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 10_000)
 
 
-def read_alone(path: Path, number: int) -> tuple[FileReading, list[Part]]:
+def read_alone(path: Path, number: int) -> tuple[FileReading, list[FilePart]]:
     parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
     file = InputFile(path, PSC, "2mass", number)
     return next((reading, list(parts)) for reading, parts in read_files([file], parse))
@@ -65,7 +72,9 @@ def same(one: Ingested, other: Ingested) -> None:
 @pytest.mark.parametrize("count", [1, 6])
 def test_the_number_of_workers_does_not_matter(parts, limit_mag, count):
     read = [
-        ingest("2mass", parts[:count], read_limit_mag=limit_mag, neighbours=False, workers=workers)
+        ingest_catalog(
+            "2mass", parts[:count], read_limit_mag=limit_mag, neighbours=False, workers=workers
+        )
         for workers in (1, 2, 5)
     ]
     assert read[0].rows_read == count * ROWS
@@ -77,7 +86,7 @@ def test_the_number_of_workers_does_not_matter(parts, limit_mag, count):
 
 @pytest.mark.usefixtures("small_blocks")
 def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
-    whole = ingest("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
+    whole = ingest_catalog("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
     stars, rejected, counted, facts = [], [], 0, []
     for number, path in enumerate(parts[:3]):
         reading, blocks = read_alone(path, number)
@@ -105,7 +114,9 @@ def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_progress_of_files_ends_with_all_bytes(parts, workers):
     events: list[tuple[str, int, int | None]] = []
-    ingest("2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e))
+    ingest_catalog(
+        "2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e)
+    )
     size = sum(path.stat().st_size for path in parts)
     assert events[-1] == ("read 2mass", size, size)
     done = [event[1] for event in events]
@@ -126,7 +137,7 @@ def test_the_error_of_the_first_bad_file_is_told(parts, tmp_path, workers):
     for bad in (2, 4):
         copies[bad].write_bytes(gzip.compress(b"1|2|3\n" * 50, mtime=0))
     with pytest.raises(ParseError, match=r"psc_aac\.gz: none of the first 50 records") as caught:
-        ingest("2mass", copies, workers=workers)
+        ingest_catalog("2mass", copies, workers=workers)
     assert caught.value.path == copies[2]
 
 
@@ -135,7 +146,7 @@ def test_an_interrupted_reading_stops(parts):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        ingest("2mass", parts, progress=interrupt)
+        ingest_catalog("2mass", parts, progress=interrupt)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -144,7 +155,7 @@ def test_merged_blocks_hold_the_same_in_the_same_order(parts, rows):
     _, blocks = read_alone(parts[0], 0)
     joined = list(merged(blocks, rows))
 
-    def tables(some: list[Part]) -> list[pa.Table]:
+    def tables(some: list[FilePart]) -> list[pa.Table]:
         each = ([part.stars for part in some], [part.rejected for part in some])
         return [pa.concat_tables(tables) for tables in each]
 

@@ -16,7 +16,7 @@ import pytest
 from starcat.catalog.readers import blocks as blocks_module
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.fixed_width import parse_binary
-from starcat.catalog.source import Column, DataSource, RecordFile
+from starcat.catalog.source import DataSource, RecordFile, SourceColumn
 from starcat.catalog.source_files import InputFile, SourceFiles, lacking
 from starcat.errors import ParseError, SourceError, SourceMissing
 from starcat.threads import map_in_order
@@ -29,7 +29,7 @@ def text_file(name: str = "tiny", **rest: object) -> RecordFile:
         name=name,
         layout="fixed_width",
         record_bytes=5,
-        columns=(Column(name="n", bytes=(1, 5), format="I5"),),
+        columns=(SourceColumn(name="n", bytes=(1, 5), format="I5"),),
         **{"file_names": (f"{name}.dat",), **rest},
     )
 
@@ -58,8 +58,8 @@ BINARY = RecordFile(
     header_bytes=8,
     magic="PACK",
     columns=(
-        Column(name="n", bytes=(1, 4), format="<i4"),
-        Column(name="x", bytes=(5, 12), format="<f8"),
+        SourceColumn(name="n", bytes=(1, 4), format="<i4"),
+        SourceColumn(name="x", bytes=(5, 12), format="<f8"),
     ),
 )
 

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.catalog.readers.fixed_width import parse_fixed_width
-from starcat.catalog.readers.records import Problem, Records
-from starcat.catalog.source import Column, RecordFile, data_source
+from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
+from starcat.catalog.source import RecordFile, SourceColumn, data_source
 
 LINE = b"T|   1    13 1| |00 04 30.12|+02 16 02.6| 8.50| | |001.12551719|+02.26739188|"
 """The first 77 bytes of a record of tyc_main, up to the declination."""
 
 
-def layout(*columns: Column, size: int, literals: dict[str, str] | None = None) -> RecordFile:
+def layout(*columns: SourceColumn, size: int, literals: dict[str, str] | None = None) -> RecordFile:
     return RecordFile(
         name="tiny",
         file_names=("tiny.dat",),
@@ -27,25 +27,25 @@ def layout(*columns: Column, size: int, literals: dict[str, str] | None = None) 
 
 
 def one_number(width: int, format_: str, **rest: object) -> RecordFile:
-    return layout(Column(name="x", bytes=(1, width), format=format_, **rest), size=width)
+    return layout(SourceColumn(name="x", bytes=(1, width), format=format_, **rest), size=width)
 
 
-def parse_texts(texts: list[str], format_: str, **rest: object) -> Records:
+def parse_texts(texts: list[str], format_: str, **rest: object) -> ParsedRecords:
     file = one_number(len(texts[0]), format_, **rest)
     return parse_fixed_width("\n".join(texts).encode() + b"\n", file, ["x"])
 
 
 NAMED = layout(
-    Column(name="name", bytes=(1, 3), format="A3"),
-    Column(name="count", bytes=(4, 6), format="I3", required=True),
-    Column(name="mag", bytes=(8, 12), format="F5.2", null=("99.99",)),
+    SourceColumn(name="name", bytes=(1, 3), format="A3"),
+    SourceColumn(name="count", bytes=(4, 6), format="I3", required=True),
+    SourceColumn(name="mag", bytes=(8, 12), format="F5.2", null=("99.99",)),
     size=12,
     literals={"7": "|"},
 )
 GOOD = b"abc 12| 5.25"
 
 
-def parse_named(data: bytes, first_line: int = 1) -> Records:
+def parse_named(data: bytes, first_line: int = 1) -> ParsedRecords:
     return parse_fixed_width(data, NAMED, ["name", "count", "mag"], first_line)
 
 
@@ -152,7 +152,9 @@ def test_a_field_that_is_no_number_of_its_kind(format_, text):
     parsed = parse_texts(["    1", text, "    2"], format_)
     assert parsed["x"].tolist() == [1.0, 2.0]
     assert parsed.line.tolist() == [1, 3]
-    assert parsed.problems == [Problem(2, "x", (1, 5), repr(text), f"a number like {format_}")]
+    assert parsed.problems == [
+        MalformedRecord(2, "x", (1, 5), repr(text), f"a number like {format_}")
+    ]
 
 
 @pytest.mark.parametrize(("text", "found"), [("  1.5", "1.5"), ("1E-99", "1e-99")])
@@ -160,7 +162,7 @@ def test_a_fraction_where_a_whole_number_belongs(text, found):
     parsed = parse_texts(["    1", text, "    2"], "I5")
     assert parsed.line.tolist() == [1, 3]
     expected = "a whole number, -99999 to 99999"
-    assert parsed.problems == [Problem(2, "x", (1, 5), found, expected)]
+    assert parsed.problems == [MalformedRecord(2, "x", (1, 5), found, expected)]
 
 
 def test_bytes_beyond_ascii_are_reported_as_they_are():
@@ -171,13 +173,13 @@ def test_bytes_beyond_ascii_are_reported_as_they_are():
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        (b"abc 12| 5.2", Problem(2, "record", None, "11 bytes", "12 bytes")),
-        (b"abc 12| 5.250", Problem(2, "record", None, "13 bytes", "12 bytes")),
-        (b"abc 12  5.25", Problem(2, "separator", (7, 7), "' '", "'|'")),
-        (b"abc   | 5.25", Problem(2, "count", (4, 6), "a blank field", "a value")),
-        (b"abc x2| 5.25", Problem(2, "count", (4, 6), "' x2'", "a number like I3")),
-        (b"abc 12|5,250", Problem(2, "mag", (8, 12), "'5,250'", "a number like F5.2")),
-        (b"abc x2  5,25", Problem(2, "separator", (7, 7), "' '", "'|'")),
+        (b"abc 12| 5.2", MalformedRecord(2, "record", None, "11 bytes", "12 bytes")),
+        (b"abc 12| 5.250", MalformedRecord(2, "record", None, "13 bytes", "12 bytes")),
+        (b"abc 12  5.25", MalformedRecord(2, "separator", (7, 7), "' '", "'|'")),
+        (b"abc   | 5.25", MalformedRecord(2, "count", (4, 6), "a blank field", "a value")),
+        (b"abc x2| 5.25", MalformedRecord(2, "count", (4, 6), "' x2'", "a number like I3")),
+        (b"abc 12|5,250", MalformedRecord(2, "mag", (8, 12), "'5,250'", "a number like F5.2")),
+        (b"abc x2  5,25", MalformedRecord(2, "separator", (7, 7), "' '", "'|'")),
     ],
 )
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])

@@ -13,7 +13,7 @@ sys.path.append(str(Path(__file__).parent / "benchmarks"))
 
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.products.coverage import tiling_gap
 from starcat.stars.star_table import directions_of
@@ -33,7 +33,7 @@ def check_neighbours(read: Ingested) -> None:
 
 
 def test_sao(tmp_path, catalogs):
-    read = ingest("sao", [make_sao(tmp_path, catalogs)], epoch_jyear=2026.0)
+    read = ingest_catalog("sao", [make_sao(tmp_path, catalogs)], epoch_jyear=2026.0)
     assert read.rows_read == len(read.stars) == SAO_ROWS
     assert read.stars["star_id"].to_pylist() == list(range(1, SAO_ROWS + 1))
     check_neighbours(read)
@@ -41,7 +41,7 @@ def test_sao(tmp_path, catalogs):
 
 def test_tycho2_in_parts_and_in_one_file(tmp_path, catalogs):
     parts = make_tycho2(tmp_path / "parts", catalogs, compress=False)
-    read = ingest("tycho2", [parts], epoch_jyear=2026.0)
+    read = ingest_catalog("tycho2", [parts], epoch_jyear=2026.0)
     number = read.stars["star_id"].to_numpy()
     assert read.rows_read == len(read.stars) == TYCHO2_ROWS
     assert [file.name for file in read.files] == [f"tyc2.dat.{part:02d}" for part in range(20)]
@@ -51,7 +51,7 @@ def test_tycho2_in_parts_and_in_one_file(tmp_path, catalogs):
     with whole.open("wb") as file:
         for part in sorted(parts.iterdir()):
             file.write(part.read_bytes())
-    again = ingest("tycho2", [whole], epoch_jyear=2026.0)
+    again = ingest_catalog("tycho2", [whole], epoch_jyear=2026.0)
     place = {"source_file", "source_line"}
     names = [name for name in again.stars.column_names if name not in place]
     assert again.stars.select(names).equals(read.stars.select(names))

@@ -19,9 +19,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from starcat.catalog.doubles import WDS_COLUMNS, PairTable, read_wds
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.parts import archive_of
-from starcat.catalog.source import Column, RecordFile, data_source, source_names
+from starcat.catalog.source import RecordFile, SourceColumn, data_source, source_names
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
 from starcat.errors import StarcatError
 from starcat.stars.star_table import directions_of, floats_of
@@ -102,7 +102,7 @@ def layout_of(source_name: str, layout_name: str) -> RecordFile:
     return next(file for file in data_source(source_name).files if file.name == layout_name)
 
 
-def columns_read(source_name: str, layout: RecordFile) -> list[Column]:
+def columns_read(source_name: str, layout: RecordFile) -> list[SourceColumn]:
     """The columns that the catalog's module asks for: damage elsewhere is not seen."""
     if source_name in JOINED:
         names: Sequence[str] = JOINED[source_name][layout.name]
@@ -136,14 +136,14 @@ def damaged(source_name: str, layout: RecordFile, record: bytes, damage: Damage)
     return with_field(layout, record, column, damage.text.encode())
 
 
-def packed(column: Column, number: float) -> bytes:
+def packed(column: SourceColumn, number: float) -> bytes:
     if "i" in column.format:
         number = max(-(2**63), min(2**63 - 1024, int(np.nan_to_num(number))))
     with np.errstate(over="ignore"):
         return np.array(number).astype(column.format).tobytes()
 
 
-def field_of(layout: RecordFile, record: bytes, column: Column) -> bytes:
+def field_of(layout: RecordFile, record: bytes, column: SourceColumn) -> bytes:
     if layout.layout == "delimited":
         fields = record.rstrip(b"\n").split(layout.delimiter.encode())
         place = layout.columns.index(column)
@@ -152,7 +152,7 @@ def field_of(layout: RecordFile, record: bytes, column: Column) -> bytes:
     return record[first - 1 : last]
 
 
-def with_field(layout: RecordFile, record: bytes, column: Column, content: bytes) -> bytes:
+def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content: bytes) -> bytes:
     """Put bytes into a field; those of fixed width are cut, or filled up on the left."""
     if layout.layout == "delimited":
         fields = record.rstrip(b"\n").split(layout.delimiter.encode())
@@ -182,7 +182,7 @@ def check_archive(folder: Path, source_name: str, layout_name: str, hits: list[D
 
 
 def check_stars(source_name: str, path: Path) -> None:
-    read = ingest(source_name, [path], epoch_jyear=2026.0)
+    read = ingest_catalog(source_name, [path], epoch_jyear=2026.0)
     assert read.rows_read == len(read.stars) + len(read.rejected)
     assert sum(read.rejected_by_reason.values()) == len(read.rejected)
     product_schema("stars").check(read.stars)
@@ -232,7 +232,7 @@ def test_the_undamaged_records_are_kept(tmp_path, source_name, layout_name):
         read = read_joined(source_name, path)
         assert read.kept == len(good_records(source_name, layout_name)) > 50
     else:
-        stars = ingest(source_name, [path], epoch_jyear=2026.0).stars
+        stars = ingest_catalog(source_name, [path], epoch_jyear=2026.0).stars
         assert len(stars) == len(good_records(source_name, layout_name)) == 60
 
 

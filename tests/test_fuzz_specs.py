@@ -25,7 +25,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from starcat.artifact.writer import write_products
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.errors import ConfigError, StarcatError
 from starcat.pipeline.finish import database_facts, make_products, run_self_test
 from starcat.pipeline.report_data import filter_coverages
@@ -161,7 +161,7 @@ def use(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Use
     """Do with a spec what a build does, on few stars and with few fields."""
     path = tmp_path_factory.mktemp("few") / "sao.dat"
     path.write_bytes(b"".join(sao_lines[::7][:80]))
-    catalog = ingest("sao", [path])
+    catalog = ingest_catalog("sao", [path])
 
     def use(spec: BuildSpec) -> None:
         with suppress(StarcatError):

@@ -15,10 +15,10 @@ from starcat.images.centroiding import find_spots
 from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure
+from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure_picture
 from starcat.images.spot_width import best_widths
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.specs.reading import preset
 
 SIZE = (400, 300)
@@ -26,7 +26,7 @@ SIZE = (400, 300)
 
 @pytest.fixture(scope="module")
 def matcher(tmp_path_factory: pytest.TempPathFactory) -> Matcher:
-    built = build(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("sky"))
+    built = build_database(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("sky"))
     return Matcher.open(built.folder)
 
 
@@ -81,7 +81,7 @@ def test_stars_of_a_hard_picture_are_found(kind, tmp_path):
     image = in_file_steps(render_image(places, mag, SIZE, optics, 5), taken.scene)
     path = tmp_path / ("a.png" if taken.quality is None else "a.jpg")
     write_image(path, image, **({} if taken.quality is None else {"quality": taken.quality}))
-    [frame] = measure(path).frames
+    [frame] = measure_picture(path).frames
     distance, _ = cKDTree(frame.centroids_px).query(places)
     assert (distance < 0.7).sum() >= 26
     if taken.quality is None:  # of what compression leaves of the noise some stands out
@@ -221,7 +221,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     path = tmp_path / "faint.png"
     size = camera.width_px, camera.height_px
     write_image(path, render_image(places, mag, size, optics, 5))
-    measured = measure(path)
+    measured = measure_picture(path)
     [frame] = measured.frames
     first = matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
@@ -248,9 +248,9 @@ def test_a_dark_frame_takes_hot_pixels_out(tmp_path):
     image = render_image(*stars(40, 5), SIZE, Optics(full_well_e=6e4), 2, current)
     write_image(tmp_path / "image.fits", image)
     write_image(tmp_path / "dark.fits", lid)
-    [bare] = measure(tmp_path / "image.fits", IdentifyOptions(psf_sigma_px=1.0)).frames
+    [bare] = measure_picture(tmp_path / "image.fits", IdentifyOptions(psf_sigma_px=1.0)).frames
     how = IdentifyOptions(psf_sigma_px=1.0), LocalInputs(dark=tmp_path / "dark.fits")
-    [frame] = measure(tmp_path / "image.fits", *how).frames
+    [frame] = measure_picture(tmp_path / "image.fits", *how).frames
     assert len(frame.centroids_px) < len(bare.centroids_px)
     distance, _ = cKDTree(frame.centroids_px).query(stars(40, 5)[0])
     assert (distance < 0.5).sum() >= 36
@@ -261,7 +261,9 @@ def test_no_spot_is_found_in_a_dead_zone(tmp_path):
     mask[:, 200:] = 255
     write_image(tmp_path / "image.png", picture(5))
     write_image(tmp_path / "mask.png", mask)
-    [frame] = measure(tmp_path / "image.png", local=LocalInputs(mask=tmp_path / "mask.png")).frames
+    [frame] = measure_picture(
+        tmp_path / "image.png", local=LocalInputs(mask=tmp_path / "mask.png")
+    ).frames
     places, _ = stars(40, 5)
     assert (frame.centroids_px[:, 0] < 201.0).all()
     distance, _ = cKDTree(frame.centroids_px).query(places[places[:, 0] < 195.0])

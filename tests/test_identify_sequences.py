@@ -14,25 +14,25 @@ from slew import slew
 
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.database import open_database
-from starcat.simulation.simulate import Frame, Noise
+from starcat.simulation.simulate import Noise, SimulatedFrame
 
 Run = Callable[[list[Any]], Any]
 
 
 @pytest.fixture(scope="module")
-def frames(small_artifact: Path) -> list[Frame]:
+def frames(small_artifact: Path) -> list[SimulatedFrame]:
     return list(slew(open_database(small_artifact), 12, Noise(0.3), 3, (6,)))
 
 
 @pytest.fixture
-def sequence(frames: list[Frame], tmp_path: Path) -> Path:
+def sequence(frames: list[SimulatedFrame], tmp_path: Path) -> Path:
     path = tmp_path / "slew.json"
     content = [{"centroids_px": frame.centroids_px.tolist()} for frame in frames]
     path.write_text(json.dumps({"frames": content}))
     return path
 
 
-def prior(frame: Frame) -> str:
+def prior(frame: SimulatedFrame) -> str:
     return ",".join(map(str, quaternion_from_matrix(frame.matrix).tolist()))
 
 

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_radec_roll
-from starcat.images.background import SMALLEST_PX, Levels, repair_hot_pixels, subtract_background
+from starcat.images.background import SMALLEST_PX, SkyLevels, repair_hot_pixels, subtract_background
 from starcat.images.centroiding import Spots, brightest_first, detect, find_spots
 from starcat.images.frame_axes import FrameAxes, draw_compass, mark_radii, place_labels, stretch
 from starcat.images.image_file import read_image, write_image
@@ -407,7 +407,7 @@ def test_what_is_no_image_is_refused(image, word):
 def test_where_too_much_stands_out_it_says_what_to_do():
     light = 5.0 + np.random.default_rng(1).exponential(size=(1000, 1000)).astype(np.float32)
     nothing = np.zeros(light.shape, dtype=np.bool_)
-    levels = Levels(light, light, np.full_like(light, 1e-3), nothing)
+    levels = SkyLevels(light, light, np.full_like(light, 1e-3), nothing)
     with pytest.raises(ConfigError, match="too much in it") as caught:
         detect(levels, 1.0, 5.0)
     assert "buffer" not in str(caught.value)

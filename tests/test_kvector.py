@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from starcat.geometry.kvector import build_kvector
 
-MOST_STEPS_BEYOND = 1.0
+MAX_STEPS_BEYOND = 1.0
 """How far beyond an end of the interval ``range`` may reach, in steps of the line."""
 
 
@@ -62,7 +62,7 @@ def test_range_holds_all_and_little_more(case):
     assert set(brute_force(values, low, high)) <= set(found)
     if found and index.slope:
         # The line itself is rounded: half a unit in the last place of the largest value.
-        slack = MOST_STEPS_BEYOND * index.slope + np.spacing(np.abs(values).max())
+        slack = MAX_STEPS_BEYOND * index.slope + np.spacing(np.abs(values).max())
         assert low - values[found[0]] <= slack
         assert values[found[-1]] - high <= slack
 
@@ -75,7 +75,7 @@ def test_range_of_many_values_is_a_few_more_than_asked(power):
     for low in generator.random(200):
         high = low + 0.01
         found = values[index.range(low, high)]
-        wide = MOST_STEPS_BEYOND * index.slope * (1.0 + 1e-9)
+        wide = MAX_STEPS_BEYOND * index.slope * (1.0 + 1e-9)
         assert brute_force(values, low, high) == rows(index.exact(low, high))
         assert len(found) <= len(brute_force(values, low - wide, high + wide))
 

@@ -19,13 +19,13 @@ from starcat.images import centroiding
 from starcat.images.background import subtract_background
 from starcat.images.image_file import write_image
 from starcat.matcher.database import open_database
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.build_spec import CameraSpec
 from starcat_service.problems import Problem
 from starcat_service.sandbox.sandbox import Sandbox
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 RUNS = 10
 DATABASE = "0123456789abcdef"
@@ -39,7 +39,7 @@ def built(tmp_path_factory):
     spec = starter_spec("large", camera).spec.model_dump(mode="json", exclude_defaults=True)
     spec["self_test"] = {"frames": 20}
     given = type(starter_spec("large", camera).spec).model_validate(spec)
-    return build(given, {}, tmp_path_factory.mktemp("large")).folder
+    return build_database(given, {}, tmp_path_factory.mktemp("large")).folder
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def essence(found):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_one_process_answers_alike_every_time(built, photographs, tmp_path):
-    sandbox = Sandbox(Settings(root=tmp_path, query_time_s=120.0, queries=1), tmp_path)
+    sandbox = Sandbox(ServiceSettings(root=tmp_path, query_time_s=120.0, queries=1), tmp_path)
     answers = {name: [] for name in photographs}
     arguments = {"folder": str(tmp_path), "artifact": str(built), "options": {}}
     for name, content in photographs.items():
@@ -114,7 +114,7 @@ def test_memory_that_is_missing_is_not_said_to_be_an_image_with_too_much_in_it(m
 
 
 def test_a_request_that_takes_too_much_memory_says_so(small_artifact, tmp_path):
-    sandbox = Sandbox(Settings(root=tmp_path, query_memory_gib=0.15, queries=1), tmp_path)
+    sandbox = Sandbox(ServiceSettings(root=tmp_path, query_memory_gib=0.15, queries=1), tmp_path)
     write_image(tmp_path / "a.png", np.full((4000, 6000), 20, dtype=np.uint8))
     given = {"folder": str(tmp_path), "artifact": str(small_artifact), "options": {}}
     with pytest.raises(Problem, match=r"memory than it may \(0.15 GiB\).*query_memory_gib") as told:

@@ -368,7 +368,7 @@ PLUG_INS = (
     "starcat.matcher.methods",
     "starcat.products",
     "starcat.selection.rules",
-    "starcat.catalog.hooks",
+    "starcat.catalog.archives",
     "starcat_lab.papers",
 )
 """Folders whose modules define functions of the same names, because one protocol calls them."""

@@ -15,13 +15,13 @@ import pytest
 import starcat as starcat_package
 from starcat.artifact.reader import open_artifact
 from starcat.calibration.answers import Sightings, SkyStars, read_answers
-from starcat.calibration.learn import learn
+from starcat.calibration.learn import learn_from_frames
 from starcat.calibration.lessons import learn_files, observed_toml, sky_stars
 from starcat.errors import BuildError, CalibrationError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.simulation.simulate import Noise
 from starcat.specs.reading import read_spec, spec_from_dict
 
@@ -70,7 +70,7 @@ def answers(flown):
 def test_500_frames_give_back_the_terms_and_every_altered_star_and_no_other(flown, answers):
     stars, altered, _ = flown
     assert (len(answers.names), answers.n_frames) == (500, 500)
-    lesson = learn(answers.sightings, stars, 500)
+    lesson = learn_from_frames(answers.sightings, stars, 500)
     assert lesson.terms.zero_point_mag == pytest.approx(flight.ZERO_POINT, abs=0.02)
     assert lesson.terms.colour_term == pytest.approx(flight.COLOUR_TERM, abs=0.02)
     assert told(lesson.distrusted) == altered
@@ -111,7 +111,7 @@ def unseen(seen, which):
 @pytest.mark.parametrize("seed", range(4))
 def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
     seen, stars = plain(seed)
-    lesson = learn(seen, stars, 100)
+    lesson = learn_from_frames(seen, stars, 100)
     assert lesson.distrusted == ()
     terms = lesson.terms
     assert abs(terms.zero_point_mag - 0.2) < 4.0 * terms.zero_point_error_mag < 0.02
@@ -125,7 +125,7 @@ def test_single_wild_measurements_convict_nobody():
     rows = np.array([np.flatnonzero(seen.star == star)[0] for star in range(0, 800, 20)])
     seen.mag[rows] += 3.0
     seen.offset_arcsec[rows] += 100.0
-    lesson = learn(seen, stars, 100)
+    lesson = learn_from_frames(seen, stars, 100)
     assert lesson.distrusted == ()
     assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.01)
 
@@ -138,7 +138,7 @@ def test_what_all_stars_are_off_by_convicts_nobody():
         mag=seen.mag + own.normal(0.0, 0.2, len(stars))[seen.star],
         offset_arcsec=seen.offset_arcsec + own.normal(0.0, 8.0, (len(stars), 2))[seen.star],
     )
-    lesson = learn(seen, stars, 100)
+    lesson = learn_from_frames(seen, stars, 100)
     assert lesson.distrusted == ()
     assert lesson.mag_noise.of_stars == pytest.approx(0.2, rel=0.15)
     assert lesson.offset_noise.of_stars == pytest.approx(8.0, rel=0.15)
@@ -148,18 +148,18 @@ def test_frames_of_their_own_exposures_need_an_offset_each():
     seen, stars = plain(13)
     offset = np.random.default_rng(13).normal(0.0, 0.7, 100)
     seen = replace(seen, mag=seen.mag + offset[seen.frame])
-    terms = learn(seen, stars, 100, by_frame=True).terms
+    terms = learn_from_frames(seen, stars, 100, by_frame=True).terms
     assert terms.colour_term == pytest.approx(0.3, abs=0.02)
     found = terms.zero_point_mag + terms.frame_offset_mag
     assert np.abs(found - 0.2 - offset).max() < 0.1
     assert terms.zero_point_error_mag > 0.05
-    assert learn(seen, stars, 100).terms.colour_term_error > terms.colour_term_error
+    assert learn_from_frames(seen, stars, 100).terms.colour_term_error > terms.colour_term_error
 
 
 def test_a_limit_neither_bends_the_terms_nor_makes_stars_missing():
     seen, stars = plain(14, per_star=12)
     seen = unseen(seen, seen.mag > 5.5)
-    lesson = learn(seen, stars, 100)
+    lesson = learn_from_frames(seen, stars, 100)
     assert lesson.distrusted == ()
     assert lesson.limit_mag == pytest.approx(5.4, abs=0.2)
     assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.02)
@@ -168,9 +168,9 @@ def test_a_limit_neither_bends_the_terms_nor_makes_stars_missing():
 def test_frames_that_are_half_covered_make_no_star_missing():
     seen, stars = plain(15, per_star=12)
     covered = (seen.frame < 20) & (np.random.default_rng(15).random(len(seen)) < 0.5)
-    assert learn(unseen(seen, covered), stars, 100).distrusted == ()
+    assert learn_from_frames(unseen(seen, covered), stars, 100).distrusted == ()
     gone = seen.star == 33
-    lesson = learn(unseen(seen, covered | gone), stars, 100)
+    lesson = learn_from_frames(unseen(seen, covered | gone), stars, 100)
     assert told(lesson.distrusted) == {33: "missing"}
     assert lesson.records.n_seen[33] == 0
     assert lesson.records.n_missed[33] == lesson.records.n_expected[33] >= 8
@@ -180,12 +180,12 @@ def test_a_double_scatters_in_place():
     seen, stars = plain(16)
     rows = seen.star == 5
     seen.offset_arcsec[rows] *= 8.0
-    assert told(learn(seen, stars, 100).distrusted) == {5: "double"}
+    assert told(learn_from_frames(seen, stars, 100).distrusted) == {5: "double"}
 
 
 def test_without_colours_there_is_a_zero_point_only():
     seen, stars = plain(17)
-    terms = learn(seen, replace(stars, colour=np.full(len(stars), np.nan)), 100).terms
+    terms = learn_from_frames(seen, replace(stars, colour=np.full(len(stars), np.nan)), 100).terms
     assert terms.colour_term is None
     assert terms.zero_point_mag == pytest.approx(0.5, abs=0.03)  # 0.3 times the mean colour more
 
@@ -193,7 +193,7 @@ def test_without_colours_there_is_a_zero_point_only():
 def test_too_few_stars_teach_nothing():
     seen, stars = plain(18, stars=12)
     with pytest.raises(CalibrationError, match="12 stars of 100 identified frames"):
-        learn(seen, stars, 100)
+        learn_from_frames(seen, stars, 100)
 
 
 # Files and commands -------------------------------------------------------------------------
@@ -254,7 +254,7 @@ def test_the_section_is_recorded_only_where_it_is_said(small_spec):
 def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file, tmp_path):
     content = tomllib.loads(small_spec)
     content["selection"]["observed"] = OBSERVED
-    made = build(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
+    made = build_database(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
     rejected = pq.read_table(made.folder / "rejected.parquet", columns=["star_id", "reason"])
     reasons = dict(zip(*rejected.to_pydict().values(), strict=True))
     assert {number for number, why in reasons.items() if why == "distrusted"} == {1, 2}
@@ -271,7 +271,7 @@ def test_a_section_of_another_catalog_is_refused(observed, words, small_spec, sa
     content = tomllib.loads(small_spec)
     content["selection"]["observed"] = observed
     with pytest.raises(BuildError, match=words):
-        build(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
+        build_database(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
 
 
 FLOWN = """\
@@ -302,12 +302,12 @@ def flown_with(folder, seed, path):
 @pytest.mark.timeout(300)
 def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_path):
     (tmp_path / "spec.toml").write_text(FLOWN)
-    first = build(read_spec(tmp_path / "spec.toml"), {}, tmp_path / "dist").folder
+    first = build_database(read_spec(tmp_path / "spec.toml"), {}, tmp_path / "dist").folder
     learnt, altered, numbers = flown_with(first, 2, tmp_path / "answers.ndjson")
     assert told(learnt.lesson.distrusted) == altered
     assert set(learnt.observed.reject) == numbers
     (tmp_path / "patch.toml").write_text(FLOWN.replace("1.0.0", "1.0.1") + observed_toml(learnt))
-    patch = build(read_spec(tmp_path / "patch.toml"), {}, tmp_path / "dist").folder
+    patch = build_database(read_spec(tmp_path / "patch.toml"), {}, tmp_path / "dist").folder
     table = open_artifact(patch).stars
     assert not numbers & set(table["star_id"].to_pylist())
     mag, own, colour = (

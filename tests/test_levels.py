@@ -22,7 +22,7 @@ from starcat.images.render import Optics, render_image
 from starcat.matcher.blind import BEYOND, levels, parts_of_range
 from starcat.matcher.database import ProductArrays
 from starcat.matcher.matcher import Matcher
-from starcat.products.levels import FEWEST_BORESIGHTS, find_levels, level_fields
+from starcat.products.levels import MIN_BORESIGHTS, find_levels, level_fields
 from starcat.products.tiling import NominalField
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -79,7 +79,7 @@ def test_levels_by_brute_force(random_directions):
     known = np.arange(len(u))
     for n, field in enumerate(fields):
         stars, triangles = set(), set()
-        for boresight in saff_kuijlaars(FEWEST_BORESIGHTS):
+        for boresight in saff_kuijlaars(MIN_BORESIGHTS):
             ra, dec = math.atan2(boresight[1], boresight[0]), math.asin(boresight[2])
             east, north = tangent_axes(np.degrees([ra]), np.degrees([dec]))
             along = u[known] @ boresight

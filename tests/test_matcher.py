@@ -32,9 +32,9 @@ from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import REACH, TriangleOrder
-from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify
+from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify_candidates
 from starcat.simulation.selftest import answers_rightly, self_test
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
@@ -45,7 +45,7 @@ IN_MEMORY = ("triangle", "pairs", "pyramid")
 def verified(candidates, seen, database):
     """Return the best agreement of a batch of candidates."""
     best = BestOf(1e-9)
-    verify(candidates, seen, database, best)
+    verify_candidates(candidates, seen, database, best)
     return best.found
 
 
@@ -72,7 +72,7 @@ def triangles(sky) -> Matcher:
     return Matcher(sky, engine="numpy")
 
 
-def observed(frame: Frame, magnitudes: bool = False) -> Observation:
+def observed(frame: SimulatedFrame, magnitudes: bool = False) -> Observation:
     return observe(frame.centroids_px, CAMERA, 2.0, frame.mag if magnitudes else None)
 
 
@@ -187,7 +187,7 @@ def test_magnitudes_of_another_number_are_refused(shape):
 # --- Verification
 
 
-def truth_as_candidate(frame: Frame, seen: Observation, size: int = 3) -> Candidates:
+def truth_as_candidate(frame: SimulatedFrame, seen: Observation, size: int = 3) -> Candidates:
     rows = np.arange(size)[None, :]
     return Candidates(rows, frame.star_index[seen.rows][rows])
 

@@ -18,8 +18,8 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
-from starcat.pipeline.build import build
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
+from starcat.pipeline.build import build_database
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 from starcat.specs.reading import preset
 
 pytestmark = pytest.mark.timeout(600)
@@ -71,7 +71,7 @@ def ground(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         return Ground(request.getfixturevalue("small_artifact"), 60, 0.25, is_whole=False)
     catalogs = request.getfixturevalue("catalogs")
     inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
-    built = build(preset(request.param), inputs, tmp_path_factory.mktemp("sky"))
+    built = build_database(preset(request.param), inputs, tmp_path_factory.mktemp("sky"))
     return Ground(built.folder, 1000, 0.1, is_whole=True)
 
 
@@ -80,7 +80,7 @@ def matcher(ground: Ground) -> Matcher:
     return Matcher.open(ground.artifact)
 
 
-Answered = list[tuple[Frame, MatchResult]]
+Answered = list[tuple[SimulatedFrame, MatchResult]]
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def answers(ground: Ground, matcher: Matcher) -> Callable[[Noise], Answered]:
     return answered
 
 
-def frames(matcher: Matcher, count: int, noise: Noise) -> list[Frame]:
+def frames(matcher: Matcher, count: int, noise: Noise) -> list[SimulatedFrame]:
     database = matcher.database
     u, mag = database.directions, database.mag
     return list(simulate_frames(u, database.camera, count, noise, SEED, mag))
@@ -110,7 +110,7 @@ def error_px(found: MatchResult, truth: np.ndarray, camera: Camera) -> float:
     return float(np.hypot(*(moved - grid).T).max())
 
 
-def is_right(found: MatchResult, frame: Frame, matcher: Matcher) -> bool:
+def is_right(found: MatchResult, frame: SimulatedFrame, matcher: Matcher) -> bool:
     """Return whether attitude and names are right.
 
     A false spot may carry the name of a star if that star's place is there.
@@ -123,12 +123,16 @@ def is_right(found: MatchResult, frame: Frame, matcher: Matcher) -> bool:
     return bool((np.hypot(*(place - frame.centroids_px[other]).T) <= RIGHT_PX + REACH_PX).all())
 
 
-def wrong(answered: Iterable[tuple[Frame, MatchResult]], matcher: Matcher) -> list[MatchResult]:
+def wrong(
+    answered: Iterable[tuple[SimulatedFrame, MatchResult]], matcher: Matcher
+) -> list[MatchResult]:
     given = ((frame, found) for frame, found in answered if found.status == "identified")
     return [found for frame, found in given if not is_right(found, frame, matcher)]
 
 
-def named(frame: Frame, found: MatchResult, matcher: Matcher) -> tuple[np.ndarray, np.ndarray]:
+def named(
+    frame: SimulatedFrame, found: MatchResult, matcher: Matcher
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions of the centroids with a star, and of their stars."""
     has_star = found.star_index >= 0
     body = matcher.database.camera.directions_from_pixels(frame.centroids_px[has_star])
@@ -172,7 +176,7 @@ def test_no_answer_is_wrong_where_stars_crowd(ground):
 
 def around(
     matcher: Matcher, ra_deg: float, dec_deg: float, count: int, noise: Noise
-) -> Iterable[Frame]:
+) -> Iterable[SimulatedFrame]:
     """Simulate frames that hold a place of the sky."""
     database, generator = matcher.database, np.random.default_rng(SEED)
     rows = np.arange(len(database.mag), dtype=np.int32)
@@ -186,7 +190,7 @@ def around(
 # --- Attitude
 
 
-def rotation_error(frame: Frame, found: MatchResult) -> np.ndarray:
+def rotation_error(frame: SimulatedFrame, found: MatchResult) -> np.ndarray:
     """Return the small angles about x, y and z between the truth and an answer, radians."""
     turn = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
     return 0.5 * np.array(

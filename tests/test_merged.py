@@ -15,7 +15,7 @@ from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.errors import ConfigError
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.reading import merged_catalog, read_all
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch
@@ -138,7 +138,7 @@ def spec_of(catalog: dict[str, object]) -> object:
 def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
     spec = spec_of({"source": "bright", "merged": ["deep"]})
     inputs = {name: [path] for name, path in sky.items()}
-    built = build(spec, inputs, tmp_path)
+    built = build_database(spec, inputs, tmp_path)
     check_artifact(built.folder)
     facts = {one["source"]: one for one in built.manifest["sources"]}
     assert [one["role"] for one in facts.values()] == ["stars", "stars"]

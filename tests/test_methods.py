@@ -18,7 +18,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.simulation.selftest import answers_rightly
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 IN_C = {f"{name} in C": name for name in FEATURES}
 
@@ -59,7 +59,9 @@ def hasty(matcher: Matcher) -> Matcher:
     return matcher if matcher.engine == "c" else replace(matcher, max_steps=3000)
 
 
-def frames(matcher: Matcher, count: int, noise: Noise | None = None, seed: int = 3) -> list[Frame]:
+def frames(
+    matcher: Matcher, count: int, noise: Noise | None = None, seed: int = 3
+) -> list[SimulatedFrame]:
     """Frames that the method is made for: for S1's baseline, upright ones about a star."""
     noise, sky = noise or Noise(), matcher.database
     if matcher.method != "hausdorff_l1":
@@ -73,7 +75,7 @@ def frames(matcher: Matcher, count: int, noise: Noise | None = None, seed: int =
         rows = np.append(rows[kept], np.full(noise.false_stars, -1))
         inside = sky.camera.contains(px)
         mag = sky.mag[rows[inside]]
-        found.append(Frame(matrix, px[inside], rows[inside], mag, rows[inside] < 0))
+        found.append(SimulatedFrame(matrix, px[inside], rows[inside], mag, rows[inside] < 0))
     return found
 
 

@@ -25,12 +25,12 @@ from drafts import merged
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.supply import guide_star_motions, supply_motions
@@ -94,11 +94,11 @@ def sky(inputs: dict[str, list[Path]]) -> Ingested:
 
 @pytest.fixture(scope="module")
 def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
-    return build(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
+    return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
 
 
 @pytest.fixture(scope="module")
-def artifact(built: Built) -> Artifact:
+def artifact(built: Built) -> DatabaseFolder:
     return open_artifact(built.folder)
 
 
@@ -129,7 +129,7 @@ def at(stars: SkyCoord, epoch_jyear: float) -> SkyCoord:
     return stars.apply_space_motion(new_obstime=Time(epoch_jyear, format="jyear"))
 
 
-def joined(artifact: Artifact) -> tuple[pa.Table, pa.Table]:
+def joined(artifact: DatabaseFolder) -> tuple[pa.Table, pa.Table]:
     """The guide stars that have a motion of another catalog, and what is said of each."""
     table, stars = artifact.table("motions"), artifact.table("stars")
     chosen = pc.equal(table["outcome"], "joined")

@@ -11,7 +11,7 @@ import json
 import numpy as np
 import pytest
 
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import CameraSpec
 
@@ -23,7 +23,7 @@ def database(tmp_path_factory):
     spec = starter_spec("imx219", camera).spec
     short = spec.self_test.model_copy(update={"frames": 5})
     spec = spec.model_copy(update={"self_test": short})
-    return build(spec, {}, tmp_path_factory.mktemp("nights")).folder
+    return build_database(spec, {}, tmp_path_factory.mktemp("nights")).folder
 
 
 def answers(starcat, database, paths):

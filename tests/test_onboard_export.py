@@ -20,7 +20,7 @@ from starcat.onboard import flight_limits
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import DIRECTION_SCALE
-from starcat.onboard.reading import read_image
+from starcat.onboard.reading import read_onboard_image
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_an_exported_image_is_the_artifacts_and_is_found_sound(
     ran = starcat([*command, "--json"])
     assert ran.code == 0, ran.err
     said = json.loads(ran.out)
-    image = read_image(path)
+    image = read_onboard_image(path)
     assert said["files"] == [str(path)]
     assert said["image_bytes"] == path.stat().st_size
     assert (said["stars"], said["features"]) == (len(image.star_id), len(image.features))
@@ -65,11 +65,11 @@ def test_the_matcher_can_make_the_same_image_from_its_database(small_artifact, p
             mag=database.mag,
             method="triangle",
             features=np.stack(rows, axis=-1),
-            manifest_sha256=bytes.fromhex(read_image(path).manifest_sha256),
+            manifest_sha256=bytes.fromhex(read_onboard_image(path).manifest_sha256),
         )
     )
     assert made.data == path.read_bytes()
-    assert (database.star_id[made.star_rows] == read_image(path).star_id).all()
+    assert (database.star_id[made.star_rows] == read_onboard_image(path).star_id).all()
 
 
 def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
@@ -86,7 +86,7 @@ def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
     assert (refused.code, path.read_bytes()) == (1, first)
     assert "already exists and differs" in refused.err
     assert starcat([*command, "--endian", "big", "--replace"]).code == 0
-    assert read_image(path).byte_order == "big"
+    assert read_onboard_image(path).byte_order == "big"
     assert [path.name for path in tmp_path.iterdir()] == ["small-1.0.0.img"]
     big = starcat(["verify", path, "--against", small_artifact])
     assert big.code == 0, big.out
@@ -108,7 +108,7 @@ def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_pat
 
 
 def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
-    image, ran = read_image(path), starcat(["inspect", path])
+    image, ran = read_onboard_image(path), starcat(["inspect", path])
     assert ran.code == 0
     assert max(map(len, ran.out.splitlines())) <= 100
     for text in (
@@ -188,7 +188,7 @@ def test_a_field_that_the_library_has_no_room_for_is_told_of(
 ):
     command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
     assert starcat(command).err == ""
-    near = read_image(tmp_path / "db.img").header["most_near"]
+    near = read_onboard_image(tmp_path / "db.img").header["most_near"]
     monkeypatch.setattr(flight_limits, "FLIGHT_STARS", near - 1)
     assert f"-DSTARCAT_MAX_STARS={near}" in starcat(command).err
     monkeypatch.setattr(exchange, "FLIGHT_CENTROIDS", near - 1)

@@ -18,7 +18,7 @@ from starcat.geometry.sphere import separation
 from starcat.onboard import layout
 from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
-from starcat.onboard.grid import Grid, grid_for, most_near
+from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
 from starcat.onboard.layout import (
     BYTE_ORDERS,
@@ -30,8 +30,8 @@ from starcat.onboard.layout import (
     in_order,
     scrub,
 )
-from starcat.onboard.reading import read_image
-from starcat.onboard.shrink import LEAST_SHARE, shrink
+from starcat.onboard.reading import read_onboard_image
+from starcat.onboard.shrink import MIN_SHARE, shrink
 from starcat.products.pairs import find_pairs
 from starcat.products.tiling import tile_sphere
 from starcat.products.triangles import find_triangles
@@ -86,7 +86,7 @@ def real() -> tuple[Contents, np.ndarray]:
 def test_any_sky_reads_back(count, seed, method, byte_order, n_features):
     contents = sky(count, seed, method, n_features)
     made = make_image(contents, byte_order)
-    image = read_image(made.data)
+    image = read_onboard_image(made.data)
     assert (image.byte_order, image.method, image.name) == (byte_order, method, "sky-1.0.0")
     assert image.header["epoch_jyear"] == 2026.5
     assert image.camera == CAMERA
@@ -119,7 +119,7 @@ def test_the_same_contents_give_the_same_bytes_in_any_order_of_features():
 def test_equal_values_go_by_rows():
     contents = sky(12, 1, n_features=0)
     pair = np.array([[4, 6], [5, 6], [4, 7], [5, 7]])  # 4 and 5 are at the same place
-    image = read_image(make_image(replace(contents, method="pyramid", features=pair)).data)
+    image = read_onboard_image(make_image(replace(contents, method="pyramid", features=pair)).data)
     u = image.directions[image.features]
     apart = separation(u[:, 0], u[:, 1])
     for a, b in zip(range(len(apart)), range(1, len(apart)), strict=False):
@@ -129,7 +129,7 @@ def test_equal_values_go_by_rows():
 def test_more_stars_than_two_bytes_can_count():
     count = 65_538
     contents = replace(sky(count, 8, n_features=0), features=np.arange(count).reshape(-1, 3))
-    image = read_image(make_image(contents, "big").data)
+    image = read_onboard_image(make_image(contents, "big").data)
     assert image.header["index_bytes"] == 4
     assert image.sections["triangles"].dtype == np.dtype(">u4")
     assert image.features.max() == 65_537
@@ -142,7 +142,7 @@ def test_a_name_that_is_too_long_is_refused():
         ConfigError, match="has 97 bytes; an onboard image has room for names of 96"
     ):
         make_image(contents)
-    assert read_image(make_image(replace(contents, name="a" * 90 + "-1.0.0")).data).name
+    assert read_onboard_image(make_image(replace(contents, name="a" * 90 + "-1.0.0")).data).name
 
 
 def test_an_image_of_four_gigabytes_is_refused(monkeypatch):
@@ -164,7 +164,7 @@ def test_any_flipped_bit_is_found_and_its_block_named(real):
         damaged[at] ^= 1 << int(generator.integers(8))
         assert scrub(bytes(damaged)) == [at // 4096], at
     with pytest.raises(OnboardImageError, match=r"damaged in 1 of \d+ blocks of 4096 bytes: \d+;"):
-        read_image(bytes(damaged))
+        read_onboard_image(bytes(damaged))
 
 
 @pytest.mark.parametrize("blocks", [1, 1022, 1023, 2045])
@@ -216,15 +216,15 @@ def sealed(image: bytes, name: str, value: int | float) -> bytes:
 def test_numbers_that_contradict_each_other_are_refused(name, value, words):
     image = make_image(sky(30, 1)).data
     with pytest.raises(OnboardImageError, match=words) as refused:
-        read_image(sealed(image, name, value))
+        read_onboard_image(sealed(image, name, value))
     assert "export it again" in str(refused.value)
 
 
 def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
     image = make_image(sky(30, 1)).data
     with pytest.raises(SchemaVersionError, match=r"format 2\.0; this starcat reads 1\.x"):
-        read_image(sealed(image, "version_major", 2))
-    assert read_image(sealed(image, "version_minor", 7)).version == "1.7"
+        read_onboard_image(sealed(image, "version_major", 2))
+    assert read_onboard_image(sealed(image, "version_minor", 7)).version == "1.7"
 
 
 @pytest.mark.parametrize(
@@ -240,12 +240,12 @@ def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
 )
 def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
     with pytest.raises(OnboardImageError, match=words):
-        read_image(data)
+        read_onboard_image(data)
 
 
 def place_of(image: bytes, section: str) -> int:
     """Return where a section begins."""
-    read = read_image(image)
+    read = read_onboard_image(image)
     contents = Sizes(
         read.method,
         int(read.header["n_stars"]),
@@ -270,7 +270,7 @@ def test_rows_and_orders_that_cannot_be_are_refused(section, at, words):
     image[place_of(bytes(image), section) + at] ^= 0x7F
     data = bytes(image[: data_blocks(len(image)) * 4096])
     with pytest.raises(OnboardImageError, match=words):
-        read_image(data + check_blocks(data, "little"))
+        read_onboard_image(data + check_blocks(data, "little"))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["triangle", "pyramid"]), st.integers(1, 8))
@@ -283,7 +283,7 @@ def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, cha
         end = 512 if generator.integers(2) else len(data)
         data[generator.integers(8, end)] = generator.choice([0, 1, 2, 127, 128, 255])
     try:
-        image = read_image(bytes(data) + check_blocks(bytes(data), "little"))
+        image = read_onboard_image(bytes(data) + check_blocks(bytes(data), "little"))
     except (OnboardImageError, SchemaVersionError):
         return
     found = [*value_problems(image), *capacity_problems(image)]
@@ -300,7 +300,7 @@ def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, cha
 )
 def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, words):
     image = make_image(real[0]).data
-    read, place = read_image(image), place_of(image, section)
+    read, place = read_onboard_image(image), place_of(image, section)
     array = read.sections[section].copy()
     if mask is None:
         array[1:-1] = array[2:]  # still ascends, and says too much of every step
@@ -308,23 +308,23 @@ def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, w
         array[len(array) // 2] ^= mask
     data = image[:place] + array.tobytes() + image[place + array.nbytes :]
     data = data[: data_blocks(len(data)) * 4096]
-    changed = read_image(data + check_blocks(data, "little"))
+    changed = read_onboard_image(data + check_blocks(data, "little"))
     assert [problem for problem in value_problems(changed) if words in problem]
 
 
 def test_a_header_that_says_too_little_is_found(real):
     image = make_image(real[0]).data
-    steep = read_image(sealed(image, "kvector_slope", 1e308))
+    steep = read_onboard_image(sealed(image, "kvector_slope", 1e308))
     assert next(value_problems(steep)).startswith("section kvector: not the numbers of values")
-    near = read_image(sealed(image, "most_near", 3))
+    near = read_onboard_image(sealed(image, "most_near", 3))
     assert next(capacity_problems(near)).startswith("most_near is 3; ")
-    short = read_image(sealed(image, "longest_rad", 0.01))
+    short = read_onboard_image(sealed(image, "longest_rad", 0.01))
     assert next(value_problems(short)).startswith("longest_rad is 0.01; a side has 0.")
 
 
 def test_an_image_of_another_artifact_is_found(real):
     contents = real[0]
-    image = read_image(make_image(contents).data)
+    image = read_onboard_image(make_image(contents).data)
     assert not [*artifact_problems(image, contents)]
 
     def said(**changes: object) -> str:
@@ -344,12 +344,12 @@ def test_an_image_of_another_artifact_is_found(real):
 
 
 def test_the_grid_covers_the_sky_and_knows_its_corners():
-    grid = Grid(4, 8)
+    grid = CellGrid(4, 8)
     u = np.array([[0, 0, -1.0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     assert grid.cells(u).tolist() == [0, 24, 16, 18, 20, 22]
     almost = np.array([[1.0, -1e-12, 0.0], [1.0, -1e-300, 0.0]])
     assert grid.cells(almost).tolist() == [23, 23]
-    assert grid_for(0, 0.1) == Grid(1, 2)
+    assert grid_for(0, 0.1) == CellGrid(1, 2)
     assert grid_for(10**9, 1e-6).n_cells <= 2**20
 
 
@@ -403,7 +403,7 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
     made = make_image(fitted.contents)
     assert len(made.data) <= limit
     assert len(made.data) > limit - 8192
-    image = read_image(made.data)
+    image = read_onboard_image(made.data)
     assert (image.header["n_stars"], image.header["n_features"]) == (fitted.stars, fitted.features)
     assert not list(artifact_problems(image, contents))
     assert fitted.stars_before == 1500
@@ -414,7 +414,7 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
         kept = {tuple(row) for row in fitted.contents.features.tolist()}
         left = np.array([tuple(row) in kept for row in contents.features.tolist()])
         assert seen[~left].max(initial=0) <= seen[left].min()
-        assert seen[left].sum() >= LEAST_SHARE[method] * seen.sum()
+        assert seen[left].sum() >= MIN_SHARE[method] * seen.sum()
     if share <= 0.25:
         assert fitted.stars < 1500
     if fitted.stars < 1500:

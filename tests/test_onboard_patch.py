@@ -17,14 +17,14 @@ from starcat.errors import ConfigError, OnboardImageError
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import BYTE_ORDERS
 from starcat.onboard.patching import HEADER, apply_patch, make_patch
-from starcat.onboard.reading import OnboardImage, read_image
+from starcat.onboard.reading import OnboardImage, read_onboard_image
 from tests.test_onboard_image import sky
 
 ONBOARD = Path(__file__).parent.parent / "onboard"
 
 
 def image_of(contents: Contents, byte_order: str = "little") -> OnboardImage:
-    return read_image(make_image(contents, byte_order).data)
+    return read_onboard_image(make_image(contents, byte_order).data)
 
 
 def without(contents: Contents, stars: list[int]) -> Contents:
@@ -95,7 +95,7 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
     patch = (tmp_path / "new.patch").read_bytes()
     assert said["patch_bytes"] == len(patch)
     assert said["files"] == [str(paths[1]), str(tmp_path / "new.patch")]
-    assert said["crc"] == read_image(paths[1]).crc
+    assert said["crc"] == read_onboard_image(paths[1]).crc
     assert apply_patch(paths[0].read_bytes(), patch) == paths[1].read_bytes()
     command = ["export", small_artifact, "--to", "c", "-o", tmp_path / "a.c"]
     ran = starcat([*command, "--patch-from", paths[0]])

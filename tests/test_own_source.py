@@ -18,7 +18,7 @@ from astropy.table import Table
 from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 
 from starcat.catalog.archives.mapped import identity
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers import tables
 from starcat.catalog.source import (
     data_source,
@@ -34,7 +34,7 @@ from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
 from starcat.errors import ConfigError, SourceError
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
 from starcat.resources import resource_folder
 from starcat.specs.reading import preset
@@ -340,7 +340,7 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(
 ):
     """From a file and from a store made of it: the same database, and again from the manifest."""
     monkeypatch.chdir(tmp_path)
-    stars = ingest("gaia", locate("gaia", {}), read_limit_mag=6.2, neighbours=False).stars
+    stars = ingest_catalog("gaia", locate("gaia", {}), read_limit_mag=6.2, neighbours=False).stars
     table = stars.select(["star_id", "designation", "ra_deg", "dec_deg", "mag"])
     pq.write_table(table.rename_columns(["no", "who", "alpha", "delta", "g"]), "bright.parquet")
     Path("bright.toml").write_text(
@@ -350,9 +350,9 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(
     changes = {"selection.faint_limit_mag": "5.5", "catalog.source": "bright", "name": "own"}
     spec = preset("gaia-12deg", changes)
     give_map(Path("bright.toml"))
-    built = build(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
+    built = build_database(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
     ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
-    again = build(spec, {"bright": [Path("store")]}, Path("again"))
+    again = build_database(spec, {"bright": [Path("store")]}, Path("again"))
     assert built.manifest["manifest_version"] == "1.0.0"
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)

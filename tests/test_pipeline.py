@@ -21,7 +21,7 @@ import pytest
 
 from starcat.artifact.verify import check_artifact
 from starcat.errors import BuildError, OutputError, ProductError, StarcatError
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import move_into_place
 
@@ -47,7 +47,7 @@ def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., B
 
     def run(output: Path = tmp_path / "dist", *, replace: bool = False, **changes: Any) -> Built:
         spec = spec_from_dict({**tomllib.loads(small_spec), **changes}, "small.toml")
-        return build(spec, {"sao": [stars]}, output, replace=replace)
+        return build_database(spec, {"sao": [stars]}, output, replace=replace)
 
     return run
 
@@ -80,7 +80,7 @@ def first(tmp_path_factory, sao_lines, small_spec):
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     events: list[Event] = []
     spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
-    built = build(
+    built = build_database(
         spec, {"sao": [folder / "sao.dat"]}, folder / "dist",
         progress=lambda *event: events.append(event),
     )  # fmt: skip
@@ -292,7 +292,7 @@ def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> 
     before = signal.signal(signal.SIGTERM, end_on)
     try:
         with pytest.raises(SystemExit) as stop:
-            build(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)
+            build_database(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert stop.value.code == 128 + signal.SIGTERM

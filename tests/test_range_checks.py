@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.catalog.ingest import Ingested, ingest, write_star_tables
+from starcat.catalog.ingest import Ingested, ingest_catalog, write_star_tables
 from starcat.catalog.parts import RANGES, check_ranges
-from starcat.catalog.source import Column, data_source
+from starcat.catalog.source import SourceColumn, data_source
 from starcat.stars.verdict import Verdicts
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
@@ -36,7 +36,7 @@ def read(tmp_path: Path) -> Read:
         records = archive_records(source, sky)[layout_name]
         path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
         path.write_bytes(file_header(layout, 41) + b"".join([*records, record(layout, fields)]))
-        return ingest(source, [path])
+        return ingest_catalog(source, [path])
 
     return run
 
@@ -163,15 +163,15 @@ def test_the_ends_of_ranges(name):
 
 
 def test_ranges_follow_limits_then_digits_then_units():
-    assert Column(name="a", format="I3", unit="h").range == (-999.0, 999.0)
-    assert Column(name="a", format="I3", limits=(1, 7)).range == (1.0, 7.0)
-    assert Column(name="a", format="F5.2", unit="h").range == (0.0, 24.0)
-    assert Column(name="a", format="F5.2", unit="deg").range is None
+    assert SourceColumn(name="a", format="I3", unit="h").range == (-999.0, 999.0)
+    assert SourceColumn(name="a", format="I3", limits=(1, 7)).range == (1.0, 7.0)
+    assert SourceColumn(name="a", format="F5.2", unit="h").range == (0.0, 24.0)
+    assert SourceColumn(name="a", format="F5.2", unit="deg").range is None
 
 
 def test_limits_swapped_are_refused():
     with pytest.raises(ValueError, match=r"limits \(7.0, 1.0\) are not least <= greatest"):
-        Column(name="a", format="I3", limits=(7, 1))
+        SourceColumn(name="a", format="I3", limits=(7, 1))
 
 
 def test_progress_counts_bytes_within_a_file(tmp_path):
@@ -180,7 +180,7 @@ def test_progress_counts_bytes_within_a_file(tmp_path):
     path = tmp_path / "sao.dat"
     path.write_bytes(b"".join(lines))
     events: list[tuple[str, int, int | None]] = []
-    ingest("sao", [path], neighbours=False, progress=lambda *event: events.append(event))
+    ingest_catalog("sao", [path], neighbours=False, progress=lambda *event: events.append(event))
     done = [event[1] for event in events]
     size = path.stat().st_size
     assert {(stage, total) for stage, _, total in events} == {("read sao", size)}

@@ -15,8 +15,8 @@ from starcat.catalog.readers.blocks import open_input
 from starcat.catalog.source import read_source
 from starcat.errors import FileMissing, SourceError, StarcatError
 from starcat.images.image_file import read_image as read_picture
-from starcat.matcher.centroids import read_frames
-from starcat.onboard.reading import read_image
+from starcat.matcher.centroids import read_centroid_files
+from starcat.onboard.reading import read_onboard_image
 from starcat.releases.lockfile import read_pins
 from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import read_spec
@@ -52,8 +52,8 @@ READERS: tuple[Callable[[Path], object], ...] = (
     read_spec,
     read_camera,
     read_source,
-    read_frames,
-    read_image,
+    read_centroid_files,
+    read_onboard_image,
     read_picture,
     read_pins,
     open_input,

@@ -57,10 +57,10 @@ from starcat.releases.tree import (
     Blob,
     Listed,
     choose,
-    files_of,
     index_bytes,
     parse_wanted,
-    read_index,
+    read_registry_index,
+    tree_files,
 )
 from starcat.storage.atomic import replace_file
 from starcat.storage.download import DownloadOptions
@@ -187,7 +187,7 @@ triples = st.tuples(*[st.integers(0, 10**17)] * 3)
 @given(st.lists(triples, min_size=1, unique=True))
 def test_latest_is_the_highest_version(versions):
     texts = [".".join(map(str, version)) for version in versions]
-    releases = read_index(index_bytes(listed(text) for text in texts), "")
+    releases = read_registry_index(index_bytes(listed(text) for text in texts), "")
     assert [r.version for r in releases] == [".".join(map(str, v)) for v in sorted(versions)]
     assert choose(releases, "small", None, "").version == ".".join(map(str, max(versions)))
 
@@ -572,7 +572,7 @@ def test_file_names_that_lead_out(registry, name):
 def test_whatever_the_name_it_stays_inside(name):
     facts = {"sha256": "0" * 64, "bytes": 0}
     try:
-        (found,) = files_of({"files": {name: facts}}, "x")
+        (found,) = tree_files({"files": {name: facts}}, "x")
     except ProductError:
         return
     path = Path(os.path.normpath(Path("/inside") / found))

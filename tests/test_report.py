@@ -20,14 +20,14 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.cli.artifacts import histogram_rows
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
 from starcat.products.evenness import Evenness
-from starcat.report.coverage_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
+from starcat.report.coverage_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project_sky
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes, report_coverage
@@ -64,13 +64,15 @@ def spec() -> BuildSpec:
 
 
 @pytest.fixture(scope="module")
-def artifact(spec: BuildSpec, catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+def artifact(
+    spec: BuildSpec, catalogs: Path, tmp_path_factory: pytest.TempPathFactory
+) -> DatabaseFolder:
     folder = tmp_path_factory.mktemp("report")
-    return open_artifact(build(spec, {"sao": [catalogs / "sao.dat.gz"]}, folder).folder)
+    return open_artifact(build_database(spec, {"sao": [catalogs / "sao.dat.gz"]}, folder).folder)
 
 
 @pytest.fixture(scope="module")
-def report(artifact: Artifact) -> dict[str, Any]:
+def report(artifact: DatabaseFolder) -> dict[str, Any]:
     content = json.loads((artifact.folder / "report" / "report.json").read_bytes())
     assert isinstance(content, dict)
     return content
@@ -226,7 +228,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def page(artifact: Artifact) -> Page:
+def page(artifact: DatabaseFolder) -> Page:
     page = Page()
     page.feed((artifact.folder / "report" / "index.html").read_text(encoding="utf-8"))
     page.close()
@@ -329,14 +331,14 @@ def test_the_raster_is_where_the_projection_says():
     generator = np.random.default_rng(3)
     ra_deg, dec_deg = generator.uniform(0.0, 360.0, 50), generator.uniform(-85.0, 85.0, 50)
     raster = nearest_raster(directions_from_radec(ra_deg, dec_deg), np.arange(50), 1200)
-    x, y = project(ra_deg, dec_deg)
+    x, y = project_sky(ra_deg, dec_deg)
     column = np.floor((x / HALF_WIDTH + 1.0) * 600).astype(int)
     row = np.floor((1.0 - y / HALF_HEIGHT) * 300).astype(int)
     assert np.array_equal(raster[row, column], np.arange(50))
 
 
 def test_the_poles_have_a_place_on_the_map():
-    x, y = project([0.0, 123.0], [90.0, -90.0])
+    x, y = project_sky([0.0, 123.0], [90.0, -90.0])
     assert np.allclose(x, 0.0, atol=1e-4)
     assert np.allclose(y, [HALF_HEIGHT, -HALF_HEIGHT])
 

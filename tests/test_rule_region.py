@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 from mocpy import MOC
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError
 from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.specs.reading import read_spec, spec_from_dict
@@ -24,7 +24,7 @@ CELLS = "0/1 1/20-22"
 def stars(sao_lines: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     path: Path = tmp_path_factory.mktemp("sao") / "sao.dat"
     path.write_bytes(b"".join(sao_lines))
-    return ingest("sao", [path]).stars
+    return ingest_catalog("sao", [path]).stars
 
 
 def selected(text: str, stars: pa.Table, **region: Any) -> Selected:

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import BuildError, ConfigError
 from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.specs.reading import spec_from_dict
@@ -23,7 +23,7 @@ FITS_WELL = {"name": "good-fit", "expression": "ruwe < 1.4", "description": "sin
 def stars(sao_lines: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     path: Path = tmp_path_factory.mktemp("sao") / "sao.dat"
     path.write_bytes(b"".join(sao_lines))
-    table = ingest("sao", [path]).stars
+    table = ingest_catalog("sao", [path]).stars
     ruwe = np.where(np.arange(len(table)) % 3 == 0, 2.0, 1.0)
     unknown = np.arange(len(table)) % 5 == 0
     return with_columns(table, {"ruwe": pa.array(ruwe, mask=unknown)})

@@ -15,7 +15,7 @@ import pytest
 from starcat.exchange.onboard import export_image, verify_image
 from starcat.matcher.c_engine import is_compiled
 from starcat.onboard.layout import check_blocks
-from starcat.onboard.reading import read_image
+from starcat.onboard.reading import read_onboard_image
 from starcat.onboard.signature import MAX_ADDED_BYTES
 from starcat.storage.keys import new_key
 
@@ -67,7 +67,7 @@ def test_openssl_finds_the_signature_good(endian, order, keys, small_artifact, t
 def test_a_signed_image_is_the_unsigned_one_with_a_section_more(signed, small_artifact, tmp_path):
     plain = tmp_path / "plain.img"
     export_image(small_artifact, "onboard", plain)
-    one, other = read_image(plain), read_image(signed)
+    one, other = read_onboard_image(plain), read_onboard_image(signed)
     assert (one.version, other.version) == ("1.0", "1.1")
     assert len(other.data) - len(one.data) in range(MAX_ADDED_BYTES + 1)
     assert one.manifest_sha256 == other.manifest_sha256
@@ -84,7 +84,7 @@ def test_the_library_that_flies_opens_a_signed_image(signed):
     words = np.frombuffer(data, dtype=np.uint64).copy()
     image = ffi.new("starcat_image *")
     assert lib.starcat_open_image(image, ffi.from_buffer(words), len(data), 0) == lib.STARCAT_OK
-    assert image.n_stars == len(read_image(signed).star_id)
+    assert image.n_stars == len(read_onboard_image(signed).star_id)
 
 
 def test_inspect_and_verify_say_who_signed(signed, keys, starcat):

@@ -47,7 +47,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
-from starcat.sky.observer import AU_KM, LIGHT_KM_S, Observer, aberrated, numbers_of
+from starcat.sky.observer import AU_KM, LIGHT_KM_S, Observer, aberrated, observer_numbers
 from starcat.sky.spots import identify_in_time, planets_among
 
 Array = NDArray[np.float64]
@@ -180,8 +180,8 @@ def test_what_is_no_time_or_no_state_is_refused(options, word):
 @pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "1 2 3"])
 def test_what_are_no_numbers_is_refused(text):
     with pytest.raises(ConfigError, match="3 numbers with commas"):
-        numbers_of("--velocity", text, 3)
-    assert numbers_of("--velocity", " 1.5, -7e0,0", 3) == [1.5, -7.0, 0.0]
+        observer_numbers("--velocity", text, 3)
+    assert observer_numbers("--velocity", " 1.5, -7e0,0", 3) == [1.5, -7.0, 0.0]
 
 
 # --- planets ----------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import separation
 from starcat.images.frame_axes import FrameAxes
 from starcat.images.overlay import Overlay, draw_overlay, overlay_from_attitude
-from starcat.images.picture import draw_identified, short_name
+from starcat.images.picture import draw_identified, picture_name
 from starcat.sky.in_time import BodyInFrame
 from starcat.sky.names import common_names, constellation_lines, named_stars
 
@@ -68,7 +68,7 @@ def test_letters_stand_where_there_is_no_name_and_numbers_where_there_is_no_lett
     assert named_stars().label_of("HIP 19") == "HIP 19"
     for other in ("HIP 118999", "SAO 308", "HIP", "HIP x", "", "Gaia DR3 27989"):
         assert named_stars().label_of(other) is None
-    assert short_name("") == ""
+    assert picture_name("") == ""
 
 
 def test_letters_are_in_the_constellation_that_they_name():

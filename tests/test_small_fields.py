@@ -15,7 +15,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import dynamic_angle
 from starcat.matcher.methods.dynamic_angle import bases
 from starcat.matcher.settings import Budget, BudgetSpentError
-from starcat.simulation.simulate import Frame
+from starcat.simulation.simulate import SimulatedFrame
 
 MIN_SHARE = 0.01
 """Four stars of fifteen are less than a third of a frame; that is not what is tried here."""
@@ -26,7 +26,7 @@ def sky(random_directions):
     return database(random_directions(2500, 1))
 
 
-def sparse(frame: Frame, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sparse(frame: SimulatedFrame, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return centroids and stars of a frame that keeps four stars and has five false ones."""
     kept = generator.choice(len(frame.star_index), 4, replace=False)
     false = generator.uniform(0.0, 1024.0, (5, 2))
@@ -87,7 +87,7 @@ def test_a_sky_without_neighbours_has_no_base():
 def test_the_search_has_an_end_and_a_budget(sky, monkeypatch):
     frame = frames(sky, 1)[0]
     whole = sum(len(batch) for batch in bases(observe(frame.centroids_px, CAMERA, 2.0), sky))
-    monkeypatch.setattr(dynamic_angle, "MOST_PLACES", 20_000)
+    monkeypatch.setattr(dynamic_angle, "MAX_PLACES", 20_000)
     assert 0 < sum(len(b) for b in bases(observe(frame.centroids_px, CAMERA, 2.0), sky)) < whole
     limited = observe(frame.centroids_px, CAMERA, 2.0, budget=Budget(max_steps=100))
     with pytest.raises(BudgetSpentError):

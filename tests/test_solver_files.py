@@ -173,7 +173,7 @@ class TestLost:
         assert counts[-1] == pairs
 
     def test_more_stars_than_its_numbers_reach_are_refused(self, sky, tmp_path, monkeypatch):
-        monkeypatch.setattr(lost, "MOST_STARS", len(sky.mag) - 1)
+        monkeypatch.setattr(lost, "MAX_STARS", len(sky.mag) - 1)
         with pytest.raises(ConfigError, match=r"brighter selection\.faint_limit_mag"):
             lost.write_lost(sky, tmp_path / "db.dat")
 
@@ -284,11 +284,11 @@ def test_plate_solvers_solve_pictures_with_it(program, tmp_path, excerpts):
     """Four rendered fields of 6 deg, nothing known but their size."""
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not installed")
-    from starcat.pipeline.build import build
+    from starcat.pipeline.build import build_database
     from starcat.specs.reading import preset
 
     spec = preset("sao-12deg", {"camera.fov_x_deg": 6.0, "selection.faint_limit_mag": 6.9})
-    folder = build(spec, {"sao": [excerpts]}, tmp_path).folder
+    folder = build_database(spec, {"sao": [excerpts]}, tmp_path).folder
     solver = {"solve-field": "astrometry-net", "astap_cli": "astap"}[program]
     made = export_solver(folder, solver, tmp_path / "solver")
     known = open_database(folder)

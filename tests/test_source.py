@@ -15,11 +15,11 @@ import pytest
 
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_fixed_width
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source import (
-    Column,
     DataSource,
     RecordFile,
+    SourceColumn,
     data_source,
     read_source,
     source_names,
@@ -83,7 +83,7 @@ def layout_of(source: str, name: str) -> RecordFile:
     return next(file for file in data_source(source).files if file.name == name)
 
 
-def span(column: Column) -> range:
+def span(column: SourceColumn) -> range:
     assert column.bytes is not None
     return range(column.bytes[0], column.bytes[1] + 1)
 
@@ -163,7 +163,7 @@ def test_a_file_that_is_not_toml(tmp_path):
     ],
 )
 def test_formats(format_, is_text, is_integer, decimals):
-    column = Column(name="x", format=format_)
+    column = SourceColumn(name="x", format=format_)
     assert (column.is_text, column.is_integer, column.decimals) == (is_text, is_integer, decimals)
 
 
@@ -344,7 +344,7 @@ def test_every_column_of_every_record_is_readable(
     assert len(records) == expected(genuine=rows, generated=made)
 
 
-def parsed(path: Path, file: RecordFile) -> Records:
+def parsed(path: Path, file: RecordFile) -> ParsedRecords:
     parse = parse_fixed_width if file.layout == "fixed_width" else parse_delimited
     return parse(read(path), file, [column.name for column in file.columns])
 

@@ -15,13 +15,13 @@ import pytest
 from archives import record
 
 from starcat.artifact.verify import check_artifact
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source import data_source
 from starcat.catalog.span import drifts, position_errors, validity, with_span
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
 from starcat.selection.ruleset import Selection
 from starcat.selection.selecting import select_guide_stars
@@ -63,7 +63,7 @@ def fast_stars(tmp_path: Path) -> pa.Table:
     layout = data_source("hipparcos").files[0]
     path = tmp_path / "hip_main.dat"
     path.write_bytes(b"".join(record(layout, {"catalog": "H", **one}) for one in FAST.values()))
-    return ingest("hipparcos", [path], epoch_jyear=sum(SPAN) / 2).stars
+    return ingest_catalog("hipparcos", [path], epoch_jyear=sum(SPAN) / 2).stars
 
 
 @pytest.mark.parametrize("year", SPAN)
@@ -132,7 +132,7 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
     path.write_bytes(
         record(data_source("hipparcos").files[0], {"catalog": "H", **barnard, **given})
     )
-    stars = ingest("hipparcos", [path]).stars
+    stars = ingest_catalog("hipparcos", [path]).stars
     predicted = position_errors(stars, year)[0]
 
     rng = np.random.default_rng(24)
@@ -167,7 +167,7 @@ def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, cor
              "pm_de_de": " 0.00"},
         )
     )  # fmt: skip
-    stated_arcsec = position_errors(ingest("hipparcos", [path]).stars, 2027.0)[0]
+    stated_arcsec = position_errors(ingest_catalog("hipparcos", [path]).stars, 2027.0)[0]
     rng = np.random.default_rng(25)
     shared = [[1.0, correlation], [correlation, 1.0]]
     place, motion = (rng.multivariate_normal([0.0, 0.0], shared, 10_000) for _ in range(2))
@@ -186,7 +186,7 @@ def folder_of(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callab
 
     def run(**changes: str) -> Path:
         spec = read_spec(tmp_path / "small.toml", changes)
-        return build(spec, {"sao": [tmp_path / "sao.dat"]}, tmp_path).folder
+        return build_database(spec, {"sao": [tmp_path / "sao.dat"]}, tmp_path).folder
 
     return run
 

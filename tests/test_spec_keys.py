@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError
 from starcat.pipeline import starter
 from starcat.pipeline.starter import ENOUGH_STARS, boresight_count
@@ -25,7 +25,7 @@ def sky_read_once():
 
     def once(source, paths, **options):
         if source not in read:
-            read[source] = ingest(source, paths)
+            read[source] = ingest_catalog(source, paths)
         return read[source]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from genuine_records import SAO
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.exchange.export import write_hats
 from starcat.storage.digests import file_sha256
 from starcat.store.ingest import ingest_to_store
@@ -69,7 +69,7 @@ def test_a_store_holds_what_ingest_returns(made, ingested):
 @pytest.mark.parametrize("limit", [None, pytest.param(9.0, marks=pytest.mark.slow)])
 def test_a_build_reads_from_a_store_what_it_reads_from_files(made, limit):
     how = {"epoch_jyear": 2026.5, "read_limit_mag": limit}
-    files = ingest(made.source, [made.path], **how)
+    files = ingest_catalog(made.source, [made.path], **how)
     store = read_catalog(made.source, [made.folder], **how)
     assert store.stars.equals(files.stars)
     assert store.rejected.equals(files.rejected)
@@ -81,7 +81,7 @@ def test_a_build_reads_from_a_store_what_it_reads_from_files(made, limit):
 def test_a_store_with_a_limit_counts_what_it_left_out(catalogs, tmp_path):
     paths = [catalogs / "sao.dat.gz"]
     ingest_to_store("sao", paths, tmp_path / "store", read_limit_mag=6.5)
-    files = ingest("sao", paths, read_limit_mag=6.0)
+    files = ingest_catalog("sao", paths, read_limit_mag=6.0)
     store = read_catalog("sao", [tmp_path / "store"], read_limit_mag=6.0)
     assert store.rejected_by_reason == files.rejected_by_reason
     assert store.rows_read == files.rows_read > len(store.stars) > 0
@@ -95,7 +95,7 @@ def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, ingested, t
     write_hats(read.stars.select([*some, "pm_dec_mas_yr"]), tmp_path / "theirs", "theirs", 500)
     how = {"epoch_jyear": 2026.0, "read_limit_mag": 8.0}
     found = read_catalog("hipparcos", [tmp_path / "theirs"], **how)
-    wanted = ingest("hipparcos", [catalogs / "hip_main.dat.gz"], **how)
+    wanted = ingest_catalog("hipparcos", [catalogs / "hip_main.dat.gz"], **how)
     kept = [*some, "pm_dec_mas_yr", "x", "y", "z", "nearest_separation_arcsec"]
     assert found.stars.select(kept).equals(wanted.stars.select(kept))
     assert found.rows_read == len(read.stars)
@@ -117,7 +117,7 @@ def test_repeated_records_are_judged_within_the_limit_of_the_build(tmp_path):
     made = ingest_to_store("sao", [archive], tmp_path / "store")
     assert made.manifest["rejected"] == {"duplicate_record": 2}
     for limit in (None, 8.0, 5.5, 4.0):
-        files = ingest("sao", [archive], read_limit_mag=limit)
+        files = ingest_catalog("sao", [archive], read_limit_mag=limit)
         store = read_catalog("sao", [tmp_path / "store"], read_limit_mag=limit)
         assert store.stars.equals(files.stars)
         assert store.rejected.equals(files.rejected)

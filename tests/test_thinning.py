@@ -12,7 +12,7 @@ from drafts import chosen
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.attitude import (
@@ -26,7 +26,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline import guide_stars
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.guide_stars import even_stars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.evenness import (
@@ -318,7 +318,9 @@ def thinned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Built]:
     made = {}
     for rule in ("brightest", *RULES):
         content["selection"]["thinning"] = rule
-        made[rule] = build(spec_from_dict(content, rule), {}, tmp_path_factory.mktemp(rule))
+        made[rule] = build_database(
+            spec_from_dict(content, rule), {}, tmp_path_factory.mktemp(rule)
+        )
     return made
 
 
@@ -351,9 +353,11 @@ def test_the_self_test_identifies_no_fewer(rule, thinned):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> DatabaseFolder:
     """All stars of gaia-12deg."""
-    return open_artifact(build(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("whole")).folder)
+    return open_artifact(
+        build_database(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("whole")).folder
+    )
 
 
 @pytest.mark.slow
@@ -374,7 +378,7 @@ def test_where_a_sensor_sees_few_stars_only_the_bright_ones_help(thinned, whole)
 
 
 def right_answers(
-    made: dict[str, Built], whole: Artifact, limit_mag: float, frames: int = 500
+    made: dict[str, Built], whole: DatabaseFolder, limit_mag: float, frames: int = 500
 ) -> dict[str, int]:
     """Count the frames of another database's stars that each database identifies."""
     stars, found = whole.table("stars"), {}

@@ -17,8 +17,8 @@ from starcat.matcher import c_engine
 from starcat.matcher import prior as prior_search
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.tracking import MOST_STEPS, Tracker
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
+from starcat.matcher.tracking import MAX_STEPS, Tracker
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 
@@ -38,11 +38,11 @@ def sky(sky_of, random_directions) -> Database:
     return sky_of(random_directions(2000, 1))
 
 
-def frames(sky: Database, count: int, noise: Noise = HARD, seed: int = 31) -> list[Frame]:
+def frames(sky: Database, count: int, noise: Noise = HARD, seed: int = 31) -> list[SimulatedFrame]:
     return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, sky.mag))
 
 
-def wrong(frame: Frame, angle_deg: float, seed: int) -> np.ndarray:
+def wrong(frame: SimulatedFrame, angle_deg: float, seed: int) -> np.ndarray:
     return wrong_by(frame.matrix, math.radians(angle_deg), np.random.default_rng(seed))
 
 
@@ -83,11 +83,9 @@ def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
     assert same >= 38
 
 
-@pytest.mark.parametrize(
-    "most_stars", [prior_search.MOST_STARS, 0], ids=["few stars", "many stars"]
-)
+@pytest.mark.parametrize("most_stars", [prior_search.MAX_STARS, 0], ids=["few stars", "many stars"])
 def test_what_is_near_the_prior_takes_few_steps(sky, monkeypatch, most_stars):
-    monkeypatch.setattr(prior_search, "MOST_STARS", most_stars)
+    monkeypatch.setattr(prior_search, "MAX_STARS", most_stars)
     budget = 2_500 if most_stars else 1_000_000
     matcher = Matcher(sky, engine="numpy", max_steps=budget)
     found = [
@@ -227,13 +225,13 @@ def test_frames_without_stars_are_bridged(sky, engine):
     origins = {}
     for number, frame in enumerate(slew(sky, 60, HARD, 7)):
         # Two dark frames, then so many that the last answer tells nothing.
-        dark = number in (20, 21) or 40 <= number <= 40 + MOST_STEPS
+        dark = number in (20, 21) or 40 <= number <= 40 + MAX_STEPS
         found = tracker.identify(np.zeros((0, 2)) if dark else frame.centroids_px)
         assert found.status == ("too_few_stars" if dark else "identified")
         assert dark or is_near(found.q_body_from_icrs, frame.matrix)
         origins[number] = found.origin
     assert origins[22] == origins[39] == "tracking"
-    assert origins[41 + int(MOST_STEPS)] == "lost_in_space"
+    assert origins[41 + int(MAX_STEPS)] == "lost_in_space"
 
 
 @both_engines

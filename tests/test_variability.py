@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.joins import Keys
 from starcat.catalog.source import data_source
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes, read_gcvs
@@ -278,7 +278,7 @@ def test_tycho1_into_tycho2(tmp_path, catalogs):
     (tmp_path / "tyc2.dat").write_bytes(
         (catalogs / "samples" / "tycho2_I259_records.txt").read_bytes()
     )
-    stars = ingest("tycho2", [tmp_path]).stars
+    stars = ingest_catalog("tycho2", [tmp_path]).stars
     found, count = join_amplitudes(stars, read_amplitudes("tycho1", [tmp_path]))
     assert count == 1
     assert found["designation"].to_pylist()[1] == "TYC 1-13-1"

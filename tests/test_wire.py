@@ -21,10 +21,10 @@ from served import in_background
 import starcat_service
 from starcat import query
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import Ingested, ingest, write_star_tables
+from starcat.catalog.ingest import Ingested, ingest_catalog, write_star_tables
 from starcat.catalog.source import give_map
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
 from starcat.specs.reading import read_spec
 from starcat.storage.download import DownloadOptions
@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> 
     """A HATS catalog of others, whose row groups go from bright to faint."""
     made = tmp_path_factory.mktemp("others")
     (made / "sao.dat").write_bytes(b"".join(sao_lines))
-    write_others(ingest("sao", [made / "sao.dat"]).stars, made / "catalog")
+    write_others(ingest_catalog("sao", [made / "sao.dat"]).stars, made / "catalog")
     return made / "catalog"
 
 
@@ -86,8 +86,8 @@ def same_products(a: Path, b: Path) -> bool:
 def test_a_database_has_the_bytes_of_one_from_files(archive, folder, small_spec, tmp_path):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, address = read_spec(tmp_path / "spec.toml"), archive.serve_folder("/sky", folder)
-    near = build(spec, {"sao": [folder]}, tmp_path / "near").folder
-    far = build(spec, {"sao": [input_path(address)]}, tmp_path / "far").folder
+    near = build_database(spec, {"sao": [folder]}, tmp_path / "near").folder
+    far = build_database(spec, {"sao": [input_path(address)]}, tmp_path / "far").folder
     assert same_products(near, far)
     (facts,) = open_artifact(far).manifest["sources"]
     assert {file["name"].partition("/dataset/")[0] for file in facts["files"]} == {address}
@@ -102,9 +102,9 @@ def test_a_store_of_starcat_gives_the_very_same_database(archive, sao_file, smal
     lines = sao_file.read_bytes().splitlines(keepends=True)
     sao_file.write_bytes(b"".join([*lines, lines[0], b"?" * (len(lines[0]) - 1) + b"\n"]))
     ingest_to_store("sao", [sao_file], store, options=StoreOptions(max_partition_rows=100))
-    near = build(spec, {"sao": [store]}, tmp_path / "near").folder
+    near = build_database(spec, {"sao": [store]}, tmp_path / "near").folder
     address = archive.serve_folder("/store", store)
-    far = build(spec, {"sao": [input_path(address)]}, tmp_path / "far").folder
+    far = build_database(spec, {"sao": [input_path(address)]}, tmp_path / "far").folder
     files = [path.relative_to(near) for path in near.rglob("*") if path.is_file()]
     assert all((near / file).read_bytes() == (far / file).read_bytes() for file in files)
     counts = open_artifact(far).manifest["sources"][0]["rejected"]
@@ -246,8 +246,8 @@ def test_a_killed_read_goes_on(archive, folder, tmp_path):
 def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_path, monkeypatch):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, address = read_spec(tmp_path / "spec.toml"), archive.serve_folder("/sky", folder)
-    made = build(spec, {"sao": [input_path(address)]}, tmp_path).folder
-    other = ingest("sao", [folder.parent / "sao.dat"]).stars.slice(0, 590)
+    made = build_database(spec, {"sao": [input_path(address)]}, tmp_path).folder
+    other = ingest_catalog("sao", [folder.parent / "sao.dat"]).stars.slice(0, 590)
     write_others(other, tmp_path / "other")
     archive.serve_folder("/sky", tmp_path / "other")
     with pytest.raises(ChecksumMismatch, match=r"has changed.*remove that to read it"):
@@ -304,7 +304,7 @@ def test_a_note_elsewhere_is_no_address(archive, tmp_path):
     note: Callable[[str], Path] = input_path
     kept = note("http://127.0.0.1:9/sky")
     copy = kept.rename(tmp_path / kept.name)
-    assert wire.address_of(copy) is None
+    assert wire.url_of_input(copy) is None
 
 
 def test_no_service_makes_an_address_an_input():

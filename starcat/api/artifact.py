@@ -12,20 +12,20 @@ from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
-    from starcat.api.matcher import Matcher
+    from starcat.api.matcher import PublicMatcher
     from starcat.artifact.verify import Verification
-    from starcat.query.result import Answer
+    from starcat.query.result import QueryResult
     from starcat.query.session import Limits
     from starcat.report.report import CoverageReport
 
 
-class Artifact(reader.Artifact):
-    """A guide-star database on disk, opened by `open_artifact` (``starcat.open``).
+class Artifact(reader.DatabaseFolder):
+    """A guide-star database on disk, opened by `open_for_query` (``starcat.open``).
 
     ``folder`` is where it is, ``manifest`` what it is made of: spec, sources, products, digests.
     """
 
-    def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
+    def matcher(self, method: str | None = None, **limits: Any) -> PublicMatcher:
         """Open the database for identifying stars.
 
         Parameters
@@ -40,11 +40,11 @@ class Artifact(reader.Artifact):
         Matcher
             Ready to identify. Needs numpy and h5py only.
         """
-        from starcat.api.matcher import Matcher
+        from starcat.api.matcher import PublicMatcher
 
-        return Matcher.open(self.folder, method, **limits)
+        return PublicMatcher.open(self.folder, method, **limits)
 
-    def sql(self, text: str, **values: Any) -> Answer:
+    def sql(self, text: str, **values: Any) -> QueryResult:
         """Run a query over the products.
 
         Parameters
@@ -92,7 +92,7 @@ class Artifact(reader.Artifact):
         return f"<p>{escape(repr(self)[1:-1])}</p><table>{head}<tbody>{rows}</tbody></table>"
 
 
-def open_artifact(folder: PathLike) -> Artifact:
+def open_for_query(folder: PathLike) -> Artifact:
     """Open a guide-star database.
 
     Parameters
@@ -126,12 +126,12 @@ class Connection:
         self._open = ExitStack()
         self._session = self._open.enter_context(open_session(targets, limits))
 
-    def sql(self, text: str, **values: Any) -> Answer:
+    def sql(self, text: str, **values: Any) -> QueryResult:
         """Run a query, as `Artifact.sql`; QueryLimitError if it takes more than it may."""
-        from starcat.query.result import Answer
+        from starcat.query.result import QueryResult
 
         with self._session.ask(text, values) as answer:
-            return Answer(answer.batches().read_all())
+            return QueryResult(answer.batches().read_all())
 
     def close(self) -> None:
         """Forget the tables, and what was made to read them."""

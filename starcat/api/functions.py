@@ -35,7 +35,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.progress import Progress
     from starcat.releases.publishing import Published
     from starcat.releases.pulling import Pulled
-    from starcat.simulation.simulate import Frame
+    from starcat.simulation.simulate import SimulatedFrame
     from starcat.specs.build_spec import BuildSpec
 
 
@@ -82,7 +82,7 @@ def build(
     ConfigError, SourceError, BuildError, OutputError
         As the command line says them.
     """
-    from starcat.pipeline.build import build as run
+    from starcat.pipeline.build import build_database as run
     from starcat.progress import no_progress
     from starcat.specs.build_spec import BuildSpec
     from starcat.specs.reading import read_spec, spec_from_dict
@@ -347,7 +347,7 @@ def simulate(
     drop_probability: float = 0.0,
     false_stars: int = 0,
     seed: int = 0,
-) -> list[Frame]:
+) -> list[SimulatedFrame]:
     """Simulate frames of a database's stars, at random attitudes.
 
     Parameters
@@ -412,10 +412,10 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
         If the file is not there, or is neither.
     """
     from starcat.images.batch import frame_files
-    from starcat.images.solve_files import measure
+    from starcat.images.solve_files import measure_picture
 
     files = frame_files([str(path_of("file", file))])
-    return [frame for path in files for frame in measure(path).frames]
+    return [frame for path in files for frame in measure_picture(path).frames]
 
 
 def export(

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.artifact.reader import Artifact
+from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.sphere import separation
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Reason
@@ -91,7 +91,7 @@ class Difference:
         return {"is_same": self.is_same, **asdict(self)}
 
 
-def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
+def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
     """Compare two databases."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
@@ -111,7 +111,7 @@ def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
     )
 
 
-def _read_limit_mag(artifact: Artifact, other: Artifact) -> float:
+def _read_limit_mag(artifact: DatabaseFolder, other: DatabaseFolder) -> float:
     """Return the magnitude beyond which a database lists no star of the other's catalog."""
     mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
     limit_mag = mine.get("read_limit_mag")
@@ -119,7 +119,7 @@ def _read_limit_mag(artifact: Artifact, other: Artifact) -> float:
     return float("inf") if limit_mag is None or not is_same else float(limit_mag)
 
 
-def _catalog(artifact: Artifact) -> str:
+def _catalog(artifact: DatabaseFolder) -> str:
     return str(artifact.manifest["spec"]["catalog"]["source"])
 
 
@@ -140,7 +140,7 @@ def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _source_facts(artifact: Artifact) -> dict[str, Any]:
+def _source_facts(artifact: DatabaseFolder) -> dict[str, Any]:
     """Return digests and counts by a name that both sides share."""
     facts: dict[str, Any] = {}
     for source in artifact.manifest["sources"]:
@@ -212,7 +212,7 @@ def _moved(a: pa.Table, b: pa.Table) -> tuple[Moved, ...]:
     )
 
 
-def _products(a: Artifact, b: Artifact) -> tuple[ProductChange, ...]:
+def _products(a: DatabaseFolder, b: DatabaseFolder) -> tuple[ProductChange, ...]:
     facts_a, facts_b = a.manifest["products"], b.manifest["products"]
     changes = []
     for name in dict.fromkeys([*facts_a, *facts_b]):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from starcat.specs.build_spec import BuildSpec
 
 
-class Artifact:
+class DatabaseFolder:
     """A database on disk."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
@@ -81,7 +81,7 @@ class Artifact:
 class Products(Mapping[str, "pa.Table"]):
     """The tables of a database by name, in the order of the manifest; each is read when used."""
 
-    def __init__(self, artifact: Artifact) -> None:
+    def __init__(self, artifact: DatabaseFolder) -> None:
         self._artifact = artifact
         self._facts: dict[str, Any] = artifact.manifest["products"]
 
@@ -104,6 +104,6 @@ class Products(Mapping[str, "pa.Table"]):
         return f"<Products: {', '.join(counts)}>"
 
 
-def open_artifact(folder: Path) -> Artifact:
+def open_artifact(folder: Path) -> DatabaseFolder:
     """Open a database."""
-    return Artifact(folder, read_manifest(folder))
+    return DatabaseFolder(folder, read_manifest(folder))

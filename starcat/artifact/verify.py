@@ -27,7 +27,7 @@ from starcat.artifact.checks import (
     root_problems,
 )
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
-from starcat.artifact.reader import Artifact
+from starcat.artifact.reader import DatabaseFolder
 from starcat.errors import ProductError, StarcatError, no_database
 from starcat.products.table import PRODUCTS
 from starcat.specs.epoch import middle_of
@@ -86,11 +86,11 @@ def verify_artifact(folder: Path) -> Verification:
     if log.run(MANIFEST_NAME, "", _manifest_problems, folder / MANIFEST_NAME):
         manifest = log.get(MANIFEST_NAME, "", read_manifest, folder)
         if manifest:
-            log.get(MANIFEST_NAME, "", _check_all, Artifact(folder, manifest), log)
+            log.get(MANIFEST_NAME, "", _check_all, DatabaseFolder(folder, manifest), log)
     return Verification(folder, log.checks, tuple(log.findings))
 
 
-def check_artifact(folder: Path) -> Artifact:
+def check_artifact(folder: Path) -> DatabaseFolder:
     """Check that a database is whole."""
     found = verify_artifact(folder).findings
     if found:
@@ -99,7 +99,7 @@ def check_artifact(folder: Path) -> Artifact:
             product=found[0].product or None,
             path=folder / found[0].file,
         )
-    return Artifact(folder, read_manifest(folder))
+    return DatabaseFolder(folder, read_manifest(folder))
 
 
 def first_of(findings: Sequence[Finding]) -> str:
@@ -149,7 +149,7 @@ def _manifest_problems(path: Path) -> Iterator[str]:
         yield f"not a manifest of starcat ({type(error).__name__}: {error}). {_NOT_CHECKED}"
 
 
-def _check_all(artifact: Artifact, log: _Log) -> None:
+def _check_all(artifact: DatabaseFolder, log: _Log) -> None:
     damaged = _check_files(artifact, log)
     held = _check_products(artifact, damaged, log)
     log.run(MANIFEST_NAME, "", _count_problems, artifact.manifest, held)
@@ -157,7 +157,7 @@ def _check_all(artifact: Artifact, log: _Log) -> None:
         log.get(DATABASE_NAME, "database", _check_database, artifact, held, log)
 
 
-def _check_files(artifact: Artifact, log: _Log) -> set[str]:
+def _check_files(artifact: DatabaseFolder, log: _Log) -> set[str]:
     """Return the names of the files that are not as the manifest says."""
     folder, listed = artifact.folder, artifact.manifest["files"]
     damaged = {
@@ -197,7 +197,9 @@ def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _check_products(artifact: Artifact, damaged: set[str], log: _Log) -> dict[str, HeldProduct]:
+def _check_products(
+    artifact: DatabaseFolder, damaged: set[str], log: _Log
+) -> dict[str, HeldProduct]:
     """Return the products whose columns follow their schemas, after checking what is in them."""
     sound: dict[str, HeldProduct] = {}
     stars: pa.Table | None = None
@@ -218,7 +220,7 @@ def _check_products(artifact: Artifact, damaged: set[str], log: _Log) -> dict[st
     return sound
 
 
-def _hold(artifact: Artifact, product: str, stars: pa.Table | None) -> HeldProduct:
+def _hold(artifact: DatabaseFolder, product: str, stars: pa.Table | None) -> HeldProduct:
     facts = artifact.manifest["products"][product]
     directions = np.empty((0, 3)) if stars is None else directions_of(stars)
     return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions, stars)
@@ -285,7 +287,7 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
         yield f"{products['boresights']['rows']} boresights; the spec says {fields}"
 
 
-def _check_database(artifact: Artifact, held: dict[str, HeldProduct], log: _Log) -> None:
+def _check_database(artifact: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:
     stars = artifact.manifest["products"]["stars"]["rows"]
     with h5py.File(artifact.folder / DATABASE_NAME, "r") as file:
         log.run(DATABASE_NAME, "database", root_problems, file, artifact.manifest)

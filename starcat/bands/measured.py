@@ -34,10 +34,10 @@ Bins = dict[tuple[str, str], dict[str, Array]]
 @cache
 def relation_errors() -> Bins:
     """Return the table of relations that ships with starcat."""
-    return bins_of(data_table("relation_errors.csv")[1])
+    return bands_in_bins(data_table("relation_errors.csv")[1])
 
 
-def bins_of(rows: list[list[str]]) -> Bins:
+def bands_in_bins(rows: list[list[str]]) -> Bins:
     """Return the least colours and the factors of bins by relation, then by band, shape (K, 2)."""
     found: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
     for base, colour, target, low, _, factor in rows:

@@ -18,7 +18,7 @@ from starcat.arrays import Array, Mask
 from starcat.bands.measured import error_factors
 from starcat.bands.response import Response, shipped
 from starcat.bands.spectra import library, parsed_type
-from starcat.bands.synthetic import magnitudes, row_weights
+from starcat.bands.synthetic import row_weights, synthetic_magnitudes
 
 GRID_MAG = 0.02
 """Step of the colours that a relation is worked out at."""
@@ -27,7 +27,7 @@ WIDTH_MAG, WIDEST_MAG = 0.06, 0.6
 """Colours this far apart count as about the same (one standard deviation); where the library has
 few spectra the width grows, at the most to the second."""
 
-FEWEST_TYPES = 3.0
+MIN_TYPES = 3.0
 """So many types, at the least, make the line at a colour."""
 
 ZERO_POINT_MAG = 0.007
@@ -132,8 +132,8 @@ def _zone_deviations() -> Array:
 def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
     """Return the relation from a band and a colour of a catalog to a sensor's band."""
     first, second = (shipped(band) for band in colour)
-    x = (magnitudes(first) - magnitudes(second)).ravel()
-    y = (magnitudes(target) - magnitudes(shipped(base))).ravel()
+    x = (synthetic_magnitudes(first) - synthetic_magnitudes(second)).ravel()
+    y = (synthetic_magnitudes(target) - synthetic_magnitudes(shipped(base))).ravel()
     weight = library().weight
     grid = _grid(x)
     kernels = np.stack([_kernel(x, at) for at in grid])
@@ -184,7 +184,7 @@ def _band_variance(base: Response, target: Response) -> Array:
     variance = np.full(library().weight.shape, ZERO_POINT_MAG**2)
     for one in (base, target):
         shifted = replace(one, wavelength_nm=one.wavelength_nm * (1.0 + PASSBAND_SHARE))
-        variance = variance + (magnitudes(shifted) - magnitudes(one)) ** 2
+        variance = variance + (synthetic_magnitudes(shifted) - synthetic_magnitudes(one)) ** 2
     return np.asarray(variance).ravel()
 
 
@@ -200,7 +200,7 @@ def _kernel(x: Array, at: float) -> Array:
     width = WIDTH_MAG
     while True:
         near = np.exp(-0.5 * ((x - at) / width) ** 2)
-        if width >= WIDEST_MAG or np.sum(near * share.ravel()) >= FEWEST_TYPES:
+        if width >= WIDEST_MAG or np.sum(near * share.ravel()) >= MIN_TYPES:
             return np.asarray(near)
         width *= 1.2
 
@@ -220,7 +220,7 @@ def predict_by_type(
     base: str, target: Response, mag: Array, types: list[str], mag_error: Array
 ) -> Prediction:
     """Return magnitudes in a sensor's band from a band and spectral types such as K2III or A0."""
-    difference = magnitudes(target) - magnitudes(shipped(base))
+    difference = synthetic_magnitudes(target) - synthetic_magnitudes(shipped(base))
     everywhere = library().weight
     bands = _band_variance(shipped(base), target).reshape(everywhere.shape)
     found: dict[str, tuple[float, float, bool]] = {}

@@ -26,14 +26,14 @@ Counts = Literal["photon", "energy"]
 LIMITS_NM = (300.0, 2500.0)
 """Wavelengths that the spectra cover."""
 
-MOST_ROWS = 20_000
-MOST_BYTES = 4_000_000
+MAX_ROWS = 20_000
+MAX_BYTES = 4_000_000
 """Of the CSV file of a response."""
 
 WIDEST_GAP_NM = 100.0
 """Rows further apart than this leave a curve to guesswork."""
 
-MOST_OUTSIDE = 0.01
+MAX_OUTSIDE = 0.01
 """Share of a response that may lie where no spectrum reaches."""
 
 
@@ -109,9 +109,9 @@ def _fault(wavelength: Array, value: Array) -> str | None:
             f"{len(wavelength)} wavelengths and {len(value)} values; every wavelength needs one "
             "value"
         )
-    if not 3 <= len(wavelength) <= MOST_ROWS:
+    if not 3 <= len(wavelength) <= MAX_ROWS:
         return (
-            f"{len(wavelength)} wavelengths; a curve needs 3 at least and {MOST_ROWS:,} at the most"
+            f"{len(wavelength)} wavelengths; a curve needs 3 at least and {MAX_ROWS:,} at the most"
         )
     missing = ~(np.isfinite(wavelength) & np.isfinite(value))
     if missing.any():
@@ -161,7 +161,7 @@ def _fault_of_coverage(wavelength: Array, value: Array) -> str | None:
     fine = np.linspace(wavelength[0], wavelength[-1], 20_001)
     response = np.interp(fine, wavelength, value)
     outside = float(response[(fine < low) | (fine > high)].sum() / response.sum())
-    if outside <= MOST_OUTSIDE:
+    if outside <= MAX_OUTSIDE:
         return None
     return (
         f"{outside:.0%} of it is outside of {low:g} to {high:g} nm, which the spectra cover, so no "
@@ -207,7 +207,7 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
 def read_response(path: Path, per: str | None) -> Response:
     """Return the response of a CSV file, which a spec says what it is relative to."""
     try:
-        text = read_regular_file(path, MOST_BYTES).decode("utf-8")
+        text = read_regular_file(path, MAX_BYTES).decode("utf-8")
     except FileMissing:
         raise FileMissing(
             f"{path}: no such response; these ship with starcat: {', '.join(shipped_names())}"

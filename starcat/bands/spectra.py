@@ -25,7 +25,7 @@ further. Reddenings fall off exponentially with these means."""
 
 
 @dataclass(frozen=True)
-class Library:
+class SpectralLibrary:
     """Spectra by type and reddening."""
 
     types: tuple[str, ...]  # such as "a0v", shape (T,)
@@ -48,7 +48,7 @@ def data_table(name: str) -> tuple[list[str], list[list[str]]]:
 
 
 @cache
-def library() -> Library:
+def library() -> SpectralLibrary:
     """Return the library, read once."""
     names, rows = data_table("spectra.csv.gz")
     columns = np.array(rows, dtype=np.float64).T
@@ -63,7 +63,7 @@ def library() -> Library:
     common = np.exp(-REDDENING_MAG[:, None] / mean) * np.gradient(REDDENING_MAG)[:, None]
     # One star more of each type, so that none is impossible.
     weight = common / common.sum(axis=0) * (stars + 1.0)
-    return Library(
+    return SpectralLibrary(
         types=types,
         number=parsed[:, 0],
         luminosity=parsed[:, 1],

@@ -33,7 +33,7 @@ def row_weights(response: Response) -> Array:
     return np.asarray(weights)
 
 
-def magnitudes(response: Response) -> Array:
+def synthetic_magnitudes(response: Response) -> Array:
     """Return the magnitudes of the library's spectra, shape (E, T), in a response's band.
 
     The spectra have one flux at 555.6 nm before they are reddened; only differences between bands
@@ -53,7 +53,7 @@ def zero_mag(response: Response, weights: Array) -> float:
         photons = response.photon_efficiency(_FINE_NM) * _FINE_NM
         return float(-2.5 * np.log10(np.sum(flux * photons))) + float(said)
     row = type_row(said)
-    visual = magnitudes(shipped("V"))[0, row]
+    visual = synthetic_magnitudes(shipped("V"))[0, row]
     return float(-2.5 * np.log10(library().flux[0, row] @ weights) - visual)
 
 

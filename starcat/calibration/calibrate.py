@@ -14,7 +14,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.calibration.fit import AXES, PARAMETERS, Fit, camera_of, fit_camera, values_of
 from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
-from starcat.calibration.rounds import Identified, first_answer, identify_part, settled
+from starcat.calibration.rounds import IdentifiedFrame, first_answer, identify_part, settled
 from starcat.errors import CalibrationError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
@@ -25,7 +25,7 @@ from starcat.progress import Progress, no_progress
 
 # Fewest identified frames of a calibration: with fewer, leaving some out says nothing.
 MIN_FRAMES = 3
-MOST_NAMED = 10  # frames that a message names at most
+MAX_NAMED = 10  # frames that a message names at most
 SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
 
 
@@ -125,7 +125,7 @@ def calibrate_frames(
 
 
 def _finished(
-    matcher: Matcher, frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
+    matcher: Matcher, frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, fit: Fit
 ) -> Calibration:
     size_px = identified.camera.width_px, identified.camera.height_px
     seen = identified.seen(frames, matcher)
@@ -154,7 +154,7 @@ def _finished(
 
 
 def _outcomes(
-    frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
+    frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, fit: Fit
 ) -> tuple[CalibratedFrame, ...]:
     outcomes = []
     for k, (frame, result) in enumerate(zip(frames, identified.results, strict=True)):
@@ -170,7 +170,7 @@ def _outcomes(
 
 
 def _too_few(
-    frames: Sequence[MeasuredFrame], identified: Identified, focal_px: tuple[float, float]
+    frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, focal_px: tuple[float, float]
 ) -> str:
     """Return the message about frames that were not identified."""
     width_px = identified.camera.width_px
@@ -180,8 +180,8 @@ def _too_few(
         for frame, result in zip(frames, identified.results, strict=True)
         if result.status != "identified"
     ]
-    more = len(failed) - MOST_NAMED
-    named = ", ".join(failed[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(failed) - MAX_NAMED
+    named = ", ".join(failed[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
     count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
     if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
         return (

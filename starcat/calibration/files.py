@@ -22,7 +22,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.images.figure_file import check_kind, own_style, write_figure
 from starcat.images.identify_options import IdentifyOptions
-from starcat.images.solve_files import measure
+from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress
@@ -69,7 +69,7 @@ def measured_frames(
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
     for number, (path, name) in enumerate(zip(paths, names_of_files(paths), strict=True), start=1):
-        measured = measure(path, IdentifyOptions(flip=flip))
+        measured = measure_picture(path, IdentifyOptions(flip=flip))
         for frame in measured.frames:
             frames.append(replace(frame, name=name) if frame.name == path.stem else frame)
         if measured.image is not None:

@@ -134,7 +134,7 @@ TURNS = 30  # most steps towards the attitudes of one camera; without wrong star
 CAREFUL = 2
 
 # Curvature of a star beyond the bend in later steps, so that none is infinitely long.
-LEAST_CURVE = 0.01
+MIN_CURVE = 0.01
 
 # A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec.
 STILL_RAD = 1e-6
@@ -235,7 +235,7 @@ def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
         by_turn = turn_derivatives(values, body)
         weight = bend_px / np.maximum(np.abs(residual), bend_px)
         # What lies beyond the bend pulls, and in the end adds nothing to the curvature.
-        curve = weight if turn < CAREFUL else np.where(weight < 1.0, LEAST_CURVE, 1.0)
+        curve = weight if turn < CAREFUL else np.where(weight < 1.0, MIN_CURVE, 1.0)
         normal = np.add.reduceat(np.swapaxes(by_turn * curve[:, :, None], 1, 2) @ by_turn, first)
         pull = np.add.reduceat(np.einsum("nij,ni->nj", by_turn, weight * residual), first)
         step = np.linalg.solve(normal, pull[:, :, None])[:, :, 0]

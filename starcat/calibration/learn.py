@@ -16,8 +16,8 @@ from scipy.stats import binom
 
 from starcat.arrays import Array, Mask
 from starcat.calibration.answers import Sightings, SkyStars
-from starcat.calibration.response import FEWEST_COLOURS, Depth, Terms, fit_depth, fit_terms
-from starcat.calibration.star_tests import Measurements, Noise, StarMeans
+from starcat.calibration.response import MIN_COLOURS, Depth, Terms, fit_depth, fit_terms
+from starcat.calibration.star_tests import Measurements, StarMeans, StarNoise
 from starcat.errors import CalibrationError
 
 FAMILY = 1e-3
@@ -26,7 +26,7 @@ FAMILY = 1e-3
 MIN_FRAMES = 3
 """Fewest frames that a star is judged from."""
 
-FEWEST_STARS = 20
+MIN_STARS = 20
 """Fewest stars with a magnitude that anything is learnt from."""
 
 TESTS = ("brightness", "variable", "moved", "double", "missing")
@@ -34,10 +34,10 @@ TESTS = ("brightness", "variable", "moved", "double", "missing")
 CLEAR = 3.0
 """Noises that a star is brighter than the limit of the frames, for its mean to be fair."""
 
-FEWEST_ROUNDS, MAX_ROUNDS = 3, 8
+MIN_ROUNDS, MAX_ROUNDS = 3, 8
 FIRST_NOISE_MAG = 0.3  # until it is known
-LEAST_MAG, LEAST_ARCSEC = 1e-3, 1e-2  # noise is not taken to be smaller
-LEAST_LOG = -300.0  # of a probability; smaller ones are no longer numbers
+MIN_MAG, MIN_ARCSEC = 1e-3, 1e-2  # noise is not taken to be smaller
+MIN_LOG = -300.0  # of a probability; smaller ones are no longer numbers
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Lesson:
     """What identified frames say about their sensor and their stars."""
 
     terms: Terms
-    mag_noise: Noise
-    offset_noise: Noise
+    mag_noise: StarNoise
+    offset_noise: StarNoise
     limit_mag: float  # measured magnitude from which stars are missed; inf where none are
     records: StarRecords
     distrusted: tuple[Distrusted, ...]  # by row
@@ -84,7 +84,7 @@ class Lesson:
     n_sightings: int  # with a magnitude
 
 
-def learn(
+def learn_from_frames(
     sightings: Sightings,
     stars: SkyStars,
     n_frames: int,
@@ -100,10 +100,10 @@ def learn(
     unknown colour.
     """
     found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
-    if found < FEWEST_STARS:
+    if found < MIN_STARS:
         raise CalibrationError(
             f"{found} stars of {n_frames} identified frames have a measured magnitude; at least "
-            f"{FEWEST_STARS} are needed. Give more frames, with magnitudes"
+            f"{MIN_STARS} are needed. Give more frames, with magnitudes"
         )
     is_trusted = np.ones(len(stars), dtype=bool)
     lesson = None
@@ -114,7 +114,7 @@ def learn(
         ).judged(before)
         flagged = np.zeros(len(stars), dtype=bool)
         flagged[[one.row for one in lesson.distrusted]] = True
-        if number >= FEWEST_ROUNDS and (flagged == ~is_trusted).all():
+        if number >= MIN_ROUNDS and (flagged == ~is_trusted).all():
             break
         is_trusted = ~flagged
     assert lesson is not None
@@ -147,8 +147,8 @@ class _Round:
         place = Measurements(
             seen.offset_arcsec[there], expected_mag[there], seen.star[there], count
         )
-        mag_noise = light.of(trusted[use]).noise(LEAST_MAG, self.min_frames)
-        offset_noise = place.of(trusted[there]).noise(LEAST_ARCSEC, self.min_frames)
+        mag_noise = light.of(trusted[use]).noise(MIN_MAG, self.min_frames)
+        offset_noise = place.of(trusted[there]).noise(MIN_ARCSEC, self.min_frames)
         brightness = light.by_star(mag_noise, self._unsure_mag(terms), self.min_frames)
         position = place.by_star(offset_noise, np.zeros(count), self.min_frames)
         records = self._records(terms, depth, brightness, position)
@@ -171,7 +171,7 @@ class _Round:
             use = measured & (expected_mag < before.limit_mag - CLEAR * sigma)
         # Where frames are so shallow that hardly a star of known colour is left, all have to do.
         known = np.isfinite(self.stars.colour)
-        is_enough = known[np.unique(seen.star[use])].sum() >= FEWEST_COLOURS
+        is_enough = known[np.unique(seen.star[use])].sum() >= MIN_COLOURS
         rows = (use if is_enough or not known.any() else measured) & self.is_trusted[seen.star]
         star = seen.star[rows]
         terms = fit_terms(
@@ -230,7 +230,7 @@ class _Round:
             offset_arcsec=position.mean,
             offset_error_arcsec=position.error,
             offset_scatter_arcsec=position.scatter,
-            log_chance=np.maximum(np.column_stack(tests), LEAST_LOG),
+            log_chance=np.maximum(np.column_stack(tests), MIN_LOG),
         )
 
 

@@ -14,9 +14,9 @@ import pyarrow.compute as pc
 from pydantic import ValidationError
 
 from starcat.artifact.manifest import manifest_digest
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.calibration.answers import SkyStars, read_answers
-from starcat.calibration.learn import FAMILY, MIN_FRAMES, Distrusted, Lesson, learn
+from starcat.calibration.learn import FAMILY, MIN_FRAMES, Distrusted, Lesson, learn_from_frames
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
 from starcat.specs.reading import what_is_wrong
@@ -74,7 +74,7 @@ def learn_files(
     answers = read_answers(paths, stars)
     count = len(answers.names)
     before = artifact.spec.selection.observed
-    lesson = learn(
+    lesson = learn_from_frames(
         answers.sightings,
         stars,
         count,
@@ -109,7 +109,7 @@ def learn_files(
     return Learnt(lesson, stars, answers.n_frames, count, bands, observed)
 
 
-def sky_stars(artifact: Artifact) -> tuple[SkyStars, str | None]:
+def sky_stars(artifact: DatabaseFolder) -> tuple[SkyStars, str | None]:
     """Return the stars of a database, and the bands of their colours: those that most have."""
     table, manifest = artifact.stars, artifact.manifest
     colour, bands = floats_of(table, "colour_mag"), None

@@ -15,13 +15,13 @@ from starcat.arrays import Array, Mask, Rows
 
 HUBER = 1.345  # deviations, in their noise, from which on a measurement counts less
 OF_A_BIN = 100  # measurements of a bin of magnitude at the least
-MOST_BINS = 48
+MAX_BINS = 48
 COMPLETE = 0.85  # share of what the best bins see, from which on stars are expected
 COVERED = (
     1e-3  # a frame that misses so many as one in a thousand does says nothing of what it lacks
 )
-FEWEST_COLOURS = 10  # stars of known colour that a colour term needs
-FEWEST_STEPS, MAX_STEPS = 10, 50  # of the fit; each has new weights
+MIN_COLOURS = 10  # stars of known colour that a colour term needs
+MIN_STEPS, MAX_STEPS = 10, 50  # of the fit; each has new weights
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def fit_terms(
     with it. Stars without colour have no part in it, unless nearly all have none.
     """
     known = np.isfinite(colour)
-    has_colour = len(np.unique(colour[known])) >= FEWEST_COLOURS
+    has_colour = len(np.unique(colour[known])) >= MIN_COLOURS
     used = known if has_colour else np.ones(len(star), dtype=bool)
     y, frame, star, sigma = difference[used], frame[used], star[used], sigma[used]
     x = colour[used] if has_colour else np.zeros(len(y))
@@ -76,7 +76,7 @@ def fit_terms(
         left = y_left - slope * x_left
         far = np.maximum(np.abs(left) / (HUBER * sigma), 1.0)
         weight = sigma**-2.0 / far
-        if step >= FEWEST_STEPS and abs(slope - before) < 1e-12:
+        if step >= MIN_STEPS and abs(slope - before) < 1e-12:
             break
     offset = y_mean - slope * x_mean
     pull = weight * left
@@ -120,7 +120,7 @@ def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) ->
     chance does: the limb of the Earth or the baffle may hide a part of them.
     """
     used = np.flatnonzero(is_trusted)
-    bins = int(np.clip(len(used) // OF_A_BIN, 1, MOST_BINS))
+    bins = int(np.clip(len(used) // OF_A_BIN, 1, MAX_BINS))
     order = used[np.argsort(predicted[used], kind="stable")]
     parts = np.array_split(order, bins)
     edges = np.array([predicted[part[0]] for part in parts[1:]])

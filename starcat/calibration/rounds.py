@@ -68,7 +68,7 @@ ROUND_MODELS = (
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentifiedFrame:
     """What the matcher says about the frames."""
 
     # one a frame, about the centroids as they were given; those outside of the part of the frame
@@ -146,7 +146,7 @@ def identify_part(
     *,
     few: int | None = None,
     fov_error: float = 0.0,
-) -> Identified:
+) -> IdentifiedFrame:
     """Identify the middle of frames."""
     middle, corner_px = cropped(camera, share)
     results = []
@@ -159,7 +159,7 @@ def identify_part(
         mag = None if frame.mag is None else frame.mag[rows]
         result = matcher.identify(px[rows], middle, magnitudes=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))
-    return Identified(tuple(results), camera, matcher.tolerance_px)
+    return IdentifiedFrame(tuple(results), camera, matcher.tolerance_px)
 
 
 def settled(
@@ -168,7 +168,7 @@ def settled(
     camera: Camera,
     share: float,
     progress: Progress,
-) -> tuple[Identified, Fit | None]:
+) -> tuple[IdentifiedFrame, Fit | None]:
     """Identify and fit in turn until the stars no longer change."""
     size_px, tolerance_px = (camera.width_px, camera.height_px), WIDE_PX
     before: list[bytes] = []

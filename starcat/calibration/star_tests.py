@@ -17,14 +17,14 @@ from starcat.arrays import Array, Mask, Rows
 CLIP = 4.0  # deviations farther away, in their noise, are not counted in the noise
 FAR = 4.0  # those in the scatter of a star count as so many noises at most: one proves nothing
 OF_A_BIN = 100  # deviations of a bin of magnitude at the least
-MOST_BINS = 12
+MAX_BINS = 12
 HALF_OF_NORMAL = 0.6744897501960817  # half of normal deviations are smaller
 
 _LOG10 = np.log(10.0)
 
 
 @dataclass(frozen=True)
-class Noise:
+class StarNoise:
     """The noise of one measurement by the magnitude measured, and what stars differ by beside it.
 
     The latter are errors of the catalog and of the model of the sensor, which more sightings of a
@@ -82,7 +82,7 @@ class Measurements:
         count = np.maximum(self.count, 1)
         return np.column_stack([self.total(column) / count for column in self.left.T])
 
-    def noise(self, least: float, min_count: int) -> Noise:
+    def noise(self, least: float, min_count: int) -> StarNoise:
         """Return the noise, from how the measurements of each star differ."""
         of_star = self.count[self.star]
         factor = np.sqrt(of_star / np.maximum(of_star - 1.0, 1.0))
@@ -91,15 +91,15 @@ class Measurements:
             within, where = within[of_star > 1], where[of_star > 1]
         else:  # hardly any star was seen twice
             within = self.left
-        bins = int(np.clip(len(within) // OF_A_BIN, 1, MOST_BINS))
+        bins = int(np.clip(len(within) // OF_A_BIN, 1, MAX_BINS))
         parts = np.array_split(np.argsort(where, kind="stable"), bins)
         sigma = [max(least, float(sigmaclip(within[part], CLIP, CLIP)[0].std())) for part in parts]
         middle = np.array([float(np.median(where[part])) for part in parts])
-        noise, often = Noise(middle, np.array(sigma), 0.0), self.count >= min_count
+        noise, often = StarNoise(middle, np.array(sigma), 0.0), self.count >= min_count
         variance = self.total(noise.at(self.mag) ** 2)[often] / self.count[often] ** 2
-        return Noise(noise.mag, noise.sigma, _beyond(self.mean[often], variance))
+        return StarNoise(noise.mag, noise.sigma, _beyond(self.mean[often], variance))
 
-    def by_star(self, noise: Noise, further: Array, min_count: int) -> StarMeans:
+    def by_star(self, noise: StarNoise, further: Array, min_count: int) -> StarMeans:
         """Return what the measurements say of each star; ``further`` is an error of each mean."""
         axes, count, sigma = self.left.shape[1], self.count, noise.at(self.mag)
         some = np.maximum(count, 1)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask
 from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, with_code
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
@@ -111,7 +111,7 @@ class _Systems:
     names: list[str]
 
 
-def _by_hip(part: Records) -> _Systems:
+def _by_hip(part: ParsedRecords) -> _Systems:
     nothing = np.full(len(part), np.nan)
     separation = np.where(part["sep"] >= 0.0, part["sep"], np.nan)
     places = np.stack([nothing] * 3, axis=1)
@@ -121,7 +121,7 @@ def _by_hip(part: Records) -> _Systems:
     )
 
 
-def _by_place(part: Records) -> _Systems:
+def _by_place(part: ParsedRecords) -> _Systems:
     first, last = (numbers_in(texts_of(part[f"sep_{when}"])) for when in ("first", "last"))
     separation = np.where(last >= 0.0, last, np.where(first >= 0.0, first, np.nan))
     mags = [numbers_in(texts_of(part[f"mag_{which}"]), "mag") for which in ("first", "second")]

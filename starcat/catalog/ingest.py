@@ -128,7 +128,7 @@ def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str,
     return {name: counted[name] for name in ALL_REASONS if name in counted}
 
 
-def ingest(
+def ingest_catalog(
     source_name: str,
     paths: Sequence[Path],
     *,

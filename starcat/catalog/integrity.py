@@ -30,7 +30,7 @@ from starcat.errors import (
     SourceMissing,
 )
 from starcat.failures import validation_message
-from starcat.storage.atomic import placed, sync
+from starcat.storage.atomic import placed, sync_to_disk
 from starcat.storage.digests import json_bytes
 from starcat.storage.locks import locked
 
@@ -187,7 +187,7 @@ def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
     try:
         with placed(path) as partial:
             partial.write_bytes(json_bytes({name: e.model_dump() for name, e in entries.items()}))
-            sync(partial)
+            sync_to_disk(partial)
     except OSError as error:
         raise OutputError(f"cannot write the lock file {path}: {error}", path=path) from error
 

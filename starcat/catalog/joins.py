@@ -21,7 +21,7 @@ from starcat.catalog.parts import FileReading, read_files
 from starcat.catalog.readers.blocks import Block
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_fixed_width
-from starcat.catalog.readers.records import Records, number_from_text
+from starcat.catalog.readers.records import ParsedRecords, number_from_text
 from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.geometry.sphere import chord_from_separation
@@ -107,7 +107,7 @@ def with_code(codes: str | None, code: str) -> str:
 class JoinRecords:
     """The records of a joined source, in the order of its files."""
 
-    parts: tuple[Records, ...]  # with the good records of a block each
+    parts: tuple[ParsedRecords, ...]  # with the good records of a block each
     files: tuple[FileFacts, ...]
     malformed: int
 
@@ -126,14 +126,14 @@ def read_records(
     """Read the columns of each layout of a joined source."""
     files = SourceFiles.find(data_source(source_name), paths)
 
-    def parse(block: Block) -> Records:
+    def parse(block: Block) -> ParsedRecords:
         layout = block.file.layout
         if layout.layout == "delimited":
             return parse_delimited(block.data, layout, columns[layout.name], block.first_line)
         data = _padded(block) if layout.trimmed else block.data
         return parse_fixed_width(data, layout, columns[layout.name], block.first_line)
 
-    parts: list[Records] = []
+    parts: list[ParsedRecords] = []
     readings: list[FileReading] = []
     for reading, parsed in read_files(files.files, parse, progress=progress):
         parts += parsed

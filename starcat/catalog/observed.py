@@ -13,7 +13,7 @@ from starcat.stars.star_table import floats_of, with_columns
 SOURCE = "observed"
 """What `mag_source` and `band` say of a magnitude with the colour term of a sensor that flew."""
 
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 
 
 def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
@@ -51,8 +51,8 @@ def _check_numbers(stars: pa.Table, observed: Observed) -> None:
     wanted = np.array(observed.reject, dtype=np.int64)
     unknown = wanted[~np.isin(wanted, stars["star_id"].to_numpy())]
     if len(unknown):
-        named = ", ".join(map(str, unknown[:_MOST_NAMED].tolist()))
-        more = ", ..." if len(unknown) > _MOST_NAMED else ""
+        named = ", ".join(map(str, unknown[:_MAX_NAMED].tolist()))
+        more = ", ..." if len(unknown) > _MAX_NAMED else ""
         raise BuildError(
             f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are the "
             "star_id of no star of the catalog; learn from frames of a database of this catalog"

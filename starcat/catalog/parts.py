@@ -23,7 +23,7 @@ from starcat.catalog.archives.mapped import MappedTable, names_wanted, records_o
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
-from starcat.catalog.readers.records import Problem, Records
+from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
 from starcat.catalog.readers.tables import read_tables
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts, InputFile
@@ -41,7 +41,7 @@ NAMED_PROBLEMS = 20
 MAX_MALFORMED_FRACTION = 0.01
 """Above this share of malformed records (and more than 10 of them) a file is refused."""
 
-_MOST_BLOCKS, _MOST_REJECTED = 256, 1 << 18
+_MAX_BLOCKS, _MAX_REJECTED = 256, 1 << 18
 """Blocks and rejected records that are joined into one part at most."""
 
 RANGES = {
@@ -65,10 +65,10 @@ class Archive(Protocol):
     def COLUMNS(self) -> Mapping[str, Sequence[str]]:  # noqa: N802
         """Columns to parse, by layout."""
 
-    def magnitudes(self, records: Records, band: str, /) -> Array:
+    def magnitudes(self, records: ParsedRecords, band: str, /) -> Array:
         """Return the magnitudes of records; those beyond a read limit go no further."""
 
-    def stars(self, records: Records, band: str, verdicts: Verdicts, /) -> Columns:
+    def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
         """Return the star-table columns of records, and reject those that are no stars."""
 
 
@@ -89,17 +89,17 @@ class IngestOptions:
 
 
 @dataclass(frozen=True)
-class Part:
+class FilePart:
     """One block after parsing, or several joined."""
 
     rows: int  # records in it, good and malformed
     stars: pa.Table
     rejected: pa.Table
-    problems: list[Problem]  # why records are malformed
+    problems: list[MalformedRecord]  # why records are malformed
     counted: int = 0  # records beyond the read limit, which are in neither table
 
 
-def parse_block(block: Block, options: IngestOptions) -> Part:
+def parse_block(block: Block, options: IngestOptions) -> FilePart:
     """Return the stars and the rejected records of a block."""
     number, band = block.file.number, options.band
     catalog, records = _records(block, options)
@@ -117,10 +117,10 @@ def parse_block(block: Block, options: IngestOptions) -> Part:
     if records.problems:
         malformed = _malformed_rows(records.problems, number, options)
         rejected = pa.concat_tables([rejected, malformed])
-    return Part(rows, stars, rejected, records.problems, counted)
+    return FilePart(rows, stars, rejected, records.problems, counted)
 
 
-def _records(block: Block, options: IngestOptions) -> tuple[Archive, Records]:
+def _records(block: Block, options: IngestOptions) -> tuple[Archive, ParsedRecords]:
     """Return what a block holds, and whose records they are."""
     layout = block.file.layout
     if layout.table is not None and block.rows is not None:
@@ -147,7 +147,9 @@ def check_ranges(columns: Columns, verdicts: Verdicts) -> Columns:
     return {**columns, "ra_deg": np.where(found["ra_deg"] == 360.0, 0.0, found["ra_deg"])}
 
 
-def _malformed_rows(problems: Sequence[Problem], number: int, options: IngestOptions) -> pa.Table:
+def _malformed_rows(
+    problems: Sequence[MalformedRecord], number: int, options: IngestOptions
+) -> pa.Table:
     columns: Columns = {
         "catalog": options.source_name,
         "band": options.band,
@@ -159,7 +161,7 @@ def _malformed_rows(problems: Sequence[Problem], number: int, options: IngestOpt
     return table_from_columns("rejected", columns, len(problems))
 
 
-_Parsed = TypeVar("_Parsed", Part, Records)
+_Parsed = TypeVar("_Parsed", FilePart, ParsedRecords)
 
 
 class FileReading:
@@ -168,7 +170,7 @@ class FileReading:
     def __init__(self, file: InputFile) -> None:
         self.file = file
         self.rows = self.malformed = 0
-        self.problems: list[Problem] = []  # the first `NAMED_PROBLEMS`
+        self.problems: list[MalformedRecord] = []  # the first `NAMED_PROBLEMS`
         self._digest: DigestReader | None = None
 
     def blocks(self) -> Iterator[Block]:
@@ -223,7 +225,7 @@ class FileReading:
         """The first malformed records, each with file, line and bytes."""
         return tuple(f"{self.file.path.name} {problem}" for problem in self.problems)
 
-    def _error(self, what: str, first: Problem | None = None) -> ParseError:
+    def _error(self, what: str, first: MalformedRecord | None = None) -> ParseError:
         if first is None:
             return self.file.error(what)
         place = {"line": first.line, "byte_range": first.byte_range, "field": first.field}
@@ -262,28 +264,28 @@ def _blocks_of_all(
         progress(stage, before + sizes[number], sum(sizes))
 
 
-def merged(parts: Iterable[Part], rows: int) -> Iterator[Part]:
+def merged(parts: Iterable[FilePart], rows: int) -> Iterator[FilePart]:
     """Join blocks until there are about so many stars: with a read limit they have few each."""
-    held: list[Part] = []
+    held: list[FilePart] = []
     for part in parts:
         held.append(part)
         stars, rejected = (sum(len(table) for table in tables) for tables in _tables(held))
-        if stars >= rows or rejected >= _MOST_REJECTED or len(held) >= _MOST_BLOCKS:
+        if stars >= rows or rejected >= _MAX_REJECTED or len(held) >= _MAX_BLOCKS:
             yield _joined(held)
             held = []
     if held:
         yield _joined(held)
 
 
-def _tables(parts: Sequence[Part]) -> tuple[list[pa.Table], list[pa.Table]]:
+def _tables(parts: Sequence[FilePart]) -> tuple[list[pa.Table], list[pa.Table]]:
     return [part.stars for part in parts], [part.rejected for part in parts]
 
 
-def _joined(parts: Sequence[Part]) -> Part:
+def _joined(parts: Sequence[FilePart]) -> FilePart:
     if len(parts) == 1:
         return parts[0]
     stars, rejected = (pa.concat_tables(tables) for tables in _tables(parts))
-    return Part(
+    return FilePart(
         sum(part.rows for part in parts),
         stars,
         rejected,

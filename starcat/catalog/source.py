@@ -61,7 +61,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Column(_Model):
+class SourceColumn(_Model):
     """One column of a record."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # the archive's own label, in snake_case
@@ -74,7 +74,7 @@ class Column(_Model):
     description: str = ""
 
     @model_validator(mode="after")
-    def _check(self) -> Column:
+    def _check(self) -> SourceColumn:
         if not (_FORMAT.match(self.format) or _BINARY.match(self.format)):
             raise ValueError(f"column {self.name}: format {self.format!r} is not like I6, F9.6, A3")
         if self.unit not in (None, *UNITS):
@@ -137,7 +137,7 @@ class RecordFile(_Model):
     rows: int | None = None  # records in the whole archive file
     sha256: str | None = None  # of the file as published, where it is known
     urls: tuple[str, ...] = ()  # the preferred first
-    columns: tuple[Column, ...] = ()  # the record, in order; of a table the file has them
+    columns: tuple[SourceColumn, ...] = ()  # the record, in order; of a table the file has them
 
     @model_validator(mode="after")
     def _check(self) -> RecordFile:
@@ -161,7 +161,7 @@ class RecordFile(_Model):
                 )
         return self
 
-    def column(self, name: str) -> Column:
+    def column(self, name: str) -> SourceColumn:
         """Return the column called ``name``."""
         return {column.name: column for column in self.columns}[name]
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.catalog.archives.mapped import Understood, names_wanted, records_of, target, understand
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers.tables import open_table, read_tables
 from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import SourceFiles
@@ -80,7 +80,7 @@ def check_map(source: DataSource, path: Path) -> Checked:
             records = records_of(table, rows, file)
             for key, values in ranges.items():
                 values.add(records["star_text" if key == "columns.star_id" else key])
-    read = ingest(source.name, [path], neighbours=False)
+    read = ingest_catalog(source.name, [path], neighbours=False)
     used = {name for one in found.values() for name in one.columns}
     return Checked(
         source.name,

@@ -15,7 +15,7 @@ from starcat.catalog.readers.records import TableColumn
 from starcat.catalog.readers.tables import ANY, SAMPLE_ROWS, open_table
 from starcat.catalog.source import RecordFile, source_names
 from starcat.catalog.source_files import InputFile, table_parts
-from starcat.catalog.table_map import UNITS, unit_of
+from starcat.catalog.table_map import UNITS, unit_of_column
 from starcat.errors import SourceMissing
 
 _WHEN = r"(deg|rad|h|hr|hours?|hms|dms|mean|icrs|fk4|fk5|j|b|ep|epoch|[12][0-9]{3})*"
@@ -62,7 +62,7 @@ _USUAL = {"radial_velocity": "km/s", "pm_ra": "mas/yr", "parallax_error": "mas"}
 
 
 @dataclass
-class Draft:
+class MapDraft:
     """What is proposed for the columns of a table."""
 
     path: Path
@@ -119,7 +119,7 @@ class Draft:
         return found
 
 
-def draft_map(path: Path) -> Draft:
+def draft_map(path: Path) -> MapDraft:
     """Propose a map for a table."""
     parts = table_parts(path) if path.is_dir() else [path]
     if not parts or not parts[0].exists():
@@ -129,7 +129,7 @@ def draft_map(path: Path) -> Draft:
     rows = next(opened.rows(list(opened.columns)), None)
     names = list(opened.columns)
     sample = rows.table.slice(0, SAMPLE_ROWS) if rows else pa.table({name: [] for name in names})
-    made = Draft(path, opened.columns, sample)
+    made = MapDraft(path, opened.columns, sample)
     _split_angles(made)
     for key, name in _guesses(made):
         _take(made, key, name)
@@ -141,7 +141,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
 
 
-def _guesses(made: Draft) -> Iterator[tuple[str, str]]:
+def _guesses(made: MapDraft) -> Iterator[tuple[str, str]]:
     """Give keys and the columns that may be them, the likeliest first."""
     for by_ucd in (True, False):
         for key, ucd, pattern in _RULES:
@@ -166,7 +166,7 @@ def _base(name: str, column: TableColumn) -> tuple[str, bool]:
     return base, base != name or column.ucd.lower().startswith("stat.error")
 
 
-def _magnitudes(made: Draft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
+def _magnitudes(made: MapDraft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
     for name, column in made.columns.items():
         base, is_error = _base(re.sub(r"\s*[\[(].*?[\])]", "", name), column)
         told = re.search(r"phot\.(?:mag|flux).*em\.[a-z]+\.(?P<band>[A-Za-z]+)$", column.ucd)
@@ -187,7 +187,7 @@ def _band(text: str) -> str:
     return text.upper() if text.lower() in ("bp", "rp", "bt", "vt") else text
 
 
-def _take(made: Draft, key: str, name: str) -> None:
+def _take(made: MapDraft, key: str, name: str) -> None:
     """Make a column the value of a key, if neither has another yet."""
     kind, _, band = key.partition(".")
     if name in made.used:
@@ -218,7 +218,7 @@ def _take(made: Draft, key: str, name: str) -> None:
     made.notes[key] = "; ".join(filter(None, (made.columns[name].description[:60], note)))
 
 
-def _unit(made: Draft, key: str, name: str) -> tuple[str, str]:
+def _unit(made: MapDraft, key: str, name: str) -> tuple[str, str]:
     """Return the unit to state, empty where none is needed, and what to look at."""
     kind, _, short = key.partition(".")
     wanted = "mag" if kind.startswith("magnitude") else UNITS.get(short, "")
@@ -229,7 +229,7 @@ def _unit(made: Draft, key: str, name: str) -> tuple[str, str]:
         if _is_unit(text):
             return text, ""
     for text in name.split("_")[1:]:
-        if _is_unit(text) and unit_of(text).physical_type in _KINDS:
+        if _is_unit(text) and unit_of_column(text).physical_type in _KINDS:
             return text, ""
     numbers = made.numbers(name)
     largest = max(map(abs, numbers), default=0.0)
@@ -252,13 +252,13 @@ _KINDS = (
 
 def _is_unit(text: str) -> bool:
     try:
-        unit_of(text)
+        unit_of_column(text)
     except ValueError:
         return False
     return True
 
 
-def _condition(made: Draft, name: str) -> str:
+def _condition(made: MapDraft, name: str) -> str:
     """Return a condition for which values of a flag mean yes."""
     column, values = made.columns[name], made.values(name)
     shown = name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) else f'"{name}"'
@@ -275,7 +275,7 @@ def _condition(made: Draft, name: str) -> str:
     return json.dumps(f"{shown} IN ({', '.join(repr(str(one)) for one in yes)})")
 
 
-def _split_angles(made: Draft) -> None:
+def _split_angles(made: MapDraft) -> None:
     """Take hours and degrees that are apart from their minutes and seconds, as the CDS has them."""
     names = {name.lower(): name for name in made.columns}
     hours = [names.get(one, "") for one in ("rah", "ram", "ras")]
@@ -297,7 +297,7 @@ def _sum(names: Sequence[str]) -> str:
     return f"{names[0]} + {names[1]} / 60 + {names[2]} / 3600"
 
 
-def _place_and_time(made: Draft) -> None:
+def _place_and_time(made: MapDraft) -> None:
     """Propose frame, equinox and epoch."""
     place = " ".join(name.lower() for name, key in made.used.items() if key in ("ra", "dec"))
     year = re.search(r"(1[89][0-9]{2}|20[0-9]{2})", place)

@@ -64,7 +64,7 @@ class Value(_Model):
         if self.value == "":
             raise ValueError("is empty; name a column or write an expression, or leave the key out")
         if self.unit is not None:
-            unit_of(self.unit)
+            unit_of_column(self.unit)
         return self
 
 
@@ -75,7 +75,7 @@ def _as_value(given: Any) -> Any:
 Given = Annotated[Value, BeforeValidator(_as_value)]
 
 
-def unit_of(text: str) -> Any:
+def unit_of_column(text: str) -> Any:
     """Return the unit of astropy that a text means; `ValueError` where it means none."""
     from astropy import units
 

@@ -20,9 +20,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, whole_numbers, with_code
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
@@ -63,7 +63,7 @@ def read_amplitudes(
     """Read the amplitudes of a source."""
     if source_name in _READERS:
         return _READERS[source_name](paths, progress)
-    read = ingest(source_name, paths, neighbours=False, progress=progress)
+    read = ingest_catalog(source_name, paths, neighbours=False, progress=progress)
     # A star without a position can still be known to vary.
     usable = read.rejected.filter(pc.is_valid(read.rejected["star_id"]))
     columns = [name for name in usable.column_names if name in read.stars.column_names]
@@ -133,7 +133,7 @@ def read_vsx(paths: Sequence[Path], progress: Progress = no_progress) -> Amplitu
     )
 
 
-def _amplitudes_of_vsx(part: Records) -> Array:
+def _amplitudes_of_vsx(part: ParsedRecords) -> Array:
     maxima, minima = texts_of(part["mag_max"]), texts_of(part["mag_min"])
     return _amplitudes(maxima, minima, part["f_min"] == b"(")
 

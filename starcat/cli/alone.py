@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcat.errors import StarcatError, worded
-from starcat.version import __version__, lacking
+from starcat.version import __version__, missing_packages
 
 if TYPE_CHECKING:
     from starcat.matcher.result import MatchResult
@@ -28,14 +28,14 @@ def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
     """Run ``identify``; of any other command say that it is not there. Returns the exit code."""
     command = next((word for word in arguments if not word.startswith("-")), "")
     if command not in ("", "identify"):
-        return _refused(lacking(f"starcat {command}", missing), USAGE)
+        return _refused(missing_packages(f"starcat {command}", missing), USAGE)
     try:
         given = _parser().parse_args(list(arguments) or ["--help"])
         _identify(given.database, given.frames, given.fov_error, as_lines=given.json)
     except StarcatError as error:
         return _refused(worded(error, _option_of), error.exit_code)
     except ModuleNotFoundError as error:
-        return _refused(lacking("starcat identify", error), USAGE)
+        return _refused(missing_packages("starcat identify", error), USAGE)
     except BrokenPipeError:  # the reader of the output is gone
         return 1
     return 0
@@ -68,14 +68,14 @@ def _parser() -> argparse.ArgumentParser:
 def _identify(
     database: str, files: Sequence[Path], fov_error: float | None, *, as_lines: bool
 ) -> None:
-    from starcat.matcher.centroids import read_frames
+    from starcat.matcher.centroids import read_centroid_files
     from starcat.matcher.matcher import Matcher
     from starcat.matcher.settings import SCALE_FREE
 
     matcher = Matcher.open(database, None)
     default = FOV_ERROR if matcher.method in SCALE_FREE else 0.0
     error = default if fov_error is None else fov_error
-    for frame in (frame for path in files for frame in read_frames(path)):
+    for frame in (frame for path in files for frame in read_centroid_files(path)):
         found = matcher.identify(
             frame.centroids_px, magnitudes=frame.mag, sigma_px=frame.sigma_px, fov_error=error
         )

@@ -23,7 +23,7 @@ from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
     from starcat.artifact.diff import Change, Difference
-    from starcat.artifact.reader import Artifact
+    from starcat.artifact.reader import DatabaseFolder
     from starcat.artifact.verify import Verification
     from starcat.pipeline.rebuild import Rebuilt
     from starcat.report.report import CoverageReport
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command("inspect")
 def inspect(
     artifact: Annotated[
         Path,
@@ -47,9 +47,9 @@ def inspect(
     """
     if artifact.is_file():
         from starcat.cli.exchange import print_image
-        from starcat.onboard.reading import read_image
+        from starcat.onboard.reading import read_onboard_image
 
-        image = read_image(artifact)
+        image = read_onboard_image(artifact)
         show(json, image.as_dict(), print_image, image)
         return
     from starcat.artifact.reader import open_artifact
@@ -58,8 +58,8 @@ def inspect(
     show(json, opened.manifest, print_artifact, opened)
 
 
-@app.command()
-def coverage(
+@app.command("coverage")
+def coverage_command(
     artifact: Annotated[
         Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
     ],
@@ -75,8 +75,8 @@ def coverage(
     print_coverage(open_artifact(artifact), output, as_json=json)
 
 
-@app.command()
-def verify(
+@app.command("verify")
+def verify_command(
     artifact: Annotated[
         Path,
         typer.Argument(
@@ -113,8 +113,8 @@ def verify(
         raise typer.Exit(ProductError.exit_code)
 
 
-@app.command()
-def diff(
+@app.command("diff")
+def diff_command(
     a: Annotated[Path, typer.Argument(metavar="A", help="The earlier database's folder.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The later one's.")],
     json: Json = False,
@@ -131,8 +131,8 @@ def diff(
     show(json, {**names, **found.as_dict()}, print_difference, found, *names.values())
 
 
-@app.command()
-def rebuild(
+@app.command("rebuild")
+def rebuild_command(
     artifact: Annotated[
         Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
     ],
@@ -241,7 +241,7 @@ def _count(rows: int | None) -> str:
 _BARS, _BAR_WIDTH = 20, 50
 
 
-def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
+def print_coverage(artifact: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of a database, and write its tables and plots where asked to."""
     from starcat.pipeline.report_data import artifact_coverage
     from starcat.report.report import coverage_warnings, write_coverage

@@ -36,12 +36,12 @@ _KEYS = (
 )
 
 
-def main() -> None:
+def astap_main() -> None:
     """Run the command."""
-    sys.exit(run(sys.argv[1:]))
+    sys.exit(run_astap(sys.argv[1:]))
 
 
-def run(arguments: Sequence[str]) -> int:
+def run_astap(arguments: Sequence[str]) -> int:
     """Solve a picture as ASTAP's options say; returns ASTAP's exit code."""
     given, _ = _parser().parse_known_args(arguments)
     picture = Path(given.f)

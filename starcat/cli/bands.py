@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command("bands")
 def bands(
     response: Annotated[
         str | None,

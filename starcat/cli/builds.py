@@ -30,11 +30,11 @@ from starcat.cli.options import (
     inputs_by_source,
     to_folder,
 )
-from starcat.cli.remote import service_of
+from starcat.cli.remote import client_of
 from starcat.errors import BuildError
 
 if TYPE_CHECKING:
-    from starcat.artifact.reader import Artifact
+    from starcat.artifact.reader import DatabaseFolder
     from starcat.pipeline.build import Built
     from starcat.report.report import CoverageReport
     from starcat.simulation.selftest import Rates
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
-def build(
+@app.command("build")
+def build_command(
     context: typer.Context,
     spec: SpecFile = None,
     preset: PresetName = None,
@@ -80,7 +80,7 @@ def build(
         _build_remotely(context, chosen_spec(spec, preset, changes), output, as_json=json)
         return
     from starcat.pipeline.build import Built
-    from starcat.pipeline.build import build as run_build
+    from starcat.pipeline.build import build_database as run_build
 
     given = inputs_by_source(inputs, maps=sources)
     chosen = chosen_spec(spec, preset, changes)
@@ -126,7 +126,7 @@ def _build_remotely(
     from starcat.artifact.reader import open_artifact
     from starcat.simulation.selftest import rates_of
 
-    client = service_of(context)
+    client = client_of(context)
     with progress_bars() as progress:
         job = client.build(spec.recorded(), progress)
         database = str(job["result"]["database"])
@@ -239,7 +239,7 @@ def print_rates(rates: Sequence[Rates]) -> None:
     )
 
 
-def print_artifact(artifact: Artifact) -> None:
+def print_artifact(artifact: DatabaseFolder) -> None:
     """Print what a database holds."""
     from starcat.specs.build_spec import CameraSpec
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command("sources")
 def sources(
     file: Annotated[
         Path | None, typer.Argument(help="A table of your own, for --check or --draft.")
@@ -74,8 +74,8 @@ Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that wa
 Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that differs (hats).")]
 
 
-@app.command()
-def ingest(
+@app.command("ingest")
+def ingest_command(
     output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
     source: Annotated[
         str | None, typer.Argument(help="A star catalog, such as sao; default: that of --source.")
@@ -171,8 +171,8 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
     return own[0] if name is None else source_given(name).name
 
 
-@app.command()
-def crossmatch(
+@app.command("crossmatch")
+def crossmatch_command(
     a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet).")],
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")

@@ -120,7 +120,7 @@ def progress_bars() -> Iterator[Progress]:
             bars = stack.enter_context(StageBars(console))
 
         def draw(stage: str, done: int, total: int | None) -> None:
-            interrupts.check()
+            interrupts.check_interrupt()
             reached[0] = stage
             if bars is not None:
                 bars.show(stage, done, total)

@@ -66,8 +66,8 @@ PatchFrom = Annotated[
 ]
 
 
-@app.command()
-def export(
+@app.command("export")
+def export_command(
     source: SourcePath = None,
     form: FormatName = "csv",
     output: OutputPath = None,

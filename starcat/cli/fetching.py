@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
+@app.command("fetch")
 def fetch(
     source: Annotated[
         str,

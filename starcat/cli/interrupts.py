@@ -32,7 +32,7 @@ def stop(number: int, frame: Any) -> None:
     _raise(number)
 
 
-def check() -> None:
+def check_interrupt() -> None:
     """Raise the exception of a signal that has come and was lost."""
     if _received:
         _raise(_received[0])

@@ -27,7 +27,7 @@ Registry = Annotated[Path, typer.Argument(help="Folder of the registry.")]
 Sign = Annotated[list[Path], typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")]
 
 
-@keys.command()
+@keys.command("new")
 def new(
     name: Annotated[Path, typer.Argument(help="Of the two files, without an ending.")],
     json: Json = False,
@@ -61,8 +61,8 @@ def show_roles(
     _show(roles_of(registry), json)
 
 
-@keys.command()
-def renew(
+@keys.command("renew")
+def renew_command(
     registry: Registry,
     sign: Sign,
     days: Annotated[float, typer.Option(min=0.001, help="Days until it has to be renewed.")] = 90.0,
@@ -80,7 +80,7 @@ def renew(
     _show(run(registry, signing_with(sign, days=days)), json)
 
 
-@keys.command()
+@keys.command("roles")
 def roles(
     registry: Registry,
     sign: Sign,

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
-def learn(
+@app.command("learn")
+def learn_command(
     database: Annotated[
         Path, typer.Argument(help="The folder <name>-<version> they were identified with.")
     ],

@@ -107,7 +107,7 @@ def main() -> None:
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
         code = _run([*arguments, *behind])
-        interrupts.check()
+        interrupts.check_interrupt()
     except Exception as error:
         if is_debug:
             traceback.print_exc()

@@ -20,7 +20,7 @@ from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
-from starcat.simulation.simulate import Frame
+from starcat.simulation.simulate import SimulatedFrame
 
 NAMED = 3  # frames that are named where some were not identified
 
@@ -276,7 +276,7 @@ def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
         print_things("Planets in the frame", bodies, columns, numbers=(2, 3, 4, 5))
 
 
-def simulated_facts(frame: Frame, output: Path) -> dict[str, Any]:
+def simulated_facts(frame: SimulatedFrame, output: Path) -> dict[str, Any]:
     """Return the truth about a simulated frame."""
     ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
     return {

@@ -61,7 +61,7 @@ ContactSheet = Annotated[
 ]
 
 
-@app.command()
+@app.command("methods")
 def methods(json: opt.Json = False) -> None:
     """List the ways to identify stars, and the products that each needs.
 
@@ -78,8 +78,8 @@ def methods(json: opt.Json = False) -> None:
     show(json, rows, print_things, "Methods", cells, columns)
 
 
-@app.command()
-def simulate(
+@app.command("simulate")
+def simulate_command(
     artifact: Folder,
     output: Annotated[Path, opt.to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
@@ -112,8 +112,8 @@ def simulate(
     )
 
 
-@app.command(cls=OptionsInPanels)
-def identify(
+@app.command("identify", cls=OptionsInPanels)
+def identify_command(
     context: typer.Context,
     artifact: Folder,
     files: FrameFiles,
@@ -248,8 +248,8 @@ def _print_file_answers(
     return tally
 
 
-@app.command()
-def calibrate(
+@app.command("calibrate")
+def calibrate_command(
     artifact: Folder,
     files: Annotated[
         list[str], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
@@ -312,7 +312,7 @@ def calibrate(
     print_calibration(found, output, turned_by(found, when) if when else None, as_json=json)
 
 
-@app.command()
+@app.command("selftest")
 def selftest(
     artifact: Folder,
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,

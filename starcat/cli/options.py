@@ -297,14 +297,14 @@ def observer_of_options(
             word = "--velocity" if velocity is not None else "--orbit"
             raise ConfigError(f"{word} is given without --time, the time that it is of")
         return None
-    from starcat.sky.observer import Observer, numbers_of
+    from starcat.sky.observer import Observer, observer_numbers
 
     if orbit is not None:
         if velocity is not None:
             raise ConfigError("give either --velocity or --orbit, which holds the velocity too")
-        state = numbers_of("--orbit", orbit, 6)
+        state = observer_numbers("--orbit", orbit, 6)
         return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
-    speed = None if velocity is None else numbers_of("--velocity", velocity, 3)
+    speed = None if velocity is None else observer_numbers("--velocity", velocity, 3)
     return Observer.at(time, velocity_km_s=speed)
 
 

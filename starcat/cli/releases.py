@@ -30,8 +30,8 @@ SIGNED = {
 """What is said of the signatures of what was pulled."""
 
 
-@app.command()
-def publish(
+@app.command("publish")
+def publish_command(
     artifact: Annotated[
         Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
     ],
@@ -62,8 +62,8 @@ def publish(
     show(json, published.as_dict(), print_published, published)
 
 
-@app.command()
-def pull(
+@app.command("pull")
+def pull_command(
     wanted: Annotated[
         str | None,
         typer.Argument(metavar="NAME@VERSION", help="Or NAME@latest, or NAME for the latest."),
@@ -110,7 +110,7 @@ def pull(
     show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
 
 
-@app.command()
+@app.command("releases")
 def releases(
     registry: Annotated[str, typer.Argument(help="Folder or http(s) address of the registry.")],
     retries: Retries = 3,

@@ -50,7 +50,7 @@ def sql_remotely(
     from starcat.query.gallery import guessed
     from starcat.query.result import ResultTable
 
-    client, output, named = service_of(context), question.output, question.named
+    client, output, named = client_of(context), question.output, question.named
     if question.query is None and named is None:
         raise QueryError("--server needs the query on the line, or --named")
     if not targets:
@@ -82,7 +82,7 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     """Have a service identify frames, and print the answers."""
     from starcat.cli.matches import print_contents
 
-    client, given = service_of(context), context.params
+    client, given = client_of(context), context.params
     picture: Path | None = given["picture"]
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
         raise ConfigError(f"{picture}: the picture is PNG or SVG; end its name so", key="picture")
@@ -106,14 +106,14 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
     from starcat.cli.options import identify_options
-    from starcat.specs.reading import MOST_BYTES
+    from starcat.specs.reading import MAX_BYTES
     from starcat.storage.regular_files import read_regular_file
 
     camera: Path | None = given["camera"]
     try:
         text = None
         if camera is not None:
-            text = read_regular_file(camera, MOST_BYTES).decode("utf-8")
+            text = read_regular_file(camera, MAX_BYTES).decode("utf-8")
     except (SourceError, UnicodeDecodeError) as error:
         raise ConfigError(f"{error}; expected a camera file", key="camera") from error
     options = identify_options(given) | {"camera": text}
@@ -127,7 +127,7 @@ def _of_stdin(folder: Path) -> Path:
     return path
 
 
-def service_of(context: typer.Context) -> Client:
+def client_of(context: typer.Context) -> Client:
     """Return the service; refuse options that it does not take."""
     for name in LOCAL_OPTIONS[context.info_name or ""]:
         source = context.get_parameter_source(name)

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-@app.command()
-def presets(
+@app.command("presets")
+def presets_command(
     name: Annotated[str | None, typer.Argument(help="Only this one.")] = None,
     toml: Annotated[
         bool, typer.Option("--toml", help="Print the whole spec with every key explained.")
@@ -74,8 +74,8 @@ def presets(
         show(json, facts, print_things, "", specs, columns)
 
 
-@app.command()
-def estimate(
+@app.command("estimate")
+def estimate_command(
     spec: SpecFile = None,
     preset: PresetName = None,
     changes: Changes = None,
@@ -96,8 +96,8 @@ def estimate(
     print_estimate(found, as_json=json)
 
 
-@app.command()
-def init(
+@app.command("init")
+def init_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
     size: Annotated[
         str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")

@@ -38,7 +38,7 @@ FormatName = Annotated[
 ]
 
 
-@app.command()
+@app.command("sql")
 def sql(
     context: typer.Context,
     arguments: Arguments = None,

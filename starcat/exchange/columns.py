@@ -176,7 +176,7 @@ def is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind))
 
 
-def is_number(kind: pa.DataType) -> bool:
+def is_numeric_column(kind: pa.DataType) -> bool:
     """Return whether a type is an integer or a floating-point number."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 

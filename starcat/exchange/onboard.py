@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
@@ -22,7 +22,7 @@ from starcat.onboard.checking import artifact_problems, capacity_problems, value
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
 from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder, crc_of
 from starcat.onboard.patching import apply_patch, make_patch
-from starcat.onboard.reading import OnboardImage, bytes_of_file, read_image
+from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.onboard.shrink import Shrunk, shrink
 from starcat.onboard.signature import (
     MAX_ADDED_BYTES,
@@ -118,7 +118,7 @@ def export_image(
             key="patch_from",
             fields=("patch_from", "form"),
         )
-    old = None if patch_from is None else read_image(Path(patch_from))
+    old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
         raise OutputError(
             f"{target}: is a folder; choose a file with output", path=target, fields=("output",)
@@ -132,7 +132,7 @@ def export_image(
     files = {target: made.data}
     if file_format == "c":
         files = _c_files(made, fitted.contents.name, target, order)
-    patch = None if old is None else _checked_patch(old, read_image(made.data))
+    patch = None if old is None else _checked_patch(old, read_onboard_image(made.data))
     if patch is not None:
         files[target.with_suffix(".patch")] = patch
     _write(files, replace=replace)
@@ -148,7 +148,7 @@ def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:
     return patch
 
 
-def contents_of(artifact: Artifact, method: str) -> Contents:
+def contents_of(artifact: DatabaseFolder, method: str) -> Contents:
     """Return what the image of a database is made of."""
     _check_product(artifact, method)
     product, columns = FEATURES[method]
@@ -177,7 +177,7 @@ def verify_image(
     data = bytes_of_file(path)
     checks, findings = 1, list(_damage(data, path.name))
     if not findings:
-        image = read_image(data)
+        image = read_onboard_image(data)
         problems = [*value_problems(image), *capacity_problems(image)]
         problems += signature_problems(image, key)
         checks += 5 + len(image_signatures(data, image.byte_order)) + (key is not None)
@@ -190,7 +190,7 @@ def verify_image(
 
 def _damage(data: bytes, file: str) -> Iterator[Finding]:
     try:
-        read_image(data)
+        read_onboard_image(data)
     except OnboardImageError as error:
         for block in error.bad_blocks:
             where = f"bytes {block * BLOCK_BYTES} to {(block + 1) * BLOCK_BYTES - 1}"
@@ -199,11 +199,11 @@ def _damage(data: bytes, file: str) -> Iterator[Finding]:
             yield Finding(file, "", str(error))
 
 
-def _name(artifact: Artifact) -> str:
+def _name(artifact: DatabaseFolder) -> str:
     return f"{artifact.manifest['name']}-{artifact.manifest['version']}"
 
 
-def _check_product(artifact: Artifact, method: str) -> None:
+def _check_product(artifact: DatabaseFolder, method: str) -> None:
     product, _ = FEATURES[method]
     if product not in artifact.products:
         raise ConfigError(
@@ -216,7 +216,7 @@ def _check_product(artifact: Artifact, method: str) -> None:
         )
 
 
-def _times_seen(artifact: Artifact, method: str) -> NDArray[np.int32] | None:
+def _times_seen(artifact: DatabaseFolder, method: str) -> NDArray[np.int32] | None:
     """Return the boresights that see each triangle; None for pairs, which no one counts."""
     if method != "triangle":
         return None
@@ -224,7 +224,7 @@ def _times_seen(artifact: Artifact, method: str) -> NDArray[np.int32] | None:
     return seen
 
 
-def _fields(artifact: Artifact) -> FieldStars:
+def _fields(artifact: DatabaseFolder) -> FieldStars:
     spec = spec_from_dict(artifact.manifest["spec"], MANIFEST_NAME)
     return tile_guide_stars(artifact.table("stars"), spec)
 

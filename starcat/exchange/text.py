@@ -24,7 +24,7 @@ from starcat.errors import SchemaError
 from starcat.exchange.columns import (
     column_error,
     is_list,
-    is_number,
+    is_numeric_column,
     plain_batch,
     plain_schema,
     steps,
@@ -117,7 +117,7 @@ def cells_of(name: str, values: pa.Array, *, signed: bool) -> Cells:
     """
     is_null = values.is_null().to_numpy(zero_copy_only=False) if values.null_count else None
     offsets = None
-    if is_list(values.type) and is_number(values.type.value_type):
+    if is_list(values.type) and is_numeric_column(values.type.value_type):
         offsets, items = _list_offsets(values), values.flatten()
         if items.null_count and pa.types.is_integer(items.type):
             raise column_error(

@@ -19,7 +19,7 @@ from starcat.exchange.columns import (
     column_error,
     field_facts,
     is_list,
-    is_number,
+    is_numeric_column,
     unit_text,
 )
 from starcat.exchange.text import Cells, cells_of, plain_values
@@ -170,7 +170,7 @@ def _votable_column(field: pa.Field) -> VotableColumn:
     xtype = (field.metadata or {}).get(b"xtype", b"").decode() or None
     if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
         xtype = "timestamp"
-    has_lists = is_list(kind) and is_number(kind.value_type)
+    has_lists = is_list(kind) and is_numeric_column(kind.value_type)
     if has_lists:
         kind = kind.value_type
     plain = plain_values(field.name, pa.array([], kind), signed=True).type
@@ -200,8 +200,8 @@ def head(
     """Return all that stands before the rows."""
     parts = [_VOTABLE, _RESULTS]
     for name, text in label.origin.items():
-        parts.append(info(name, text, f"starcat.{name}"))
-    parts += [info(name, text) for name, text in infos.items()]
+        parts.append(info_element(name, text, f"starcat.{name}"))
+    parts += [info_element(name, text) for name, text in infos.items()]
     if has_places(columns):
         parts.append(f"{_COOSYS}{epoch}/>\n")
     name = f" name={_attribute(label.table)}" if label.table else ""
@@ -215,7 +215,7 @@ def foot(serialization: str, infos: Sequence[str] = ()) -> str:
     return "".join([_AFTER_ROWS[serialization], "  </TABLE>\n", *infos, _AFTER_TABLE])
 
 
-def info(name: str, value: str, identifier: str = "", text: str = "") -> str:
+def info_element(name: str, value: str, identifier: str = "", text: str = "") -> str:
     """Return an ``INFO`` element."""
     begins = f"ID={_attribute(identifier)} " if identifier else ""
     start = f"  <INFO {begins}name={_attribute(name)} value={_attribute(value)}"
@@ -224,7 +224,7 @@ def info(name: str, value: str, identifier: str = "", text: str = "") -> str:
 
 def error_document(text: str) -> bytes:
     """Return a VOTable that says why there is no answer."""
-    said = info("Error", text) + _RESULTS + info("QUERY_STATUS", "ERROR", text=text)
+    said = info_element("Error", text) + _RESULTS + info_element("QUERY_STATUS", "ERROR", text=text)
     return f"{_VOTABLE}{said}{_AFTER_TABLE}".encode()
 
 

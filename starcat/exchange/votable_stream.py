@@ -24,7 +24,7 @@ from starcat.exchange.votable_fields import (
     foot,
     has_places,
     head,
-    info,
+    info_element,
     votable_cells,
     votable_columns,
 )
@@ -73,11 +73,11 @@ def votable_chunks(
     try:
         yield from rows
         if cut.were_more:
-            last = [info("QUERY_STATUS", "OVERFLOW")]
+            last = [info_element("QUERY_STATUS", "OVERFLOW")]
     except StarcatError as error:
-        last = [info("QUERY_STATUS", "ERROR", text=str(error))]
+        last = [info_element("QUERY_STATUS", "ERROR", text=str(error))]
     except (OSError, pa.ArrowException):
-        last = [info("QUERY_STATUS", "ERROR", text="the rest of the rows cannot be read")]
+        last = [info_element("QUERY_STATUS", "ERROR", text="the rest of the rows cannot be read")]
     yield foot(serialization, last).encode()
 
 

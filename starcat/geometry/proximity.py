@@ -16,7 +16,7 @@ AT_ONCE = 50_000
 SAMPLE = 1000
 """Stars whose neighbours tell how far apart the others are."""
 
-MOST_NEAR = 8.0
+MAX_NEAR = 8.0
 """Stars within the radius of a star, on average, up to which all pairs are looked at."""
 
 
@@ -76,7 +76,7 @@ def _nearest_of_pairs(
     best, index = np.full(len(stars), np.inf), np.full(len(stars), len(stars))
     some = stars[np.random.default_rng(0).integers(len(stars), size=SAMPLE)]
     radius = float(np.quantile(_nearest(tree, some, 2, 0)[0][:, 1], 0.9))
-    if tree.query_ball_point(some, radius, return_length=True).mean() > MOST_NEAR:
+    if tree.query_ball_point(some, radius, return_length=True).mean() > MAX_NEAR:
         return best, index
     pairs = tree.query_pairs(radius, output_type="ndarray")
     legs = (stars[pairs[:, 0]] - stars[pairs[:, 1]]) ** 2

@@ -1,6 +1,6 @@
 """What stands above the background of a star image, and the noise that it stands in.
 
-Input is a grey image, output is a `Levels`. Background and noise vary slowly over the image, and
+Input is a grey image, output is a `SkyLevels`. Background and noise vary slowly over the image, and
 single hot pixels can be taken out. What is a star is not decided here.
 """
 
@@ -31,7 +31,7 @@ _EXCESS_SIGMA_PX = (1.0, 4.0)
 _CUT_SHARE = (0.2, 0.985)
 _STAR_NOISE = 4.5
 _FLAT_EXCESS = 0.3  # smoothed pixels with so little of the noise of white ones are flat, not noisy
-_MOST_EXCESS = 10.0
+_MAX_EXCESS = 10.0
 # Noise is white up to the first; the background has structure beyond the second.
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
 _HOT_NOISE = 4.0
@@ -43,7 +43,7 @@ _HOT_MEDIAN_PART, _HOT_ROUNDS = 0.15, 3
 
 
 @dataclass(frozen=True)
-class Levels:
+class SkyLevels:
     """An image and its background."""
 
     raw: Grey  # shape (height, width): grey values; 0 where they are left out
@@ -72,7 +72,7 @@ def load_sep() -> Any:
         ) from error
 
 
-def subtract_background(image: ArrayLike) -> Levels:
+def subtract_background(image: ArrayLike) -> SkyLevels:
     """Take the background off an image."""
     values = np.asarray(image)
     if values.ndim != 2 or min(values.shape) < SMALLEST_PX or values.dtype.kind not in "buif":
@@ -100,7 +100,7 @@ def unmasked(values: Grey, mask: Mask) -> Grey:
     return values[~mask] if mask.any() else values.reshape(-1)
 
 
-def _leveled(raw: Grey, mask: Mask) -> Levels:
+def _leveled(raw: Grey, mask: Mask) -> SkyLevels:
     """Return levels with boxes as large as the structure of the background allows."""
     least = _least_noise(unmasked(raw, mask))
     levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
@@ -119,10 +119,10 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
         fine, coarse = _excess(levels)
         if coarse < _CLOUD_EXCESS * fine:
             break
-    return replace(levels, is_rough=True, excess=float(np.clip(fine, 1.0, _MOST_EXCESS)))
+    return replace(levels, is_rough=True, excess=float(np.clip(fine, 1.0, _MAX_EXCESS)))
 
 
-def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> Levels:
+def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> SkyLevels:
     height, width = raw.shape
     sep = load_sep()
     background = sep.Background(shown, mask=mask, bw=min(box, width), bh=min(box, height))
@@ -133,10 +133,10 @@ def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -
     if shown is not raw:
         noise *= np.float32(np.sqrt(4.0 * np.pi) * 1.0)  # what the smoothing took of white noise
     np.maximum(noise, least, out=noise)
-    return Levels(raw, above, noise, mask, box_px=box)
+    return SkyLevels(raw, above, noise, mask, box_px=box)
 
 
-def _excess(levels: Levels) -> tuple[float, float]:
+def _excess(levels: SkyLevels) -> tuple[float, float]:
     """Return the noise of smoothed pixels over that of smoothed white noise, for two widths.
 
     Some boxes of the image stand for all of it, and of them those with less. Stars are left
@@ -169,7 +169,7 @@ def _spread(boxes: NDArray[np.float32], left_out: Mask) -> Array:
     return np.asarray(np.ma.masked_array(boxes, left_out).std(axis=(1, 2)).filled(np.inf))
 
 
-def _sample(levels: Levels) -> NDArray[np.float32]:
+def _sample(levels: SkyLevels) -> NDArray[np.float32]:
     """Return squares from all over the image, in units of the noise."""
     height, width = levels.raw.shape
     side = min(_SAMPLE_PX, height, width)
@@ -221,7 +221,7 @@ def _noise_above_black(values: Grey) -> float:
     return float((value - black) / (scipy.special.ndtri(1.0 - beyond) - scipy.special.ndtri(cut)))
 
 
-def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
+def repair_hot_pixels(levels: SkyLevels, psf_sigma_px: float) -> SkyLevels:
     """Replace single bright pixels by the mean of their neighbours."""
     centre, square = (
         scipy.special.erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5)
@@ -238,7 +238,7 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     return replace(levels, above=above)
 
 
-def mask_hot_pixels(levels: Levels) -> Levels:
+def mask_hot_pixels(levels: SkyLevels) -> SkyLevels:
     """Replace bright pixels among dark ones by the median of those, clusters of them included.
 
     Many of them seem to be noise, so that the background is measured once more without them. It
@@ -256,7 +256,7 @@ def mask_hot_pixels(levels: Levels) -> Levels:
     return levels
 
 
-def _bright_pixels(levels: Levels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _bright_pixels(levels: SkyLevels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return rows and columns of the pixels that can be hot, found row by row to save memory."""
     is_bright = np.empty(levels.above.shape, dtype=np.bool_)
     for above, noise, row in zip(levels.above, levels.noise, is_bright, strict=True):

@@ -30,7 +30,7 @@ from starcat.images.solve_files import (
     LocalInputs,
     MeasuredFile,
     answers_of,
-    measure,
+    measure_picture,
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
@@ -39,7 +39,7 @@ CENTROID_SUFFIXES = (".csv", ".json")
 TILE_PX = 256  # longest side of the small picture that is kept of each
 
 _FEW = 6  # so many pictures are measured sooner than a process has started
-_MOST_WORKERS = 4
+_MAX_WORKERS = 4
 _AHEAD = 2  # pictures that are measured before they are asked for, for each process
 
 _COARSE = 8  # pixels of a tile between those that its background is taken from
@@ -138,7 +138,7 @@ def identify_files(
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     tracker = Tracker(matcher) if own.track else None
     if workers is None:
-        workers = min(multiprocessing.cpu_count(), _MOST_WORKERS) if len(paths) > _FEW else 0
+        workers = min(multiprocessing.cpu_count(), _MAX_WORKERS) if len(paths) > _FEW else 0
     for path, measured in zip(paths, _measured_files(paths, chosen, own, workers), strict=True):
         if isinstance(measured, ConfigError):
             if tracker is not None:  # time passes in a frame that cannot be read, too
@@ -185,7 +185,7 @@ def _measured_files(
 def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Measured | ConfigError:
     """Measure a file; an image itself is too large to be handed on."""
     try:
-        file = measure(path, options, local)
+        file = measure_picture(path, options, local)
     except ConfigError as error:
         return ConfigError(str(error), key=error.key, fields=error.fields)
     small = None if file.image is None else small_picture(file.image)

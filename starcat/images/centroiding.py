@@ -19,7 +19,7 @@ from scipy.ndimage import convolve1d
 from starcat.arrays import Array, Mask, Pixels, Rows
 from starcat.errors import ConfigError
 from starcat.images.background import (
-    Levels,
+    SkyLevels,
     load_sep,
     mask_hot_pixels,
     pixels_around,
@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 # second if the first is full. sep takes the memory of all of them, some 40 bytes for each.
 _ROOM, _ROOM_PARTS = 300_000, (0.03, 0.3)
 _ROOM_IS_FULL = "pixel buffer full"  # part of what sep says then
-_MOST_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
+_MAX_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
 # The threshold is raised by this factor, so many times, where the room does not do.
 _RAISE, _TRIES = 1.5, 4
 # A plateau: pixels that differ by no more than read noise, and by half a per cent.
@@ -108,7 +108,7 @@ def find_spots(
 
 
 def _streaked(
-    levels: Levels, streak: Streak, threshold: float, gain: float, most: int | None
+    levels: SkyLevels, streak: Streak, threshold: float, gain: float, most: int | None
 ) -> Spots:
     for is_final in (False, True):
         filtered, noise = streak.filtered(levels)
@@ -122,7 +122,7 @@ def _streaked(
 
 
 def _measured(
-    levels: Levels, found: NDArray[Any], sigma: float, gain: float, most: int | None
+    levels: SkyLevels, found: NDArray[Any], sigma: float, gain: float, most: int | None
 ) -> Spots:
     widths = widths_px(sigma)
     seen, window = widths.spot, widths.window
@@ -153,7 +153,7 @@ def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(levels: Levels, found: NDArray[Any]) -> Mask:
+def _is_saturated(levels: SkyLevels, found: NDArray[Any]) -> Mask:
     """Return which spots have a plateau at the image's maximum."""
     around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
     read_noise = _PLATEAU_NOISE * float(np.median(levels.noise))
@@ -162,7 +162,7 @@ def _is_saturated(levels: Levels, found: NDArray[Any]) -> Mask:
     return np.asarray(at_limit.sum(axis=(1, 2)) >= _PLATEAU_PIXELS)
 
 
-def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
+def _windowed(levels: SkyLevels, found: NDArray[Any], window: float) -> Array:
     """Return windowed centroids; barycentres where a window drifts to the spot beside it."""
     start = np.stack([found["x"], found["y"]], axis=1)
     x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
@@ -197,7 +197,7 @@ def centres_of_mass(light: Array, places: Pixels, box_px: int) -> Pixels:
     return np.asarray(middle - half - 1 + 0.5 + np.stack(moved, axis=1) / total[:, None])
 
 
-def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
+def detect(levels: SkyLevels, sigma: float, threshold: float) -> NDArray[Any]:
     """Return what stands out after smoothing with a star's shape.
 
     Where noise is white, its part that is left by the filter is known. Where it is not
@@ -243,7 +243,7 @@ def extract(
     """
     sep = load_sep()
     before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
-    sep.set_sub_object_limit(_MOST_PARTS)
+    sep.set_sub_object_limit(_MAX_PARTS)
     try:
         for part in _ROOM_PARTS:
             sep.set_extract_pixstack(_ROOM + int(part * image.size))
@@ -262,7 +262,7 @@ def extract(
         sep.set_sub_object_limit(before[1])
 
 
-def _filtered(levels: Levels, profile: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _filtered(levels: SkyLevels, profile: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the filtered image above its own background, and its own noise."""
     image = convolve1d(levels.above, profile, axis=0, mode="nearest")
     image = convolve1d(image, profile, axis=1, mode="nearest")

@@ -21,7 +21,7 @@ SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
 _BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
 LABEL_PT = 8.0
 LETTER_PT = 0.62 * LABEL_PT  # size of names, and about the width of a letter
-_MOST_LABELS = 60
+_MAX_LABELS = 60
 _LABEL_GAP_PT = 4.0
 _COMPASS_PT = 76.0
 # Layers of a spot: their sizes and opacities.
@@ -122,7 +122,7 @@ def draw_names(frame: FrameAxes, taken: Array) -> int:
     order = np.argsort(-frame.radii, kind="stable")
     wanted = [int(spot) for spot in order if frame.names[spot]]
     places = place_labels(
-        frame.points, frame.radii, sizes, wanted[:_MOST_LABELS], frame.size_pt, taken
+        frame.points, frame.radii, sizes, wanted[:_MAX_LABELS], frame.size_pt, taken
     )
     halo = [withStroke(linewidth=2.0, foreground=SKY)]
     for spot, corner in places.items():

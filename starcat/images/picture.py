@@ -91,14 +91,14 @@ def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> l
     known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
     labels: list[str | None] = [None] * len(result.star_index)
     for row, name, other in zip(rows.tolist(), known, own, strict=True):
-        labels[row] = name or short_name(other)
+        labels[row] = name or picture_name(other)
     for body in () if sky is None else sky.bodies:
         if body.row is not None:
             labels[body.row] = ""
     return labels
 
 
-def short_name(designation: str) -> str:
+def picture_name(designation: str) -> str:
     """Return a designation that fits beside a star.
 
     Examples

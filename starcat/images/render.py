@@ -19,12 +19,12 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import WRITTEN_KINDS, write_image
 from starcat.matcher.centroids import write_centroids
-from starcat.simulation.simulate import Frame
+from starcat.simulation.simulate import SimulatedFrame
 
 CENTROIDS_SUFFIX = ".csv"  # suffix of the file that a simulated frame's centroids are written to
 _REACH_SIGMA = 6.0  # a star is drawn this far to each side: 4e-9 of its light falls outside
 _HOT_RANGE = (0.02, 0.5)  # electrons of a hot pixel, as parts of the full well
-_MOST_ELECTRONS = 1e15  # above it a count has no digits left; numpy draws none above 9e18
+_MAX_ELECTRONS = 1e15  # above it a count has no digits left; numpy draws none above 9e18
 
 
 @dataclass(frozen=True)
@@ -101,14 +101,14 @@ def render_image(
         mean += light_e
     hot = generator.choice(mean.size, min(optics.hot_pixels, mean.size), replace=False)
     mean.flat[hot] += optics.full_well_e * generator.uniform(*_HOT_RANGE, size=len(hot))
-    electrons = generator.poisson(np.minimum(mean, _MOST_ELECTRONS)).astype(np.float64)
+    electrons = generator.poisson(np.minimum(mean, _MAX_ELECTRONS)).astype(np.float64)
     np.minimum(electrons, optics.full_well_e, out=electrons)
     electrons += generator.normal(scale=optics.read_noise_e, size=mean.shape)
     adu = np.rint(electrons / optics.gain_e_per_adu + optics.bias_adu)
     return np.clip(adu, 0, 65_535).astype(np.uint16)
 
 
-def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
+def write_simulated(path: Path, frame: SimulatedFrame, camera: Camera, seed: int) -> None:
     """Write a simulated frame as centroids, or as the image that a camera would take."""
     suffix = path.suffix.lower()
     if suffix == CENTROIDS_SUFFIX:

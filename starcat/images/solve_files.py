@@ -22,7 +22,7 @@ from starcat.images.second_look import FOV_ERROR, Search, look_again
 from starcat.images.spot_noise import weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
-    read_frames,
+    read_centroid_files,
     read_stdin,
     said_of_columns,
     upside_down,
@@ -234,7 +234,7 @@ class FileAnswers:
             "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
         }
         chosen = self.options.model_copy(update=changes)
-        again = measure(
+        again = measure_picture(
             self.path, chosen, self.local, without_hot_pixels=True, image=self.measured.image
         )
         return again.frames, again.spots
@@ -366,7 +366,7 @@ def identify_file(
     """Measure a file, or ``-`` for stdin, and identify its frames when they are asked for."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
-    return answers_of(path, measure(path, chosen, own), matcher, chosen, own)
+    return answers_of(path, measure_picture(path, chosen, own), matcher, chosen, own)
 
 
 def identify_either_way(
@@ -407,7 +407,7 @@ def answers_of(
     return FileAnswers(path, matcher, measured, camera, options, local, tracker)
 
 
-def measure(
+def measure_picture(
     path: Path,
     options: IdentifyOptions | None = None,
     local: LocalInputs | None = None,
@@ -421,7 +421,7 @@ def measure(
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
     if path.suffix.lower() not in IMAGE_SUFFIXES:
-        return MeasuredFile(read_frames(path))
+        return MeasuredFile(read_centroid_files(path))
     from starcat.images.centroiding import find_spots
 
     if image is None:

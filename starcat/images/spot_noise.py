@@ -12,13 +12,13 @@ import math
 import numpy as np
 
 from starcat.arrays import Array, Pixels
-from starcat.images.background import Levels, unmasked
+from starcat.images.background import SkyLevels, unmasked
 from starcat.matcher.result import MatchResult
 
 CREDIBLE_CHI_SQUARE = (0.5, 2.0)
 """Reduced chi-squares of an answer between which the noise of its spots is taken as its weights."""
 
-LEAST_DEPTH = 2.0
+MIN_DEPTH = 2.0
 """Standard deviations from a sky that was not clipped down to its darkest pixel, at least."""
 
 
@@ -45,19 +45,19 @@ def centroid_sigma_px(
     return np.asarray(np.nan_to_num(np.sqrt(of_sky + of_photons) / slope, nan=np.inf))
 
 
-def noise_at(levels: Levels, centroids_px: Pixels) -> Array:
+def noise_at(levels: SkyLevels, centroids_px: Pixels) -> Array:
     """Return the noise of a pixel around each spot; larger where noise is not white."""
     height, width = levels.noise.shape
     x, y = np.clip(np.nan_to_num(centroids_px).astype(np.int64), 0, (width - 1, height - 1)).T
     return np.asarray(levels.noise[y, x] * levels.excess, dtype=np.float64)
 
 
-def electrons_per_step(levels: Levels) -> float:
+def electrons_per_step(levels: SkyLevels) -> float:
     """Judge the gain of a camera from the noise of the sky, as if its photons were all noise.
 
     The black point is taken to be the darkest pixel. Read noise makes the gain seem smaller than
     it is, and the errors of bright stars larger. NaN where the sky was clipped, so that no pixel
-    is darker than it by `LEAST_DEPTH` of its noise.
+    is darker than it by `MIN_DEPTH` of its noise.
     """
     background = unmasked(levels.raw - levels.above, levels.mask)
     sky = float(np.median(background, overwrite_input=True))
@@ -66,7 +66,7 @@ def electrons_per_step(levels: Levels) -> float:
     noise = float(np.median(levels.noise))
     if not noise:
         return 1.0
-    return depth / noise**2 if depth >= LEAST_DEPTH * noise else math.nan
+    return depth / noise**2 if depth >= MIN_DEPTH * noise else math.nan
 
 
 def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:

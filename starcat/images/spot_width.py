@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from starcat.arrays import Array, Mask
-from starcat.images.background import Levels, pixels_around
+from starcat.images.background import SkyLevels, pixels_around
 
 SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
 _STEP = 1.15
 _HALF_PX = 16  # a star is looked at this far to each side
 _REACH_SIGMA = 4.0
-_MOST_SPOTS = 150
+_MAX_SPOTS = 150
 _SPOTS_AT_ONCE = 2000  # noise can have tens of thousands, each of which takes 9 kB or more
 # A spot narrower than this is a hot pixel with its neighbour, if there is another explanation.
 _SHARP_PX = 0.45
@@ -27,7 +27,7 @@ _FEW = 5
 _BRIGHT, _BRIGHT_SHARE = 10, 0.1
 
 
-def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
+def best_widths(levels: SkyLevels, places: Array) -> tuple[Array, Array]:
     """Return the Gaussian under which each spot stands out most."""
     if not len(places):
         return np.empty(0), np.empty(0)
@@ -47,7 +47,7 @@ def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
     return _between(np.log(widths), scores, best), scores.max(axis=0) / levels.noise[y, x]
 
 
-def is_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
+def is_sharp(levels: SkyLevels, places: Array, sigma: float) -> Mask:
     """Return which spots are too narrow for the light of a star, beyond their noise."""
     sharp = np.zeros(len(places), dtype=np.bool_)
     for first in range(0, len(places), _SPOTS_AT_ONCE):
@@ -56,7 +56,7 @@ def is_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
     return sharp
 
 
-def _are_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
+def _are_sharp(levels: SkyLevels, places: Array, sigma: float) -> Mask:
     corner = np.floor(places + 0.5).astype(np.int64)
     widths = sigma * np.array([0.5, 1.0])
     windows = np.full((2, len(places)), _REACH_SIGMA * sigma)
@@ -113,9 +113,9 @@ def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
     return pixels_around(above, x, y, _HALF_PX).astype(np.float64)
 
 
-def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
+def sigma_of_stars(levels: SkyLevels, places: Array, peak: Array) -> float:
     """Return the width of an image's stars."""
-    order = np.argsort(-peak, kind="stable")[: 2 * _MOST_SPOTS]
+    order = np.argsort(-peak, kind="stable")[: 2 * _MAX_SPOTS]
     if not len(order):
         return 1.0
     sigma, snr = best_widths(levels, places[order])
@@ -131,7 +131,7 @@ def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
     if not (sigma > _SHARP_PX).any():
         return _SHARP_PX
     sigma = sigma[sigma > _SHARP_PX]
-    sigma = sigma[:_MOST_SPOTS]
+    sigma = sigma[:_MAX_SPOTS]
     # Not of logarithms: clouds are wide, and no width of theirs is as frequent as a star's.
     near = np.abs(np.log(sigma / _densest(np.sort(sigma)))) < np.log(1.35)
     # Of two or three widths that differ none is near their mode.

@@ -19,7 +19,7 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 from starcat.arrays import Array
-from starcat.images.background import Levels
+from starcat.images.background import SkyLevels
 from starcat.images.spot_noise import noise_at
 from starcat.products.blends import PIXEL_VARIANCE
 
@@ -60,7 +60,7 @@ class Streak:
         bar = ends * np.exp(-((across / wide) ** 2))
         return np.asarray(bar / bar.sum())
 
-    def filtered(self, levels: Levels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def filtered(self, levels: SkyLevels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the light of a bar about every pixel, and the noise of that."""
         bar = self.profile()
         size = float((bar**2).sum())
@@ -105,7 +105,7 @@ def streak_of(found: NDArray[Any], shape: tuple[int, int]) -> Streak | None:
     return Streak(length * np.cos(angle), length * np.sin(angle), sigma)
 
 
-def refined(levels: Levels, streak: Streak, places: Array) -> Streak:
+def refined(levels: SkyLevels, streak: Streak, places: Array) -> Streak:
     """Return a bar as the brightest bars of an image are, measured at their ends and across."""
     for _ in range(_ROUNDS):
         spans, acrosses = _profiles(levels, streak, places[:_BRIGHTEST])
@@ -123,7 +123,7 @@ def refined(levels: Levels, streak: Streak, places: Array) -> Streak:
     return streak
 
 
-def _profiles(levels: Levels, streak: Streak, places: Array) -> tuple[Array, Array]:
+def _profiles(levels: SkyLevels, streak: Streak, places: Array) -> tuple[Array, Array]:
     """Return the light along bars, two lengths to each side, and across their middles."""
     unit = np.array([streak.dx_px, streak.dy_px]) / streak.length_px
     reach = int(np.ceil(2.0 * streak.length_px))
@@ -170,7 +170,7 @@ def _is_inside(found: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]
 
 
 def measured_streaks(
-    levels: Levels,
+    levels: SkyLevels,
     filtered: NDArray[np.float32],
     found: NDArray[Any],
     streak: Streak,

@@ -23,7 +23,7 @@ from starcat.geometry.distortion import checked_pair
 from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, ProductArrays, damaged
-from starcat.matcher.numpy_engine import answer_of, proposals
+from starcat.matcher.numpy_engine import proposals, result_of_search
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Candidates, Frame, Observation, observe
 from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult
@@ -38,7 +38,7 @@ from starcat.matcher.settings import (
 )
 from starcat.matcher.verification import AT_ONCE, BestOf, agree, agreeing_centroids
 
-MOST_CENTROIDS = 40
+MAX_CENTROIDS = 40
 """Brightest centroids of a frame that are compared with a level, which has about 20 stars a field
 of its size, and 40 a frame that is wider by half."""
 
@@ -57,7 +57,7 @@ frame of other proportions than the camera's has another width for the same area
 
 
 @dataclass(frozen=True)
-class Level:
+class BlindLevel:
     """One level."""
 
     # Tangent of half the field of view: the geometric mean of those across width and height, so
@@ -71,7 +71,7 @@ class Level:
         return 0.5 * math.sqrt(camera.width_px * camera.height_px) / self.half_width
 
 
-def levels(database: Database) -> tuple[Level, ...]:
+def levels(database: Database) -> tuple[BlindLevel, ...]:
     """Return the levels of a database."""
     for name in ("levels", "triangles"):
         if name not in database.products:
@@ -83,7 +83,7 @@ def levels(database: Database) -> tuple[Level, ...]:
     camera, product = database.camera, database.products["levels"]
     if not len(product["level"]):
         raise damaged("levels", "level", "is empty")
-    own = Level(
+    own = BlindLevel(
         0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px,
         database,
         np.arange(len(database.mag)),
@@ -91,7 +91,7 @@ def levels(database: Database) -> tuple[Level, ...]:
     return own, *(_level(database, product, n) for n in range(len(product["level"])))
 
 
-def _level(database: Database, product: ProductArrays, row: int) -> Level:
+def _level(database: Database, product: ProductArrays, row: int) -> BlindLevel:
     stars = _list(product, "stars", row)
     lists = [_list(product, name, row) for name in "ijk"]
     is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
@@ -107,7 +107,7 @@ def _level(database: Database, product: ProductArrays, row: int) -> Level:
         designation=database.designation[stars],
         products={"triangles": _triangles(place, database.directions[stars])},
     )
-    return Level(math.sqrt(half[0] * half[1]), part, stars)
+    return BlindLevel(math.sqrt(half[0] * half[1]), part, stars)
 
 
 def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
@@ -131,10 +131,10 @@ def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> P
 
 
 @dataclass(frozen=True)
-class Part:
+class ImagePart:
     """A part of a range of focal lengths, and the level that serves it."""
 
-    level: Level
+    level: BlindLevel
     low_px: float
     high_px: float
 
@@ -153,15 +153,15 @@ class Part:
 class _Search:
     """One part's frame, its candidates, and the best that came of them."""
 
-    part: Part
+    part: ImagePart
     whole: Observation
     used: Observation
     best: BestOf
 
 
 def parts_of_range(
-    known: Sequence[Level], camera: Camera, fov_deg: tuple[float, float]
-) -> list[Part]:
+    known: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
+) -> list[ImagePart]:
     """Return the parts of a range of fields of view."""
     narrow_deg, wide_deg = checked_pair("fov_deg", fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
@@ -185,7 +185,7 @@ def parts_of_range(
         )
     ends[0], ends[-1] = ends[0] * BEYOND, ends[-1] / BEYOND
     parts = [
-        Part(level, max(low_px, low), min(high_px, high))
+        ImagePart(level, max(low_px, low), min(high_px, high))
         for level, (high, low) in zip(known, pairwise(ends), strict=True)
     ]
     return [part for part in reversed(parts) if part.low_px < part.high_px]
@@ -216,7 +216,7 @@ def identify_blind(
     certain = certainty(settings) / len(parts)
     searches = [_begun(part, settings, frame, budget, certain) for part in parts]
     if len(searches[0].whole) < MIN_STARS:
-        return answer_of(None, searches[0].whole, database)
+        return result_of_search(None, searches[0].whole, database)
     limit = _run(searches)
     best = searches[0]
     for other in searches[1:]:
@@ -228,15 +228,17 @@ def identify_blind(
         index = np.full(len(best.whole), -1, dtype=np.int32)
         index[: len(found.star_index)] = rows[found.star_index]
         found = replace(found, star_index=index, chance=min(1.0, len(parts) * found.chance))
-    return answer_of(found, best.whole, database, limit)
+    return result_of_search(found, best.whole, database, limit)
 
 
-def _begun(part: Part, settings: Settings, frame: Frame, budget: Budget, certain: float) -> _Search:
+def _begun(
+    part: ImagePart, settings: Settings, frame: Frame, budget: Budget, certain: float
+) -> _Search:
     eye = Camera(frame.camera.width_px, frame.camera.height_px, part.focal_length_px)
     error = min(part.fov_error, WIDEST_FOV_ERROR)
     whole = used = observe(replace(frame, camera=eye), settings, fov_error=error, budget=budget)
     if whole.mag is not None:
-        used = whole.first(MOST_CENTROIDS)
+        used = whole.first(MAX_CENTROIDS)
         if settings.selection == TriangleOrder():
             used = replace(used, settings=replace(settings, selection=BRIGHTEST))
     return _Search(part, whole, used, BestOf(certain))

@@ -376,14 +376,14 @@ def _options(settings: Settings, fov_error: float) -> Any:
     return _onboard.ffi.new("starcat_options *", options)
 
 
-MOST_FEATURES = 4_000_000
+MAX_FEATURES = 4_000_000
 """Triangles or pairs of a database that are made an image unasked: that takes a second."""
 
 
 def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
     """Return the engine of a database, made once; None where the library does not serve it.
 
-    Unless it is wanted ``always``, no image is made of more than `MOST_FEATURES`.
+    Unless it is wanted ``always``, no image is made of more than `MAX_FEATURES`.
     """
     if _onboard is None or method not in FEATURES:
         return None
@@ -391,7 +391,7 @@ def c_engine(database: Database, method: str, always: bool = True) -> CEngine | 
         return None
     if not always and database.image is None:
         product, (column, *_) = FEATURES[method]
-        if len(database.products[product][column]) > MOST_FEATURES:
+        if len(database.products[product][column]) > MAX_FEATURES:
             return None
     return database.cached(_made, METHODS.index(method))
 

@@ -52,7 +52,7 @@ HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a CSV file whose first line is numbers."""
 
 
-def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
+def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
     path = Path(path)
     try:

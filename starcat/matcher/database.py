@@ -34,7 +34,7 @@ from starcat.errors import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
-from starcat.onboard.reading import OnboardImage, read_image
+from starcat.onboard.reading import OnboardImage, read_onboard_image
 from starcat.products.layouts import LARGEST, LAYOUTS, MAY_BE_UNKNOWN, RANGES, SMALLEST, Numbers
 from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.regular_files import check_regular_file, read_regular_file
@@ -158,7 +158,7 @@ def as_database(name: str, value: Any) -> Database:
 
 def open_image(path: Path) -> Database:
     """Open an onboard image as a database for the C library, without names and products."""
-    image = read_image(path)
+    image = read_onboard_image(path)
     header, stars = image.header, image.star_id
     return Database(
         name=image.name,

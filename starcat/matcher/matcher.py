@@ -50,7 +50,7 @@ WIDE_PX = 4.0
 """With a wider tolerance, ``auto`` is ``numpy``, which tries smaller reaches too."""
 
 
-MOST_CAMERAS = 16
+MAX_CAMERAS = 16
 """Cameras that a matcher keeps ready for the C library."""
 
 
@@ -338,7 +338,7 @@ class Matcher(Settings, _WithDatabase):
             engine = self._c_engine
             if engine is None:
                 return None
-            if len(self._searches) >= MOST_CAMERAS:
+            if len(self._searches) >= MAX_CAMERAS:
                 self._searches.clear()
             found = self._searches[key] = engine.search(camera, self._settings, fov_error)
         return found

@@ -14,7 +14,7 @@ from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, Origin, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.stars import ARCSEC
-from starcat.matcher.verification import Agreement, BestOf, verify
+from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
 
 def solve(
@@ -38,7 +38,7 @@ def solve(
     best, limit = BestOf(certainty(settings)), None
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
-    answer = answer_of(best.found, observation, database, limit, prior)
+    answer = result_of_search(best.found, observation, database, limit, prior)
     return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
 
 
@@ -56,7 +56,7 @@ def _search(
             search_near(prior, observation, database, best, whole_sky)
             return None
         for candidates in whole_sky:
-            verify(candidates, observation, database, best)
+            verify_candidates(candidates, observation, database, best)
             if best.is_certain:
                 break
     except BudgetSpentError as spent:
@@ -64,7 +64,7 @@ def _search(
     return None
 
 
-def answer_of(
+def result_of_search(
     found: Agreement | None,
     observation: Observation,
     database: Database,

@@ -34,7 +34,7 @@ SURE_CORNER = 0.5
 """Largest error of a corner, in tolerances, that stars may leave which determine their frame where
 the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
 
-LEAST_WEIGHT = 1e-8
+MIN_WEIGHT = 1e-8
 """Least weight of a centroid over the largest of its frame; rounding leaves no room for less."""
 
 
@@ -114,7 +114,7 @@ def weights_of(sigma_px: Array) -> Array:
     least = known.min(initial=np.inf)
     if least == np.inf:
         return np.ones(len(known))
-    return np.asarray(np.maximum((least / known) ** 2, LEAST_WEIGHT))
+    return np.asarray(np.maximum((least / known) ** 2, MIN_WEIGHT))
 
 
 def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tuple[Matrix, float]:

@@ -26,7 +26,7 @@ from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match
 from starcat.matcher.settings import LOOKUP, REACH, in_range
 from starcat.matcher.star_cells import stars_in_cap
-from starcat.matcher.verification import BestOf, agree, verify
+from starcat.matcher.verification import BestOf, agree, verify_candidates
 
 WIDEST_PRIOR_DEG = 20.0
 """Largest error of a prior attitude."""
@@ -35,10 +35,10 @@ CLOSE = 8.0
 """Error of a prior up to which each centroid is taken for the star predicted nearest to it, in
 units of the largest error of a centroid."""
 
-MOST_ANCHORS = 8
+MAX_ANCHORS = 8
 """Centroids that are compared with the stars near where they are predicted."""
 
-MOST_STARS = 1500
+MAX_STARS = 1500
 """Stars around a prior attitude; where there are more, looking up patterns is quicker."""
 
 
@@ -112,12 +112,12 @@ def search_near(
     reach_rad += observation.fov_error / (1.0 - observation.fov_error) * camera.radius_rad
     near = stars_in_cap(database, matrix[2], min(math.pi, camera.radius_rad + reach_rad))
     predicted = observation.body @ matrix
-    if observation.fov_error or len(near) > MOST_STARS:
+    if observation.fov_error or len(near) > MAX_STARS:
         found = _as_predicted(whole_sky, database, predicted, reach_rad)
     else:
         found = anchored_pairs(observation, database, predicted, near, reach_rad)
     for candidates in found:
-        verify(candidates, observation, database, best, in_order=False)
+        verify_candidates(candidates, observation, database, best, in_order=False)
         if best.is_certain:
             return
 
@@ -154,7 +154,7 @@ def anchored_pairs(
     if compatible is not None:
         cosine[~compatible] = -math.inf
     least, tolerance_rad = math.cos(min(math.pi, reach_rad)), observation.side_tolerance_rad
-    for anchor in range(min(count, MOST_ANCHORS)):
+    for anchor in range(min(count, MAX_ANCHORS)):
         first = np.flatnonzero(cosine[anchor] >= least)
         first = first[np.argsort(-cosine[anchor, first], kind="stable")]
         apart_rad = observation.separation_rad[anchor]

@@ -287,7 +287,7 @@ class MatchResult:
         if self.ok:
             facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
             facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
-        return sky_objects.table(self.stars, facts)
+        return sky_objects.sky_object_table(self.stars, facts)
 
     @property
     def skycoord(self) -> SkyCoord:

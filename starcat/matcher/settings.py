@@ -39,7 +39,7 @@ Where more is allowed, a hundredth of it ends the search; else the best answer i
 LARGEST = {"tolerance_px": 200.0, "noise_px": 50.0, "noise_mag": 10.0}
 """Largest values that can be stated; beyond them any spot is any star."""
 
-MOST_TRIANGLES = 5000
+MAX_TRIANGLES = 5000
 """Triangles of centroids that are looked up, in the order of their selection."""
 
 MAX_STEPS = 100_000

@@ -41,7 +41,7 @@ _UNITS = {"px": "pix", "arcsec": "arcsec", "deg": "deg", "mag": "mag"}
 _log = logging.getLogger(__name__)
 
 
-def table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
+def sky_object_table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
     """Return stars as a table of astropy."""
     made = _astropy("table").QTable(meta=dict(facts))
     for field in fields(stars):

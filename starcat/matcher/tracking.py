@@ -32,7 +32,7 @@ MARGIN = 2.0
 FADING = 0.5
 """What the error of an earlier prediction counts, for every frame since."""
 
-MOST_STEPS = 5.0
+MAX_STEPS = 5.0
 """Time since the last answer after which it tells nothing, over that between the last two."""
 
 
@@ -227,7 +227,7 @@ class Tracker:
         """Return the attitude that is expected, and its largest error; None where none is."""
         motion = self._motion
         steps = math.inf if motion is None else (now - motion.time) / motion.step
-        if motion is None or steps > MOST_STEPS:
+        if motion is None or steps > MAX_STEPS:
             return None, None
         floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
         # What is not a constant velocity grows with the square of the time.

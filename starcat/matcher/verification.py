@@ -135,7 +135,7 @@ class BestOf:
             self.found = found
 
 
-def verify(
+def verify_candidates(
     candidates: Candidates,
     observation: Observation,
     database: Database,

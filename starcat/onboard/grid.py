@@ -38,7 +38,7 @@ _FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(rang
 
 
 @dataclass(frozen=True)
-class Grid:
+class CellGrid:
     """Numbers of bands and of the sectors of each."""
 
     bands: int  # 1 or more
@@ -75,12 +75,12 @@ def quarter_turns(u: Array) -> Array:
     return turns
 
 
-def grid_for(n_stars: int, radius_rad: float) -> Grid:
+def grid_for(n_stars: int, radius_rad: float) -> CellGrid:
     """Return a grid of about as many cells as stars, but no finer than a camera has use for."""
     useful = math.ceil(BANDS_OF_A_FIELD / math.sin(min(radius_rad, 0.5 * math.pi)))
     largest = math.isqrt(MAX_CELLS // 2)
     bands = max(1, min(round(math.sqrt(n_stars / 2.0)), useful, largest))
-    return Grid(bands, 2 * bands)
+    return CellGrid(bands, 2 * bands)
 
 
 def most_near(u: Array, radius_rad: float) -> int:

@@ -25,7 +25,7 @@ from starcat.errors import (
 )
 from starcat.geometry.camera import LARGEST_PX, Camera
 from starcat.onboard import layout
-from starcat.onboard.grid import MAX_CELLS, Grid
+from starcat.onboard.grid import MAX_CELLS, CellGrid
 from starcat.onboard.layout import ByteOrder, Sizes, check_bytes, has_check_blocks, in_order, scrub
 from starcat.storage.regular_files import check_regular_file, read_regular_file
 
@@ -111,7 +111,7 @@ def is_image(path: Path) -> bool:
         return False
 
 
-def read_image(source: bytes | Path) -> OnboardImage:
+def read_onboard_image(source: bytes | Path) -> OnboardImage:
     """Read an onboard image."""
     path = source if isinstance(source, Path) else None
     where = str(path) if path is not None else "the onboard image"
@@ -327,7 +327,7 @@ def content_problems(header: Numbers, sections: Mapping[str, NDArray[Any]]) -> I
     if (np.abs(np.einsum("ij,ij->i", u, u) - 1.0) > UNIT_TOLERANCE).any():
         yield "section directions: not all of length 1"
         return
-    cells = Grid(int(header["grid_bands"]), int(header["grid_sectors"])).cells(u)
+    cells = CellGrid(int(header["grid_bands"]), int(header["grid_sectors"])).cells(u)
     counts = np.bincount(cells, minlength=len(sections["grid"]) - 1)
     numbers = sections["star_ids"].astype(np.int64)
     is_same = np.diff(cells) == 0

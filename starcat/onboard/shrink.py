@@ -22,10 +22,10 @@ from starcat.onboard.image import Contents, longest_pair_rad
 from starcat.onboard.layout import Sizes
 from starcat.products.tiling import FieldStars
 
-LEAST_SHARE = {"triangle": 1.0 / 3.0, "pyramid": 0.5}
+MIN_SHARE = {"triangle": 1.0 / 3.0, "pyramid": 0.5}
 """Of the sightings of all triangles, or of the longest pair's length, so much is left at least."""
 
-LEAST_STARS = 4
+MIN_STARS = 4
 """Fewer stars in a field identify nothing."""
 
 
@@ -94,7 +94,7 @@ def _by_use(
 
 def _least(weight: NDArray[np.float64], method: str) -> int:
     use = np.cumsum(weight)
-    return int(np.searchsorted(use, LEAST_SHARE[method] * use[-1])) + 1 if len(use) else 0
+    return int(np.searchsorted(use, MIN_SHARE[method] * use[-1])) + 1 if len(use) else 0
 
 
 def _thinned(
@@ -104,7 +104,7 @@ def _thinned(
     yield None, contents, weight
     stars = fields()
     before = len(contents.star_id)
-    for most in range(int(stars.count.max(initial=0)) - 1, LEAST_STARS - 1, -1):
+    for most in range(int(stars.count.max(initial=0)) - 1, MIN_STARS - 1, -1):
         is_left = np.zeros(len(contents.star_id), dtype=bool)
         is_left[stars.brightest(most)[1]] = True
         if np.count_nonzero(is_left) == before:

@@ -45,7 +45,7 @@ class Built:
         )
 
 
-def build(
+def build_database(
     spec: BuildSpec,
     inputs: Inputs,
     output: Path,

@@ -25,7 +25,7 @@ from starcat.products.crossmatch import (
     NEEDED,
     Crossmatch,
     counterparts_of,
-    matched_stars,
+    matched_rows,
     moving_stars,
     table_from_matches,
 )
@@ -88,7 +88,7 @@ def match_tables(
     model = model_from_spec(wanted)
     found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
     table = table_from_matches(found, counterparts)
-    rows, first = matched_stars(table), found.rank == 1
+    rows, first = matched_rows(table), found.rank == 1
     delta_mag = found.delta_mag[rows]
     return table, Summary(
         stars=len(stars),

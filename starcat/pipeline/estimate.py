@@ -22,7 +22,7 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost, table_bytes
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.guide_stars import (
-    MOST_FIELD_STARS,
+    MAX_FIELD_STARS,
     check_cost,
     check_tiling,
     select,
@@ -166,10 +166,10 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
         found += count * left * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
         left = min(left, float(count * wanted.stars_per_field))
         boresights += count
-    if max(found, boresights) > MOST_FIELD_STARS:
+    if max(found, boresights) > MAX_FIELD_STARS:
         raise BuildError(
             f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
-            f"{found:,.0f} stars, limit {MOST_FIELD_STARS:,}; use a smaller boresights.count or "
+            f"{found:,.0f} stars, limit {MAX_FIELD_STARS:,}; use a smaller boresights.count or "
             "products.levels.stars_per_field, or a larger products.levels.max_ratio",
             key="boresights.count",
         )
@@ -212,7 +212,7 @@ class Estimate:
         return [(name, rows.get(name), size) for name, size in cost.files.items()]
 
 
-def estimate(
+def estimate_draft(
     read: Draft, chosen: Draft, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
     """Estimate what a spec will give, from what was read and chosen for it."""
@@ -270,7 +270,7 @@ def estimate_spec(
 ) -> Estimate:
     """Read the sources of a spec and estimate what it will give."""
     read = read_draft(spec, inputs, workers, progress)
-    return estimate(read, choose_stars(read, spec), spec)
+    return estimate_draft(read, choose_stars(read, spec), spec)
 
 
 def _bytes_of_a_row(table: pa.Table) -> float:

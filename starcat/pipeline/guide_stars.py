@@ -28,10 +28,10 @@ from starcat.selection.selecting import Selected, reject_dense, select_guide_sta
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 
-MOST_FIELD_STARS = 4_000_000
+MAX_FIELD_STARS = 4_000_000
 """Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
 
-LEAST_CONTAMINATION = 0.001
+MIN_CONTAMINATION = 0.001
 """A thousandth of a star's light moves no centroid; fainter neighbours need not be known."""
 
 FIRST_LOOK = 4.0
@@ -181,7 +181,7 @@ def check_tiling(
     stars: int,
     spec: BuildSpec,
     thinned_to: int | None,
-    most: int = MOST_FIELD_STARS,
+    most: int = MAX_FIELD_STARS,
     what: str = "estimate",
 ) -> None:
     """Check that the fields of a tiling have not too many stars to be gone through in a moment."""
@@ -217,7 +217,7 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
 def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
     """Return what to say of a catalog that has not all neighbours of [selection.neighbours]."""
     rule, mag = spec.selection.neighbours, floats_of(stars, "mag")
-    share = max(rule.max_contamination, LEAST_CONTAMINATION)
+    share = max(rule.max_contamination, MIN_CONTAMINATION)
     if not rule.is_on or share >= 0.5 or np.isnan(mag).all():
         return ()
     faintest, fainter = np.nanmax(mag), 2.5 * np.log10((1.0 - share) / share)

@@ -30,7 +30,7 @@ from starcat.catalog.span import with_span
 from starcat.errors import ConfigError
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.draft import Draft, Inputs, stage
-from starcat.products.crossmatch import Crossmatch, matched_stars
+from starcat.products.crossmatch import Crossmatch, matched_rows
 from starcat.progress import Progress, no_progress
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.build_spec import BuildSpec
@@ -191,7 +191,7 @@ def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
     """Return a catalog with the stars of another that it lacks."""
     own = _in_band(read, whole.band)
     matches = match_tables(whole.stars, own, wanted)[0]
-    added, again = _split(whole.stars, own, matches.take(pa.array(matched_stars(matches))))
+    added, again = _split(whole.stars, own, matches.take(pa.array(matched_rows(matches))))
     stars = pa.concat_tables([whole.stars, added])
     _check_numbers(whole, read, stars)
     rejected = pa.concat_tables([whole.rejected, read.rejected, again]).combine_chunks()

@@ -9,16 +9,16 @@ from typing import Any
 
 from starcat.artifact.diff import Change, changes_between
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.catalog.source import data_source, known_maps
 from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import ChecksumMismatch
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
-from starcat.store.wire import address_of
+from starcat.store.wire import url_of_input
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def rebuild(
     with known_maps(maps_in(old.manifest)):
         found = _same_inputs(old, inputs, progress)
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-            built = build(spec, found, output or Path(folder), progress=progress)
+            built = build_database(spec, found, output or Path(folder), progress=progress)
             _check_remote(old, built.manifest, found)
             return _compare(old, built.folder)
 
@@ -69,7 +69,7 @@ def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
     return [facts["map"] for facts in manifest["sources"] if "map" in facts]
 
 
-def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
+def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inputs:
     """Return the inputs of a build, found to be the files that the manifest lists.
 
     What is at an address is known when the build has read what it uses of it.
@@ -79,7 +79,7 @@ def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
     for facts in old.manifest["sources"]:
         name = facts["source"]
         found[name] = locate(name, given)
-        if any(map(address_of, found[name])):
+        if any(map(url_of_input, found[name])):
             continue
         paths = [file.path for file in SourceFiles.find(data_source(name), found[name]).files]
         expected = [(file["name"], file["sha256"]) for file in facts["files"]]
@@ -102,13 +102,13 @@ def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
     return found
 
 
-def _check_remote(old: Artifact, manifest: dict[str, Any], inputs: Inputs) -> None:
+def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs) -> None:
     """Check that what was read at addresses is what the database was made from."""
     read = {facts["source"]: facts["files"] for facts in manifest["sources"]}
     for facts in old.manifest["sources"]:
         name = facts["source"]
         before = {file["sha256"] for file in facts["files"]}
-        for file in read[name] if any(map(address_of, inputs[name])) else ():
+        for file in read[name] if any(map(url_of_input, inputs[name])) else ():
             if file["sha256"] not in before:
                 raise ChecksumMismatch(
                     f"{name}: {file['name']} has changed: what was read of it has sha256 "
@@ -119,8 +119,8 @@ def _check_remote(old: Artifact, manifest: dict[str, Any], inputs: Inputs) -> No
                 )
 
 
-def _compare(old: Artifact, folder: Path) -> Rebuilt:
-    new = Artifact(folder, read_manifest(folder))
+def _compare(old: DatabaseFolder, folder: Path) -> Rebuilt:
+    new = DatabaseFolder(folder, read_manifest(folder))
     names = {
         path.relative_to(place).as_posix()
         for place in (old.folder, folder)
@@ -138,7 +138,7 @@ def _compare(old: Artifact, folder: Path) -> Rebuilt:
     )
 
 
-def _what_differs(name: str, old: Artifact, new: Artifact) -> str:
+def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
     """Return how a file differs; empty where it has the same bytes."""
     before, after = old.folder / name, new.folder / name
     if not before.is_file():
@@ -156,7 +156,7 @@ def _what_differs(name: str, old: Artifact, new: Artifact) -> str:
     return "built differently" + _columns_that_differ(name, old, new)
 
 
-def _columns_that_differ(name: str, old: Artifact, new: Artifact) -> str:
+def _columns_that_differ(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
     product = name.removesuffix(".parquet")
     if product not in old.products or product not in new.products:
         return ""

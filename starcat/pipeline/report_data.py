@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcat.arrays import Directions
-from starcat.artifact.reader import Artifact
+from starcat.artifact.reader import DatabaseFolder
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
 from starcat.products.evenness import evenness_of
@@ -60,7 +60,7 @@ def coverage_report(
     return report_coverage(coverage, reach, evenness)
 
 
-def artifact_coverage(artifact: Artifact) -> CoverageReport:
+def artifact_coverage(artifact: DatabaseFolder) -> CoverageReport:
     """Return the coverage of a database, from its own boresights and stars."""
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)

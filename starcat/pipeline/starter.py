@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError, OutputError
@@ -68,10 +68,10 @@ MEMORY_BYTES, SECONDS = 1.6e9, 15.0
 NEVER_LEFT_OUT = "triangles"
 """The product that a matcher looks up first."""
 
-MOST_LOOKED_AT = 60_000_000
+MAX_LOOKED_AT = 60_000_000
 """Stars of all fields that are gone through at the most: they take some gigabytes."""
 
-MOST_BORESIGHTS = 200_000
+MAX_BORESIGHTS = 200_000
 """Of more boresights only the limit of the spec itself is looked at."""
 
 MANY_FIELDS = 5
@@ -128,12 +128,12 @@ def starter_spec(
     widest_fov_x_deg: float | None = None,
     *,
     sky: pa.Table | None = None,
-    most_field_stars: int = MOST_LOOKED_AT,
+    most_field_stars: int = MAX_LOOKED_AT,
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky."""
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
-        sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
+        sky = ingest_catalog(SOURCE, locate(SOURCE, {}), progress=progress).stars
     response = camera.response.response()
     if response is not None:
         sky = in_sensor_band(sky, SOURCE, response).stars
@@ -157,7 +157,7 @@ def starter_spec(
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
-    if spec.boresights.count > MOST_BORESIGHTS:
+    if spec.boresights.count > MAX_BORESIGHTS:
         return False
     try:
         check_tiling(int(np.searchsorted(mag, limit, side="right")), spec, None, most)

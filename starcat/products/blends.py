@@ -27,7 +27,7 @@ APERTURE_SIGMA = 2.0
 
 _REACH = 6.0  # of a star 10 mag brighter at so many widths a thousandth of a width is left
 _STEP = 1e-6  # widths; a shorter step is the last one
-_MOST_STEPS = 200  # only two equal stars that are just one spot need more
+_MAX_STEPS = 200  # only two equal stars that are just one spot need more
 
 
 _PHASES = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
@@ -245,7 +245,7 @@ def _settled(start: Array, star: Rows, offset: Array, light: Array, width: float
     count, centroid = len(start), start.copy()
     moving = np.bincount(star, minlength=count) > 1
     rows = np.arange(len(star))
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         rows, now = rows[moving[star[rows]]], np.flatnonzero(moving)
         of, place = star[rows], offset[rows]
         apart = np.sum(((place - centroid[of]) / width) ** 2, axis=1)

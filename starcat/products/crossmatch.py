@@ -91,7 +91,7 @@ def _as_type(
     return values if values.type == kind else values.cast(kind)
 
 
-def matched_stars(table: pa.Table) -> NDArray[np.intp]:
+def matched_rows(table: pa.Table) -> NDArray[np.intp]:
     """Return the rows that name the counterpart of a star, be it ambiguous."""
     named = pc.is_in(table["verdict"], pa.array(["unique", "best", "ambiguous"]))
     return np.flatnonzero(named.to_numpy() & (table["rank"].to_numpy() == 1))
@@ -99,7 +99,7 @@ def matched_stars(table: pa.Table) -> NDArray[np.intp]:
 
 def counterparts_of(table: pa.Table, catalog: str) -> int:
     """Return how many stars have a counterpart in a catalog."""
-    return len(matched_stars(table.filter(pc.equal(table["catalog"], catalog))))
+    return len(matched_rows(table.filter(pc.equal(table["catalog"], catalog))))
 
 
 class Crossmatch(ProductSection):

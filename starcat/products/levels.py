@@ -38,7 +38,7 @@ POSITION = 110
 Rows = NDArray[np.int32]
 
 # Boresights of a level, at the least: wide fields need few, and may have more for nothing.
-FEWEST_BORESIGHTS = 1000
+MIN_BORESIGHTS = 1000
 
 
 class Levels(ProductSection):
@@ -194,7 +194,7 @@ def thin_levels(
 def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize) -> int:
     """Return how many boresights tile the sphere for a level: the wider its field, the fewer."""
     area, larger = (one.fov_x_deg * one.fov_y_deg for one in (narrowest, field))
-    return max(FEWEST_BORESIGHTS, round(boresights * (area / larger)))
+    return max(MIN_BORESIGHTS, round(boresights * (area / larger)))
 
 
 def _ragged(lists: Sequence[Rows]) -> Ragged:

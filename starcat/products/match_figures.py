@@ -34,7 +34,7 @@ MAG_BIN, MAG_SMOOTHING = 0.1, 0.5
 MIN_MEASURED = 20
 """Least number of sure pairs from which anything is measured."""
 
-LEAST_ERROR_RAD = 0.01 * ARCSEC
+MIN_ERROR_RAD = 0.01 * ARCSEC
 """Least error of a position that is believed, radians: where measured errors are smaller, one
 catalog has copied the positions of the other."""
 
@@ -255,7 +255,7 @@ def _position_error(measured: Measured, radius_rad: float, model: MatchModel) ->
         return min(float(ARCSEC), 0.2 * radius_rad)
     # Separations have Rayleigh's distribution, whose median is sqrt(2 ln 2) standard deviations.
     error = measured.median_separation_rad / float(np.sqrt(2.0 * np.log(2.0)))
-    return max(error, LEAST_ERROR_RAD)
+    return max(error, MIN_ERROR_RAD)
 
 
 def _offset(measured: Measured, model: MatchModel) -> float:

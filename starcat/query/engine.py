@@ -39,7 +39,7 @@ from starcat.workers.process import WorkerProcess
 MAX_MESSAGE_BYTES = 1 << 30  # size of a message of the process
 OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 ENDING_S = 1.0  # how long a process whose pipe is closed may take to end
-_FUNCTION = "starcat.query.worker:serve"
+_FUNCTION = "starcat.query.worker:serve_queries"
 
 
 @dataclass

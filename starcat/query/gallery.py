@@ -36,7 +36,7 @@ Literal = int | float | str
 
 
 @dataclass(frozen=True)
-class Value:
+class QueryValue:
     """A value that a named query can be given."""
 
     name: str  # $name in the query
@@ -51,7 +51,7 @@ class NamedQuery:
     name: str
     help: Annotated[str, Field(description="Description.")]
     targets: Annotated[int, Field(description="How many targets it is about.")]
-    values: tuple[Value, ...]
+    values: tuple[QueryValue, ...]
     text: Annotated[str, Field(description="SQL.")]
 
     def with_values(self, given: Mapping[str, str]) -> dict[str, Literal]:
@@ -102,7 +102,7 @@ def _named_query(path: Path) -> NamedQuery:
     told, values, targets = [], [], 1
     for line in comments:
         if value := _VALUE.fullmatch(line):
-            values.append(Value(value[1], json.loads(value[2].replace("'", '"')), value[3]))
+            values.append(QueryValue(value[1], json.loads(value[2].replace("'", '"')), value[3]))
         elif count := _TARGETS.fullmatch(line):
             targets = int(count[1])
         else:

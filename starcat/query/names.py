@@ -71,7 +71,7 @@ def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
     return found
 
 
-def quoted(text: str) -> str:
+def sql_quoted(text: str) -> str:
     """Return a text as SQL writes it."""
     return "'" + text.replace("'", "''") + "'"
 

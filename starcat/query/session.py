@@ -23,7 +23,7 @@ from starcat.progress import Progress, no_progress
 from starcat.query.engine import MAX_MESSAGE_BYTES, Allowance, Engine, WorkerEnded
 from starcat.query.gallery import macros
 from starcat.query.messages import Statement
-from starcat.query.names import quoted, short_names
+from starcat.query.names import short_names, sql_quoted
 from starcat.query.result import RunningQuery, facts_by_name, result_column
 from starcat.query.spatial_macros import (
     moving_statements,
@@ -128,7 +128,7 @@ class Session:
         found = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
         known = facts_by_name(self._view_of(statement) or self.views)
         values_of = ", ".join(
-            f"({', '.join(map(quoted, astuple(result_column(name, kind, known))))})"
+            f"({', '.join(map(sql_quoted, astuple(result_column(name, kind, known))))})"
             for name, kind in found
         )
         return f"SELECT * FROM (VALUES {values_of}) AS t(column_name, column_type, unit, meaning)"
@@ -264,10 +264,10 @@ def _view_statements(name: str, view: View) -> list[str]:
     made = [f"CREATE VIEW {name} AS {reading(view)};"]
     if view.schema is None:
         return made
-    made.append(f"COMMENT ON VIEW {name} IS {quoted(view.schema.description)};")
+    made.append(f"COMMENT ON VIEW {name} IS {sql_quoted(view.schema.description)};")
     return made + [
         f"COMMENT ON COLUMN {name}.{c.name} IS "
-        f"{quoted(f'{c.description} [{c.unit}]' if c.unit else c.description)};"
+        f"{sql_quoted(f'{c.description} [{c.unit}]' if c.unit else c.description)};"
         for c in view.described
         if c.name in view.columns
     ]
@@ -280,7 +280,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     folder = _common_folder(files)
     # Files are named from there on: DuckDB tells of a view, and not where it lies on the machine.
     text = preamble(targets)
-    text = text.replace(quoted(folder + os.sep)[:-1], "'") if folder else text
+    text = text.replace(sql_quoted(folder + os.sep)[:-1], "'") if folder else text
     try:
         engine.open(text, folder, files, names)
     except QueryError as error:

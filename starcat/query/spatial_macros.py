@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from starcat.query.names import quoted, quoted_name
+from starcat.query.names import quoted_name, sql_quoted
 from starcat.query.targets import POSITION, Target, View
 
 _MACROS = Path(__file__).parent / "sql" / "spatial_macros.sql"
@@ -71,7 +71,7 @@ def place_statements(target: Target) -> Iterator[str]:
             for value, name in zip(_position(view), POSITION, strict=True)
         )
         if view.pixels:
-            rows = f"SELECT *, {place} {reading(view, ', filename = ' + quoted('_place_file'))}"
+            rows = f"SELECT *, {place} {reading(view, ', filename = ' + sql_quoted('_place_file'))}"
         else:
             rows = f"SELECT *, {place}, '' AS _place_file {reading(view)}"
         yield f"CREATE VIEW {schema}.{view.name} AS {rows};"
@@ -97,7 +97,7 @@ def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
 
 def reading(view: View, more: str = "") -> str:
     """Return the SQL that reads the files of a view."""
-    files = ", ".join(map(quoted, view.files))
+    files = ", ".join(map(sql_quoted, view.files))
     return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
 
 
@@ -106,7 +106,7 @@ def _position(view: View) -> tuple[str, str]:
     by_lower = {column.lower(): column for column in view.columns}
     missing = [name for name in view.position if name.lower() not in by_lower]
     if missing:
-        told = quoted(
+        told = sql_quoted(
             f"{view.name} has no column {' and no '.join(missing)}; cone, box, field "
             "and crossmatch are for tables with places, name another with of := 'TABLE'"
         )
@@ -126,7 +126,7 @@ def _known_of_files(view: View) -> str:
         kinds = ", ".join(f"{name} DOUBLE" for name in EXTENT)
         return f"[]::STRUCT(file VARCHAR, {kinds}, files BIGINT)[]"
     rows = ", ".join(
-        f"({quoted(file)}, {', '.join(map(repr, numbers))})"
+        f"({sql_quoted(file)}, {', '.join(map(repr, numbers))})"
         for file, numbers in zip(view.files, extents(view.pixels).tolist(), strict=True)
     )
     row = ", ".join(f"'{name}': {name}" for name in ("file", *EXTENT))

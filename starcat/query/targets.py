@@ -252,11 +252,11 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
 
 
 def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
-    from starcat.catalog.ingest import ingest
+    from starcat.catalog.ingest import ingest_catalog
     from starcat.catalog.source_files import locate
     from starcat.storage.parquet import write_parquet
 
-    read = ingest(source, locate(source, {source: inputs}), progress=progress)
+    read = ingest_catalog(source, locate(source, {source: inputs}), progress=progress)
     scratch.mkdir(parents=True)
     views = []
     for name, table in (("stars", read.stars), ("rejected", read.rejected)):

@@ -45,7 +45,7 @@ _ODD = re.compile(rf"{_ZONED.pattern}|\bINTERVAL\b")
 """Types of which the Python client of DuckDB makes other values, or none."""
 
 
-def serve() -> None:
+def serve_queries() -> None:
     """Answer requests until there are no more."""
     channel = Channel()
     sys.setrecursionlimit(NESTED_CALLS)

@@ -47,7 +47,7 @@ def copy_to_part(
             if digest == blob.sha256:
                 return
     part.unlink(missing_ok=True)
-    raise damaged(source, f"its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}")
+    raise damaged_file(source, f"its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}")
 
 
 @contextmanager
@@ -57,13 +57,13 @@ def _reading(source: Path, blob: Blob) -> Iterator[int]:
     except OSError as error:
         known = {errno.ELOOP: "a symbolic link; expected a file", errno.ENOENT: "missing"}
         what = known.get(error.errno or 0, f"cannot be read ({reason(error)})")
-        raise damaged(source, what) from error
+        raise damaged_file(source, what) from error
     try:
         facts = os.fstat(reader)
         if not stat.S_ISREG(facts.st_mode):
-            raise damaged(source, "not a file")
+            raise damaged_file(source, "not a file")
         if facts.st_size != blob.bytes:
-            raise damaged(source, f"{facts.st_size} bytes; expected {blob.bytes}")
+            raise damaged_file(source, f"{facts.st_size} bytes; expected {blob.bytes}")
         yield reader
     finally:
         os.close(reader)
@@ -74,10 +74,10 @@ def read_small(path: Path, most_bytes: int) -> bytes:
     reader = _opened(path)
     with os.fdopen(reader, "rb") as file:
         if not stat.S_ISREG(os.fstat(reader).st_mode):
-            raise damaged(path, "not a file; the registry is damaged")
+            raise damaged_file(path, "not a file; the registry is damaged")
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:
-        raise damaged(path, f"longer than {most_bytes} bytes; the registry is damaged")
+        raise damaged_file(path, f"longer than {most_bytes} bytes; the registry is damaged")
     return data
 
 
@@ -108,6 +108,6 @@ def _copy_rest(
         done(there, blob.bytes)
 
 
-def damaged(path: Path, what: str) -> ProductError:
+def damaged_file(path: Path, what: str) -> ProductError:
     """Return the error about a file that is not what it should be."""
     return ProductError(f"{path}: {what}", path=path)

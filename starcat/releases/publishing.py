@@ -18,7 +18,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import copy_to_part, damaged
+from starcat.releases.files import copy_to_part, damaged_file
 from starcat.releases.tree import (
     INCOMING,
     INDEX_NAME,
@@ -26,12 +26,12 @@ from starcat.releases.tree import (
     METADATA,
     Blob,
     Listed,
-    files_of,
     index_bytes,
     parse,
     release_bytes,
+    tree_files,
 )
-from starcat.storage.atomic import make_folder, replace_file, sync, unique, writing
+from starcat.storage.atomic import make_folder, replace_file, sync_to_disk, unique, writing
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.download import is_address
 from starcat.storage.locks import locked
@@ -106,7 +106,7 @@ def publish_artifact(
 
 def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
     manifest = check_artifact(artifact).manifest
-    files = files_of(manifest, str(artifact / MANIFEST_NAME))
+    files = tree_files(manifest, str(artifact / MANIFEST_NAME))
     path = artifact / MANIFEST_NAME
     itself = Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
     contents = {**{artifact / name: blob for name, blob in files.items()}, path: itself}
@@ -189,14 +189,14 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
         final.chmod(final.stat().st_mode & 0o555)
         if not is_mine:
             part.unlink(missing_ok=True)
-        sync(final.parent)
+        sync_to_disk(final.parent)
     return True
 
 
 def _check_blob(path: Path, blob: Blob) -> None:
     whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
     if not whole or file_sha256(path) != blob.sha256:
-        raise damaged(
+        raise damaged_file(
             path,
             "not the content that its name says. The registry is damaged: remove that blob and "
             "publish again",
@@ -210,14 +210,14 @@ def _record(root: Path, release: Listed) -> bool:
     new = unique(root / INCOMING, f"{release.title}.json")
     try:
         new.write_bytes(release_bytes(release))
-        sync(new)
+        sync_to_disk(new)
         new.chmod(new.stat().st_mode & 0o555)
         _give_free_name(root, new, final)
     except FileExistsError:
         return not _check_not_taken(root, release)
     finally:
         new.unlink(missing_ok=True)
-    sync(final.parent)
+    sync_to_disk(final.parent)
     return True
 
 
@@ -256,6 +256,6 @@ def recorded(root: Path) -> list[Listed]:
     for path in root.glob("versions/[!.]*/[!.]*.json"):
         release = parse(Listed, path.read_bytes(), str(path))
         if root / release.path != path:
-            raise damaged(path, f"holds {release.title}; the registry is damaged")
+            raise damaged_file(path, f"holds {release.title}; the registry is damaged")
         found.append(release)
     return sorted(found, key=lambda release: release.order)

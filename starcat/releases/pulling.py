@@ -20,8 +20,8 @@ from starcat.artifact.verify import first_of, verify_artifact
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.registry import Registry
-from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, files_of
-from starcat.storage.atomic import move_into_place, sync, writing
+from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, tree_files
+from starcat.storage.atomic import move_into_place, sync_to_disk, writing
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import part_of
 from starcat.storage.locks import locked
@@ -76,7 +76,7 @@ def pull_release(
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress, max_bytes)
         move_into_place(whole, final, replace=False)
-        sync(output)
+        sync_to_disk(output)
     return Pulled(release, registry.address, final, "pulled")
 
 
@@ -150,7 +150,7 @@ def _assemble(
             f"{where}: its manifest is that of {manifest['name']}-{manifest['version']}; the "
             "registry is damaged"
         )
-    files = files_of(manifest, where)
+    files = tree_files(manifest, where)
     _remove_unlisted(whole, files)
     done, total = 0, sum(blob.bytes for blob in files.values())
     _check_size(where, release.manifest.bytes + total, place, max_bytes)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from starcat.errors import DownloadError, ProductError, SourceMissing, StarcatError, reason
 from starcat.progress import Progress
-from starcat.releases.files import copy_to_part, damaged, read_small
+from starcat.releases.files import copy_to_part, damaged_file, read_small
 from starcat.releases.tree import (
     INDEX_NAME,
     MAX_INDEX_BYTES,
@@ -18,7 +18,7 @@ from starcat.releases.tree import (
     METADATA,
     Blob,
     Listed,
-    read_index,
+    read_registry_index,
 )
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import (
@@ -49,7 +49,7 @@ class FolderRegistry:
                 "'starcat publish' makes one",
                 path=path,
             ) from error
-        return read_index(data, str(path))
+        return read_registry_index(data, str(path))
 
     def read(self, name: str, most_bytes: int) -> bytes:
         """Return the content of a small file, which has to be one: no link, no pipe."""
@@ -59,7 +59,7 @@ class FolderRegistry:
         except OSError as error:
             if error.errno == errno.ELOOP:
                 what = "a symbolic link; expected a file. The registry is damaged"
-                raise damaged(path, what) from error
+                raise damaged_file(path, what) from error
             raise NotFound(reason(error)) from error
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
@@ -87,7 +87,7 @@ class HttpRegistry:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
         except NotFound as error:
             raise SourceMissing(f"{self.address}: no registry, {INDEX_NAME}: {error}") from error
-        return read_index(data, f"{self.address}/{INDEX_NAME}")
+        return read_registry_index(data, f"{self.address}/{INDEX_NAME}")
 
     def read(self, name: str, most_bytes: int) -> bytes:
         """Return the content of a small file."""

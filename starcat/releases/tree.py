@@ -136,7 +136,7 @@ def index_bytes(releases: Iterable[Listed]) -> bytes:
     return json_bytes(content)
 
 
-def read_index(data: bytes, where: str) -> list[Listed]:
+def read_registry_index(data: bytes, where: str) -> list[Listed]:
     """Read an index."""
     check_version("registry", parse(_Head, data, where).registry_version, REGISTRY_VERSION, where)
     index = parse(_Index, data, where)
@@ -177,7 +177,7 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
         raise ProductError(f"{where}: not what starcat writes: {named}; {advice}") from error
 
 
-def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
+def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
     """Return the files that a manifest lists, none of which lies outside the database."""
     with _explained(where):
         files = _Files.model_validate({"files": manifest["files"]}).files

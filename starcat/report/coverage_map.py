@@ -28,7 +28,7 @@ GALACTIC_POLE_DEG = (192.85948, 27.12825)
 """Right ascension and declination, ICRS: ESA SP-1200 (1997), volume 1, equation 1.5.11."""
 
 
-def project(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
+def project_sky(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
     """Return x and y of positions on the map, in which right ascension grows to the left.
 
     Examples
@@ -84,7 +84,7 @@ def parallels() -> Iterator[tuple[float, float, str]]:
     Labels stand left of the edge, by a little more than the edge leans away from them.
     """
     for dec in range(-60, 90, 30):
-        x, y = project([180.0, 180.0], [dec, dec])
+        x, y = project_sky([180.0, 180.0], [dec, dec])
         label = f"{dec:+d}°".replace("-", "\N{MINUS SIGN}") if dec else "0°"
         yield abs(float(x[0])), float(y[0]), label
 
@@ -106,7 +106,7 @@ COLOURS = (
 )  # fmt: skip
 """Those of ``--map-0`` to ``--map-9`` in the style sheet; the first is of fields with too few."""
 
-MOST_DOTS = 2500
+MAX_DOTS = 2500
 """Dots of an SVG by itself; each takes some 75 bytes."""
 
 SCALE = 125.0
@@ -162,7 +162,7 @@ class Bin:
         return f"{self.least}" if self.least == self.most else f"{self.least}–{self.most}"
 
 
-def bins_of(stars: Counts) -> tuple[Bin, ...]:
+def colour_bins(stars: Counts) -> tuple[Bin, ...]:
     """Return the colours for fields with so many stars."""
     least = int(stars.min())
     first = max(least, MIN_STARS)
@@ -196,7 +196,7 @@ def raster_png(nearest: Array, stars: Counts, bins: tuple[Bin, ...] = ()) -> byt
     from PIL import Image
 
     inside = ~np.isnan(nearest)
-    bins = bins or bins_of(stars)
+    bins = bins or colour_bins(stars)
     colours = np.array([int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
     pixels = np.zeros(nearest.shape, dtype=np.uint8)
     pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside].astype(np.int64)]
@@ -235,7 +235,7 @@ def sky_map(fields: Fields, bins: tuple[Bin, ...] = ()) -> SkyMap:
     return SkyMap(
         round(HALF_WIDTH * UNIT, 1),
         round(HALF_HEIGHT * UNIT, 1),
-        bins or bins_of(fields.stars),
+        bins or colour_bins(fields.stars),
         _meridians(),
         _parallels(),
         _milky_way(),
@@ -253,7 +253,7 @@ def field_at(fields: Fields, number: int) -> Field:
 
 
 def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
-    x, y = project([ra_deg], [dec_deg])
+    x, y = project_sky([ra_deg], [dec_deg])
     return round(float(x[0]) * UNIT, 1), round(float(-y[0]) * UNIT, 1)
 
 
@@ -261,7 +261,7 @@ def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
 def _meridians() -> tuple[Line, ...]:
     dec = np.linspace(-90.0, 90.0, 61)
     return tuple(
-        Line(_path(*project(np.full(61, ra), dec)), f"{ra}°", *_place(ra, 0.0))
+        Line(_path(*project_sky(np.full(61, ra), dec)), f"{ra}°", *_place(ra, 0.0))
         for ra in MERIDIANS_DEG
     )
 
@@ -281,7 +281,7 @@ def _parallels() -> tuple[Line, ...]:
 
 @cache
 def _milky_way() -> str:
-    x, y = project(*galactic_equator(181))
+    x, y = project_sky(*galactic_equator(181))
     jumps = np.flatnonzero(np.abs(np.diff(x)) > 0.5 * HALF_WIDTH) + 1
     parts = zip(np.split(x, jumps), np.split(y, jumps), strict=True)
     return "".join(_path(*part) for part in parts)

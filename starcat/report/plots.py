@@ -24,7 +24,7 @@ from starcat.report.coverage_map import (
     galactic_equator,
     nearest_raster,
     parallels,
-    project,
+    project_sky,
 )
 
 if TYPE_CHECKING:
@@ -132,8 +132,8 @@ def _sky(
     )
     image.set_clip_path(edge)
     _graticule(axes)
-    axes.plot(*_cut(*project(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
-    x, y = project(*ring_deg)
+    axes.plot(*_cut(*project_sky(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
+    x, y = project_sky(*ring_deg)
     for colour, width in (("white", 4.2), (_RED, 2.2)):
         axes.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
     axes.set(xlim=(-3.02, 2.88), ylim=(-1.46, 1.46), aspect="equal")
@@ -166,7 +166,7 @@ def _graticule(axes: Axes) -> None:
     line: dict[str, Any] = {"color": "white", "lw": 0.5, "alpha": 0.55}
     dec = np.linspace(-90.0, 90.0, 91)
     for ra in MERIDIANS_DEG:
-        x, y = project(np.full(91, ra), dec)
+        x, y = project_sky(np.full(91, ra), dec)
         axes.plot(x, y, **line)
         # The label is on the side of the meridian that the galactic equator does not cross.
         axes.text(float(x[45]) - 0.03, 0.03, f"{ra}°", color="white", ha="right", size=8)

@@ -11,7 +11,7 @@ import numpy as np
 from starcat.bands.relation import Relation
 from starcat.bands.response import shipped
 from starcat.bands.spectra import library
-from starcat.bands.synthetic import magnitudes
+from starcat.bands.synthetic import synthetic_magnitudes
 from starcat.catalog.sensor_band import InBand
 from starcat.images.figure_file import own_style
 from starcat.report.page import figure, table
@@ -31,7 +31,7 @@ _COLOURS = ("#d1495b", "#b9c4cc", "#8a97a0", "#5b6770")
 def band_content(made: InBand, selection: Selection) -> dict[str, Any]:
     """Return what report.json says of the band."""
     response, base = made.response, shipped(made.band)
-    difference = (magnitudes(response) - magnitudes(base))[0]
+    difference = (synthetic_magnitudes(response) - synthetic_magnitudes(base))[0]
     rows = [library().types.index(name) for name in TYPES]
     limits = {"faint": selection.faint_limit_mag}
     if selection.bright_limit_mag > -30.0:
@@ -122,8 +122,8 @@ def _draw_residuals(axes: Axes, made: Relation) -> None:
 
 def _spectra(made: Relation) -> tuple[Any, Any, Any]:
     """Return colour, offset and size of the point of each spectrum."""
-    first, second = (magnitudes(shipped(band)) for band in made.colour)
-    offset = magnitudes(made.target) - magnitudes(shipped(made.base))
+    first, second = (synthetic_magnitudes(shipped(band)) for band in made.colour)
+    offset = synthetic_magnitudes(made.target) - synthetic_magnitudes(shipped(made.base))
     size = 2.0 + 400.0 * np.sqrt(library().weight / library().weight.sum()) ** 1.5
     return (first - second).ravel(), offset.ravel(), size.ravel()
 

@@ -14,7 +14,7 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_MAG = 0.2
 """Standard deviation of a magnitude that a camera measures of a star, unless a spec says another:
@@ -119,7 +119,7 @@ class _Outcome(NamedTuple):
     residual_arcsec: float | None  # None where it was not identified
 
 
-def _outcome(matcher: Matcher, frame: Frame, mag: Array | None) -> _Outcome:
+def _outcome(matcher: Matcher, frame: SimulatedFrame, mag: Array | None) -> _Outcome:
     result = matcher.identify(frame.centroids_px, magnitudes=mag)
     if not result.ok:
         return _Outcome(frame.n_stars, is_right=False, residual_arcsec=None)
@@ -145,7 +145,7 @@ def _rates(name: str, noise: Noise, noise_mag: float | None, outcomes: list[_Out
     )
 
 
-def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool:
+def answers_rightly(result: MatchResult, frame: SimulatedFrame, matcher: Matcher) -> bool:
     """Return whether an answer is right."""
     camera, database = matcher.database.camera, matcher.database
     star = frame.star_index[frame.star_index >= 0]

@@ -16,7 +16,7 @@ from starcat.geometry.sphere import Zones, zones_of
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class SimulatedFrame:
     """One simulated frame."""
 
     matrix: Array  # true attitude, ``body = matrix @ icrs``; shape (3, 3)
@@ -51,7 +51,7 @@ class Noise:
 
 def simulate_frames(
     directions: Array, camera: Camera, count: int, noise: Noise, seed: int, mag: Array | None = None
-) -> Iterator[Frame]:
+) -> Iterator[SimulatedFrame]:
     """Simulate frames of guide stars at attitudes uniform over all rotations."""
     generator = np.random.default_rng(seed)
     stars = np.arange(len(directions), dtype=np.int32)
@@ -62,7 +62,7 @@ def simulate_frames(
 
 def simulate_frame(
     sky: Sky, camera: Camera, matrix: Array, noise: Noise, generator: np.random.Generator
-) -> Frame:
+) -> SimulatedFrame:
     """Simulate one frame."""
     near = sky.zones.near(matrix[2], 1.05 * camera.radius_rad)
     centroids = camera.pixels_from_directions(sky.directions[near] @ matrix.T)
@@ -81,7 +81,7 @@ def simulate_frame(
     centroids = np.concatenate([centroids, false])
     order = order[camera.contains(centroids[order])]
     borrowed = sky.mag[_visible(sky, noise.limit_mag, count, generator)]
-    return Frame(
+    return SimulatedFrame(
         matrix,
         centroids[order],
         np.concatenate([sky.star_index[star], np.full(count, -1)]).astype(np.int64)[order],

@@ -175,7 +175,7 @@ class Observer:
         return aberrated(_deflected(u, self.position_au - self.sun_au), self.velocity_km_s)
 
 
-def numbers_of(name: str, text: str, count: int) -> list[float]:
+def observer_numbers(name: str, text: str, count: int) -> list[float]:
     """Return so many numbers of a text such as ``1.5,-7.2,0``, or raise ConfigError."""
     try:
         numbers = [float(word) for word in text.split(",")]

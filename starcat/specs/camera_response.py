@@ -18,10 +18,10 @@ from starcat.errors import ConfigError
 from starcat.local_files import LocalFile
 from starcat.sections import CatalogName, Section
 
-MOST_ROWS = 2000
+MAX_ROWS = 2000
 """Of a table that travels in a spec."""
 
-Column = Annotated[tuple[float, ...], Field(max_length=MOST_ROWS, strict=False)]
+Column = Annotated[tuple[float, ...], Field(max_length=MAX_ROWS, strict=False)]
 
 
 def _response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:

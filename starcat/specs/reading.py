@@ -32,10 +32,10 @@ _SHOWN = _Shown()
 
 _SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
-MOST_CHARACTERS, MOST_POINTS = 100_000, 200
+MAX_CHARACTERS, MAX_POINTS = 100_000, 200
 """Of the text of a spec, and of full stops in a line of it."""
 
-MOST_BYTES = 4 * MOST_CHARACTERS
+MAX_BYTES = 4 * MAX_CHARACTERS
 """Of the file of a spec or of a camera."""
 
 Changes = Mapping[str, str]
@@ -72,7 +72,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
 def text_of_toml(path: Path, missing: str) -> str:
     """Read a TOML file; ``missing`` is what the error says if the file does not exist."""
     try:
-        return read_regular_file(path, MOST_BYTES).decode("utf-8")
+        return read_regular_file(path, MAX_BYTES).decode("utf-8")
     except FileMissing:
         raise FileMissing(f"{path}: {missing}") from None
     except SourceError as error:
@@ -87,16 +87,16 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
     The parser's time grows with the square of the parts of a dotted key: 40 kB of them take 8 s.
     Such lines are refused before.
     """
-    if len(text) > MOST_CHARACTERS:
+    if len(text) > MAX_CHARACTERS:
         raise ConfigError(
-            f"{origin}: {len(text):,} characters; at most {MOST_CHARACTERS:,} are read, and a spec "
+            f"{origin}: {len(text):,} characters; at most {MAX_CHARACTERS:,} are read, and a spec "
             "with every key explained has 12,000. Leave out what is no spec"
         )
     for number, line in enumerate(text.split("\n"), start=1):
-        if line.count(".") > MOST_POINTS:
+        if line.count(".") > MAX_POINTS:
             raise ConfigError(
                 f"{origin}: line {number} has {line.count('.'):,} full stops; at most "
-                f"{MOST_POINTS} are read, and a key of a spec has two"
+                f"{MAX_POINTS} are read, and a key of a spec has two"
             )
     try:
         content = tomllib.loads(text)

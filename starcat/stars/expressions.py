@@ -125,7 +125,9 @@ def _refused(key: str, text: str, why: str, where: str) -> ConfigError:
     )
 
 
-def evaluate(text: str, columns: Mapping[str, pa.Array], count: int, key: str) -> pa.Array:
+def evaluate_expression(
+    text: str, columns: Mapping[str, pa.Array], count: int, key: str
+) -> pa.Array:
     """Return the value of an expression, which was checked, for every row."""
     import duckdb
 

@@ -80,8 +80,8 @@ def replace_file(path: Path, data: bytes, beside: Path) -> None:
     """Give a file other content, at once and for good."""
     with placed(path, beside) as new:
         new.write_bytes(data)
-        sync(new)
-    sync(path.parent)
+        sync_to_disk(new)
+    sync_to_disk(path.parent)
 
 
 @contextmanager
@@ -151,7 +151,7 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
     for path in sorted(partial.rglob("*")):
         if path.is_file():
             path.chmod(READ_ONLY)
-            sync(path)
+            sync_to_disk(path)
     if not final.exists() and _rename(partial, final):
         return "written"
     if _holds_all(final, partial):
@@ -200,7 +200,7 @@ def unique(folder: Path, name: str) -> Path:
     return folder / f".{name}.{secrets.token_hex(8)}.partial"
 
 
-def sync(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
     """Have the content of a file, or the names in a folder, on disk."""
     if os.name == "nt":  # which synchronises files only while they are open, and folders never
         return
@@ -216,4 +216,4 @@ def make_folder(folder: Path) -> None:
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)
-        sync(folder.parent)
+        sync_to_disk(folder.parent)

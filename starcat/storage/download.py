@@ -166,7 +166,7 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
     headers = {"Range": f"bytes={there}-"} if state else {}
     if state and not state.is_fixed:
         headers |= {"If-Range": state.validator}
-    with answer_of(url, headers, options) as response:
+    with response_of(url, headers, options) as response:
         if not state or response.status_code not in (206, 416):
             _receive_whole(response, url, path, options)
             return False
@@ -178,7 +178,9 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
     return _transfer_http(url, path, options)
 
 
-def answer_of(url: str, headers: Mapping[str, str], options: DownloadOptions) -> requests.Response:
+def response_of(
+    url: str, headers: Mapping[str, str], options: DownloadOptions
+) -> requests.Response:
     """Ask for a file, not packed on the way."""
     own = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
     with understood():

@@ -19,10 +19,10 @@ from starcat.storage.download import (
     Broken,
     DownloadOptions,
     Refused,
-    answer_of,
     check_status,
     next_block,
     persistent,
+    response_of,
 )
 
 _CONTENT_RANGE = re.compile(rf"bytes ({SIZE})-({SIZE})/({SIZE})")
@@ -61,7 +61,7 @@ def fetch_range(
     def once() -> RemoteVersion:
         nonlocal first, end, version
         asked = f"bytes={first}" if first < 0 else f"bytes={first}-{end - 1}"
-        with answer_of(url, {"Range": asked}, options) as response:
+        with response_of(url, {"Range": asked}, options) as response:
             found, begin, stop = _range_of(response)
             if version not in (None, found):
                 raise ChecksumMismatch(f"{url}: has changed ({found}; it had {version})")

@@ -36,9 +36,9 @@ from starcat.store.plan import StorePlan
 from starcat.store.runs import (
     RunIndex,
     arrow_writer,
-    places_of,
     read_index,
     read_shares,
+    run_positions,
     with_constants,
 )
 
@@ -49,7 +49,7 @@ ROW_GROUP_ROWS = 1 << 16
 _SHARES = (64, 8)
 """The brightest 64th of the stars, then up to the brightest 8th, then the others."""
 
-_LEAST_ROWS = 1024
+_MIN_ROWS = 1024
 """A group of brightness that would be smaller than this is not made."""
 
 
@@ -110,7 +110,7 @@ def _ascending(stars: pa.Table) -> NDArray[np.int64]:
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     order = np.argsort(pixels, kind="stable")
     if (np.diff(pixels[order]) == 0).any():
-        order = np.lexsort((places_of(stars), stars["star_id"].to_numpy(), pixels))
+        order = np.lexsort((run_positions(stars), stars["star_id"].to_numpy(), pixels))
     return order
 
 
@@ -122,7 +122,7 @@ def _read_places(path: Path) -> NDArray[np.int64]:
 def _without_repeated(stars: pa.Table, repeated: NDArray[np.int64]) -> tuple[pa.Table, pa.Table]:
     if not len(repeated):
         return stars, stars.slice(0, 0)
-    again = np.isin(places_of(stars), repeated)
+    again = np.isin(run_positions(stars), repeated)
     return stars.filter(pa.array(~again)), stars.filter(pa.array(again))
 
 
@@ -219,7 +219,7 @@ def _bright_first(mag: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[in
 
 def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
     known = mag[~np.isnan(mag)]
-    ranks = [len(known) // share for share in _SHARES if len(known) // share >= _LEAST_ROWS]
+    ranks = [len(known) // share for share in _SHARES if len(known) // share >= _MIN_ROWS]
     cuts = np.partition(known, ranks)[ranks] if ranks else known[:0]
     # A magnitude that is a limit belongs to the fainter group, however many stars have it.
     group = np.searchsorted(cuts, mag, side="right").astype(np.int8)

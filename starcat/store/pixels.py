@@ -158,7 +158,7 @@ WHOLE_SKY = ((0, 12 << 2 * MAX_ORDER),)
 
 
 @dataclass(frozen=True)
-class Region:
+class StoreRegion:
     """A pixel and the rings around it."""
 
     core: Pixel | None  # the pixel in the middle; None for the whole sky
@@ -190,12 +190,12 @@ class Region:
         return found
 
 
-def region_around(pixel: Pixel, hop_rad: float, rings: int) -> Region:
+def region_around(pixel: Pixel, hop_rad: float, rings: int) -> StoreRegion:
     """Return the region with so many rings around a pixel."""
     widest, finest = least_width_rad(np.array([0, min(pixel.order + FINEST_RINGS, MAX_ORDER)]))
     nothing = np.empty(0, dtype=np.int64)
     if not hop_rad <= widest:
-        return Region(None, 0, nothing, nothing)
+        return StoreRegion(None, 0, nothing, nothing)
     width_rad = max(hop_rad, float(finest))
     order = border_order(width_rad)
     core = pixel
@@ -213,4 +213,4 @@ def region_around(pixel: Pixel, hop_rad: float, rings: int) -> Region:
     pixels = np.concatenate(found)
     levels = np.repeat(np.arange(1, len(found) + 1), [len(ring) for ring in found])
     ascending = np.argsort(pixels)
-    return Region(core, order, pixels[ascending], levels[ascending])
+    return StoreRegion(core, order, pixels[ascending], levels[ascending])

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
+from starcat.catalog.ingest import Ingested, StarTables, ingest_catalog, ingest_options, ingested
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
 from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, table_parts
@@ -43,7 +43,7 @@ from starcat.store.layout import (
     star_columns,
 )
 from starcat.store.metadata import MANIFEST_VERSION
-from starcat.store.wire import address_of, bring
+from starcat.store.wire import bring, url_of_input
 from starcat.threads import map_in_order
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
@@ -57,16 +57,16 @@ _PLACE = (
 
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
-    """Read a star catalog from a store or from archive files; what is chosen is as for `ingest`."""
+    """Read a star catalog from a store or from archive files; what is chosen is as for `ingest_catalog`."""
     here = brought(source_name, paths, **chosen)
     stores = [open_store(path) for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None
     if not stores or (is_mapped and not any(store.is_ours for store in stores)):
-        read = ingest(source_name, here, **chosen)
+        read = ingest_catalog(source_name, here, **chosen)
     else:
         _check_alone(source_name, paths)
         read = _read_store(source_name, stores[0], **chosen)
-    address = address_of(paths[0]) if paths else None
+    address = url_of_input(paths[0]) if paths else None
     return read if address is None else _named_by_address(read, here[0], address)
 
 
@@ -80,7 +80,7 @@ def brought(
     **_: Any,
 ) -> list[Path]:
     """Return paths, with a copy for an address: in it is what can be used of what is there."""
-    if not any(map(address_of, paths)):
+    if not any(map(url_of_input, paths)):
         return list(paths)
     _check_alone(source_name, paths)
     options = ingest_options(source_name, band, None, read_limit_mag)
@@ -122,7 +122,7 @@ def _read_store(
     **limits: float | None,
 ) -> Ingested:
     options = ingest_options(source_name, band, **limits)
-    manifest = read_manifest(store)
+    manifest = read_store_manifest(store)
     if manifest is not None:
         _check_made_for(store, manifest, options)
     read = partial(_bright_rows, options=options, manifest=manifest)
@@ -155,7 +155,7 @@ def _problems(rejected: Sequence[pa.Table], files: Sequence[FileFacts]) -> list[
     return [f"{files[row['source_file']].name} {row['detail']}" for row in first]
 
 
-def read_manifest(store: Store) -> dict[str, Any] | None:
+def read_store_manifest(store: Store) -> dict[str, Any] | None:
     """Return what a store says of itself."""
     if not store.is_ours:
         return None

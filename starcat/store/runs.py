@@ -49,7 +49,7 @@ _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 _PLACE_BITS = np.int64(40)
 
 PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
-"""A record: the number of its star, and its file and line as one number (`places_of`)."""
+"""A record: the number of its star, and its file and line as one number (`run_positions`)."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ Share = tuple[Path, list[int]]
 """What a partition reads of a run: its Arrow file, and the numbers of batches, ascending."""
 
 
-def places_of(stars: pa.Table) -> NDArray[np.int64]:
+def run_positions(stars: pa.Table) -> NDArray[np.int64]:
     """Return file and line of every star as one number, in reading order."""
     file = stars["source_file"].to_numpy().astype(np.int64)
     return np.asarray((file << _PLACE_BITS) | stars["source_line"].to_numpy())
@@ -128,7 +128,7 @@ def _by_bucket(stars: pa.Table) -> tuple[NDArray[Any], NDArray[np.int64]]:
     order = np.argsort(bucket, kind="stable")
     places = np.empty(len(numbers), dtype=PLACES)
     places["star_id"] = numbers[order]
-    places["place"] = places_of(stars)[order]
+    places["place"] = run_positions(stars)[order]
     counts = np.bincount(bucket, minlength=BUCKETS)
     return places, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 

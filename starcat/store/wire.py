@@ -101,7 +101,7 @@ def _notes() -> Path:
     return cache_folder() / "wire"
 
 
-def address_of(path: Path) -> str | None:
+def url_of_input(path: Path) -> str | None:
     """Return the address that a path is the note of; only the download cache has notes."""
     if path.parent != _notes() or not (path / NOTE_NAME).is_file():
         return None
@@ -113,7 +113,7 @@ def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
     table = data_source(options.source_name).table
     chosen = [options.source_name, table and table.recorded(), options.band, options.read_limit_mag]
     name = hashlib.sha256(json_bytes(chosen)).hexdigest()[:16]
-    copy = _Copy(address_of(note) or "", note / name, HOW)
+    copy = _Copy(url_of_input(note) or "", note / name, HOW)
     with writing(note, "set STARCAT_CACHE to a folder with room; what has come is kept"):
         copy.folder.mkdir(exist_ok=True)
         with locked(copy.folder):

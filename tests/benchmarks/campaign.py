@@ -32,7 +32,7 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.simulation.selftest import answers_rightly
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_PX, NOISE_MAG = 0.5, 0.3
 KINDS = {
@@ -73,7 +73,7 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     return counted
 
 
-def _is_right(answer: MatchResult, frame: Frame, matcher: Matcher, scene: Scene) -> bool:
+def _is_right(answer: MatchResult, frame: SimulatedFrame, matcher: Matcher, scene: Scene) -> bool:
     if not frame.n_stars:
         return False
     if answers_rightly(answer, frame, matcher):

@@ -76,9 +76,9 @@ def main(rows: Rows) -> None:
 def embedded(count: int) -> np.ndarray:
     """Return places of the embedded sky, the brightest first."""
     from starcat.catalog.archives.gaia import embedded_sky
-    from starcat.catalog.ingest import ingest
+    from starcat.catalog.ingest import ingest_catalog
 
-    stars = ingest("gaia", [embedded_sky()], neighbours=False).stars
+    stars = ingest_catalog("gaia", [embedded_sky()], neighbours=False).stars
     stars = stars.sort_by("mag").slice(0, count)
     return np.column_stack([stars["ra_deg"].to_numpy(), stars["dec_deg"].to_numpy()])
 

@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 from rows import Options, Rows, ended
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source import give_map
 from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
@@ -57,7 +57,9 @@ def main(rows: Rows) -> None:
             name = "embedded sky" if not merged else "merged"
             with rows.row(name):
                 spec = spec_from_dict(spec_of(merged, faint, asked), name)
-                built = build(spec, {"deep": [folder / "deep.parquet"]} if merged else {}, folder)
+                built = build_database(
+                    spec, {"deep": [folder / "deep.parquet"]} if merged else {}, folder
+                )
                 clean, hard = built.rates[:2]
                 facts = built.manifest["sources"]
                 told = "; ".join(f"{one['source']} {one['kept']:,} kept" for one in facts)
@@ -93,7 +95,7 @@ def spec_of(merged: tuple[str, ...], faint: float, asked: object) -> dict[str, o
 
 def make_deep(folder: Path, deeper: float) -> float:
     """Write a catalog that is deeper than the embedded sky; return the limit of that."""
-    stars = ingest("gaia", [embedded_sky()], epoch_jyear=2016.0, neighbours=False).stars
+    stars = ingest_catalog("gaia", [embedded_sky()], epoch_jyear=2016.0, neighbours=False).stars
     mag, unit = floats_of(stars, "mag"), directions_of(stars)
     limit = float(np.nanpercentile(mag, 99.9))
     generator = np.random.default_rng(11)

@@ -38,7 +38,7 @@ BATCH = 100
 
 FOV_ERROR = 0.02
 
-MOST_STEPS = 20_000
+MAX_STEPS = 20_000
 """Steps of numpy: some tenths of a second."""
 
 ORDINARY = {
@@ -136,7 +136,7 @@ def _asked(generator: np.random.Generator, trial: Trial, scene: Scene) -> dict[s
 def _identify(
     plain: Matcher, engine: Any, settings: dict[str, Any], trial: Trial, asked: dict[str, Any]
 ) -> MatchResult:
-    steps = {"max_steps": MOST_STEPS} if engine == "numpy" else {}
+    steps = {"max_steps": MAX_STEPS} if engine == "numpy" else {}
     matcher = replace(plain, engine=engine, **settings, **steps)
     identify: Callable[..., MatchResult] = matcher.identify
     return identify(trial.centroids_px, magnitudes=trial.mag, **asked)

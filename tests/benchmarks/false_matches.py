@@ -42,7 +42,7 @@ from rows import Options, Rows, ended
 from starcat.images.figure_file import own_style, write_figure
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.report.plots import STYLE, headline
 from starcat.simulation.selftest import wilson_interval
@@ -67,7 +67,7 @@ VALUES_PX = (0.05, 0.15, 0.5, 1.0, 2.0, 3.0)
 FACTORS = (1.0, 6.0, 1.0 / 6.0)
 """True noise over the stated one."""
 
-MOST_NOISE_PX = 6.0
+MAX_NOISE_PX = 6.0
 """Largest true noise."""
 
 NOISE_MAG = 0.3
@@ -76,7 +76,7 @@ NOISE_MAG = 0.3
 FOV_ERROR = 0.02
 """Error of the focal length that is allowed in an eighth of the frames that numpy searches."""
 
-MOST_STEPS = 300_000
+MAX_STEPS = 300_000
 """Steps of a search with numpy."""
 
 PROBABILITIES = tuple(10.0**-n for n in range(1, 10))
@@ -105,7 +105,7 @@ class Stated:
     def noise_px(self) -> float:
         """True noise of a star; that of a tolerance is a third of it."""
         right = self.value_px / (3.0 if self.name == "tolerance_px" else 1.0)
-        return min(MOST_NOISE_PX, self.factor * right)
+        return min(MAX_NOISE_PX, self.factor * right)
 
 
 STATED = [
@@ -173,7 +173,7 @@ def run(job: Job) -> dict[str, Counts]:
             fov_error = FOV_ERROR if (seed // job.searched) % 8 == 7 else 0.0
             facts |= {"engine": "numpy", "fov_error": fov_error}
             answer, notable = search(
-                trial, scene, replace(matcher, engine="numpy"), fov_error, MOST_STEPS,
+                trial, scene, replace(matcher, engine="numpy"), fov_error, MAX_STEPS,
                 is_endless=job.is_endless,
             )  # fmt: skip
             _count_search(in_numpy, answer, notable, trial, scene, matcher.tolerance_px, facts)
@@ -245,7 +245,7 @@ def databases(folder: Path) -> dict[str, Path]:
     places = {spec.name: folder / f"{spec.name}-{spec.version}" for spec in specs}
     for spec in specs:
         if not places[spec.name].exists():
-            build(spec, {}, folder, workers=1)
+            build_database(spec, {}, folder, workers=1)
     return places
 
 

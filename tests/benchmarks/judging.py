@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.numpy_engine import answer_of, proposals
+from starcat.matcher.numpy_engine import proposals, result_of_search
 from starcat.matcher.observation import as_frame, observe
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH, Budget, BudgetSpentError, Limit, certainty
-from starcat.matcher.verification import Agreement, BestOf, verify
+from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
 Rows = NDArray[np.integer]
 Verdict = Literal["right", "no sky", "attitude", "names"]
@@ -31,7 +31,7 @@ Verdict = Literal["right", "no sky", "attitude", "names"]
 DEVIATIONS = 5.0
 """Errors of an attitude that noise is allowed to make, in standard deviations."""
 
-LEAST_NOISE_PX = 0.01
+MIN_NOISE_PX = 0.01
 """Noise that an attitude is allowed at least: of rounding, and of a lens drawn by a formula."""
 
 WRONG_NAMES = 0.05
@@ -52,7 +52,7 @@ def judge(
     true_camera = trial.camera or scene.camera
     camera, shown = (scene.camera, scene.camera) if fitted is None else (fitted, true_camera)
     error_px = DEVIATIONS * attitude_error_px(
-        trial.centroids_px[rows], scene.camera, max(trial.noise_px, LEAST_NOISE_PX)
+        trial.centroids_px[rows], scene.camera, max(trial.noise_px, MIN_NOISE_PX)
     )
     verdict: Verdict = "attitude" if trial.attitudes else "no sky"
     for truth in trial.attitudes:
@@ -146,7 +146,7 @@ def search(
     limit: Limit | None = None
     try:
         for candidates in proposals(seen, scene.database):
-            verify(candidates, seen, scene.database, best)
+            verify_candidates(candidates, seen, scene.database, best)
             if best.is_certain:
                 break
     except BudgetSpentError as spent:
@@ -163,4 +163,4 @@ def search(
         found.setdefault(
             verdict, Notable(verdict, log10, one.share, len(stars), len(seen), one.withheld)
         )
-    return answer_of(best.found, seen, matcher.database, limit), list(found.values())
+    return result_of_search(best.found, seen, matcher.database, limit), list(found.values())

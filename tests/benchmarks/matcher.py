@@ -46,7 +46,7 @@ from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.build import Built
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 SEED = 86_028_121
 NOISE_PX = 0.5
@@ -95,7 +95,7 @@ class Row:
     peak_mib: float = np.nan
 
 
-def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Frame]]:
+def make_frames(database: Database, count: int, path: Path) -> dict[str, list[SimulatedFrame]]:
     """Simulate both kinds of frames and write what the identifiers get of them."""
     camera, made, given = database.camera, {}, {}
     for kind, noise in KINDS.items():
@@ -291,7 +291,7 @@ def opening(artifact: Path, scratch: Path) -> dict[str, Any]:
     return {"open_ms": statistics.median(seconds) * 1e3, "peak_mib_100_frames": row.peak_mib}
 
 
-def by_the_frame(artifact: Path, frames: dict[str, list[Frame]]) -> dict[str, list[float]]:
+def by_the_frame(artifact: Path, frames: dict[str, list[SimulatedFrame]]) -> dict[str, list[float]]:
     """Return the least of 20 times by kind, microseconds a frame, with one thread of the C library.
 
     `identify_many` with an object for each frame; calls of `identify`; the same and a look at each.
@@ -309,7 +309,7 @@ def by_the_frame(artifact: Path, frames: dict[str, list[Frame]]) -> dict[str, li
     return times
 
 
-def print_frames(made: dict[str, list[Frame]], built: Built) -> None:
+def print_frames(made: dict[str, list[SimulatedFrame]], built: Built) -> None:
     """Print what the frames are of, and how many spots they have."""
     stars, seconds = built.manifest["products"]["stars"]["rows"], built.times_s["total"]
     print(f"\n{len(made['clean']):,} frames of {stars:,} stars; whole build {seconds:.1f} s")
@@ -319,7 +319,9 @@ def print_frames(made: dict[str, list[Frame]], built: Built) -> None:
         print(f"  {kind}: median of {spots:g} centroids, fewer than {MIN_STARS} stars in {few}")
 
 
-def own_facts(artifact: Path, scratch: Path, made: dict[str, list[Frame]]) -> dict[str, Any]:
+def own_facts(
+    artifact: Path, scratch: Path, made: dict[str, list[SimulatedFrame]]
+) -> dict[str, Any]:
     """Measure and print what only starcat is asked."""
     facts = opening(artifact, scratch)
     print(f"Opening a database: {facts['open_ms']:.1f} ms, median of 20; a process that does")

@@ -22,7 +22,7 @@ from rows import Options, Rows, ended, fresh
 
 from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.selection.selecting import select_guide_stars
@@ -38,7 +38,7 @@ SKY_DEG2 = 41_252.96
 
 def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
     """Make every product of a Gaia spec; return seconds, rows and bytes of each."""
-    read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear, neighbours=False)
+    read = ingest_catalog("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear, neighbours=False)
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()

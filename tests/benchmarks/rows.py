@@ -113,14 +113,14 @@ def need(*packages: str) -> None:
 def database(name: str, folder: Path) -> Built:
     """Build a preset from the catalogs in $STARCAT_CATALOGS."""
     # Not above: a benchmark that lacks something says so without waiting for them.
-    from starcat.pipeline.build import build
+    from starcat.pipeline.build import build_database
     from starcat.specs.reading import preset
 
     inputs = {source: [catalogs_folder() / file] for source, file in FILES[name].items()}
     for path in (path for paths in inputs.values() for path in paths):
         if not path.is_file():
             raise LackingError(f"{path.name} in {path.parent}; set STARCAT_CATALOGS to its folder")
-    return build(preset(name), inputs, folder, workers=1)
+    return build_database(preset(name), inputs, folder, workers=1)
 
 
 def fresh(*command: object, variables: Mapping[str, str] | None = None) -> str:

@@ -19,14 +19,14 @@ import duckdb
 from rows import Options, Rows, ended, fresh
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
 from starcat.query.session import Session, open_session
 from starcat.selection.selecting import select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.storage.parquet import write_parquet
 
-MOST_RATIO, MOST_START_S, MOST_CONE_MS = 1.2, 0.5, 60.0
+MAX_RATIO, MAX_START_S, MAX_CONE_MS = 1.2, 0.5, 60.0
 """What is asked."""
 SHORT = 7
 """So many times as many rounds for a query that takes some milliseconds."""
@@ -67,7 +67,7 @@ def make_tables(folder: Path, limit_mag: float) -> tuple[Path, Path]:
     content = preset("gaia-12deg").model_dump(mode="json")
     content["selection"]["faint_limit_mag"] = limit_mag
     spec = spec_from_dict(content, "bench")
-    read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear)
+    read = ingest_catalog("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear)
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
     given = product_inputs(stars, tile_guide_stars(stars, spec), spec)
     paths = folder / "stars.parquet", folder / "pairs.parquet"
@@ -165,7 +165,7 @@ def main(rows: Rows) -> None:
             def compare(name: str, text: str, bare: str, rounds: int) -> None:
                 ours, plain = partial(rows_of, session, text), partial(plain_rows, connection, bare)
                 with rows.row(name):
-                    judge(f"{name}, x plain", side_by_side(name, ours, plain, rounds), MOST_RATIO)
+                    judge(f"{name}, x plain", side_by_side(name, ours, plain, rounds), MAX_RATIO)
 
             [(count,)] = plain_rows(connection, f"SELECT count(*) FROM '{pairs}'")
             size_mib = pairs.stat().st_size / 2**20
@@ -176,10 +176,10 @@ def main(rows: Rows) -> None:
             groups = GROUPS.format(pairs="b.pairs"), GROUPS.format(pairs=f"'{pairs}'")
             compare("group-by over pairs", *groups, given.rounds)
         with rows.row("start-up"):
-            judge("start-up, s", start_up(stars, given.rounds), MOST_START_S)
+            judge("start-up, s", start_up(stars, given.rounds), MAX_START_S)
     if store := os.environ.get("STARCAT_STORE"):
         with rows.row("places in a store"):
-            judge("cone of a store, ms", places_in_a_store(store, given.rounds), MOST_CONE_MS)
+            judge("cone of a store, ms", places_in_a_store(store, given.rounds), MAX_CONE_MS)
     else:
         print("\nSTARCAT_STORE is not set: places in a store are not timed")
 

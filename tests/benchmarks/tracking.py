@@ -30,7 +30,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Engine
 from starcat.matcher.tracking import Tracker
-from starcat.simulation.simulate import Frame, Noise
+from starcat.simulation.simulate import Noise, SimulatedFrame
 
 NOISE = Noise(0.5, drop_probability=0.1, false_stars=3)
 PRIORS_DEG = (0.1, 0.5, 2.0, 5.0, 20.0)
@@ -38,12 +38,12 @@ FEW = 1_000
 """Frames that are asked with a prior attitude, or none."""
 
 
-Ask = Callable[[Frame], Callable[[np.ndarray], MatchResult]]
+Ask = Callable[[SimulatedFrame], Callable[[np.ndarray], MatchResult]]
 """Returns for a frame what is to be timed, given its centroids."""
 
 
 def near_prior(
-    matcher: Matcher, most_deg: float, generator: np.random.Generator, frame: Frame
+    matcher: Matcher, most_deg: float, generator: np.random.Generator, frame: SimulatedFrame
 ) -> Callable[[np.ndarray], MatchResult]:
     """Return the call of a matcher with a prior that is wrong by up to an angle."""
     angle_rad = np.radians(most_deg) * generator.uniform() ** (1.0 / 3.0)
@@ -51,7 +51,7 @@ def near_prior(
     return partial(matcher.identify, prior=prior, prior_error_deg=most_deg)
 
 
-def report(rows: Rows, name: str, frames: Iterable[Frame], ask: Ask) -> list[MatchResult]:
+def report(rows: Rows, name: str, frames: Iterable[SimulatedFrame], ask: Ask) -> list[MatchResult]:
     """Print one line: right, wrong and no answers, how many were tracked, and milliseconds."""
     answers, ms, right = [], [], 0
     for frame in frames:

@@ -22,7 +22,7 @@ from astropy.io.votable.tree import VOTableFile
 from rows import Options, Rows, ended
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.exchange.votable_stream import Serialization, votable_chunks
 from starcat.query.session import open_session
 from starcat.storage.parquet import write_parquet
@@ -81,7 +81,7 @@ def main(rows: Rows) -> None:
     options.size("--rounds", 5, 1, "of which the best counts")
     options.size("--rows", 482_176, 20_000, "of the embedded sky")
     given = options.asked()
-    table = ingest("gaia", [embedded_sky()]).stars.slice(0, given.rows).combine_chunks()
+    table = ingest_catalog("gaia", [embedded_sky()]).stars.slice(0, given.rows).combine_chunks()
     print(f"{len(table.column_names)} columns: {', '.join(table.column_names)}")
 
     def judge(name: str, run: Callable[[], int]) -> None:

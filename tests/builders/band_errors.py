@@ -283,7 +283,7 @@ def tables(catalogs: Path) -> dict[str, str]:
     """Return the contents of both tables by name; what ships with starcat is not used."""
     with mock.patch.object(measured, "relation_errors", return_value={}):
         relations = list(relation_rows(catalogs))
-    bins = measured.bins_of([row.split(",") for row in relations])
+    bins = measured.bands_in_bins([row.split(",") for row in relations])
     with mock.patch.object(measured, "relation_errors", return_value=bins):
         stars = list(star_rows(catalogs))
     header = RELATIONS_HEADER.format(stars=f"{sample(catalogs).is_single.sum():,}")

@@ -11,7 +11,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher import observation
 from starcat.matcher.database import Database
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
-from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 
 def observe(
@@ -32,7 +32,7 @@ def observe(
 
 def frames_of(
     database: Database, count: int, noise: Noise | None = None, seed: int = 3
-) -> list[Frame]:
+) -> list[SimulatedFrame]:
     """Return frames of the stars of a database, with its camera."""
     u, camera = database.directions, database.camera
     return list(simulate_frames(u, camera, count, noise or Noise(), seed, database.mag))

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from catalog_folder import write_catalog_folder
 
 from starcat.artifact.reader import open_artifact
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.specs.reading import preset
 
 MADE = "sao-12deg-made"
@@ -33,7 +33,7 @@ def golden_build(name: str, catalogs: Path, folder: Path) -> Built:
     inputs = {"sao": [catalogs / "sao.dat.gz"]} if name.startswith("sao") else {}
     if name == MADE:
         inputs["hipparcos"] = [catalogs / "hip_main.dat.gz"]
-    return build(preset(name.removesuffix("-made")), inputs, folder)
+    return build_database(preset(name.removesuffix("-made")), inputs, folder)
 
 
 def golden_figures(artifact: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import ingest_catalog
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
@@ -263,7 +263,7 @@ def _drawn(
 @cache
 def sky() -> tuple[Array, Array]:
     """Directions and magnitudes of all stars of the embedded sky."""
-    stars = ingest("gaia", [embedded_sky()], neighbours=False).stars
+    stars = ingest_catalog("gaia", [embedded_sky()], neighbours=False).stars
     ra, dec = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
     return directions_from_radec(ra, dec), floats_of(stars, "mag")
 

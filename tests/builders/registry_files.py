@@ -19,7 +19,7 @@ from typing import Any
 from served import in_background
 
 from starcat.artifact.manifest import manifest_digest
-from starcat.releases.tree import Blob, read_index
+from starcat.releases.tree import Blob, read_registry_index
 from starcat.storage.digests import json_bytes
 
 
@@ -99,7 +99,9 @@ def serving(folder: Path, *, heeds_ranges: bool = True) -> Iterator[Served]:
 
 def manifest_of(registry: Path) -> Path:
     """The blob of the first listed release's manifest."""
-    return registry / read_index((registry / "index.json").read_bytes(), "")[0].manifest.path
+    return (
+        registry / read_registry_index((registry / "index.json").read_bytes(), "")[0].manifest.path
+    )
 
 
 def edit_index(registry: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -10,12 +10,12 @@ from PIL import Image
 
 from starcat.geometry.camera import Camera
 from starcat.images.render import Optics, star_electrons
-from starcat.simulation.simulate import Frame
+from starcat.simulation.simulate import SimulatedFrame
 
 SIGMA_PX, SKY, NOISE = 1.2, 100.0, 5.0
 
 
-def picture_of(frame: Frame, camera: Camera) -> bytes:
+def picture_of(frame: SimulatedFrame, camera: Camera) -> bytes:
     """Return a FITS picture of a frame, its rows from the bottom."""
     image = np.random.default_rng(1).normal(SKY, NOISE, (camera.height_px, camera.width_px))
     y, x = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
@@ -27,7 +27,7 @@ def picture_of(frame: Frame, camera: Camera) -> bytes:
     return buffer.getvalue()
 
 
-def photograph_of(frame: Frame, camera: Camera, *, is_colour: bool) -> bytes:
+def photograph_of(frame: SimulatedFrame, camera: Camera, *, is_colour: bool) -> bytes:
     """Return a JPEG of a frame, as a camera for photographs writes it, its rows from the top."""
     optics = Optics(psf_sigma_px=2.2, zero_point_e=2e5)
     size = (camera.width_px, camera.height_px)

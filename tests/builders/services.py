@@ -14,7 +14,7 @@ from starcat_service.app import make_app
 from starcat_service.jobs.submission import submit
 from starcat_service.records import Records
 from starcat_service.security.tokens import TokenStore
-from starcat_service.settings import Role, Settings
+from starcat_service.settings import Role, ServiceSettings
 
 if TYPE_CHECKING:
     from starcat_service.jobs.job import Job
@@ -49,7 +49,7 @@ def client_of(
     root: Path, address: str = LOCAL, workers: int = 0, **settings: Any
 ) -> Iterator[TestClient]:
     """Run a service, without workers if nothing else is said, and give a client of it."""
-    app = make_app(Settings(root=root, workers=workers, **settings))
+    app = make_app(ServiceSettings(root=root, workers=workers, **settings))
     with TestClient(app, base_url=address) as client:
         yield client
 

@@ -14,7 +14,7 @@ from starcat.geometry.attitude import (
     turn_between,
 )
 from starcat.matcher.database import Database
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 JUMP_RAD = 0.7
 """Angle of a jump, 40 deg."""
@@ -47,7 +47,7 @@ def is_near(quaternion: np.ndarray, matrix: np.ndarray) -> bool:
 
 def slew(
     database: Database, count: int, noise: Noise, seed: int, jumps: Container[int] = ()
-) -> Iterator[Frame]:
+) -> Iterator[SimulatedFrame]:
     """Simulate the frames of a slew.
 
     The rate goes from its slowest to its fastest and back, and its axis wanders. Before the frames

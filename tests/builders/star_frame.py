@@ -21,7 +21,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import triangle
 from starcat.matcher.settings import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 from starcat.stars.star_table import floats_of
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ class Shot:
     """A simulated frame, and what the matcher says of it."""
 
     story: Story
-    frame: Frame
+    frame: SimulatedFrame
     matcher: Matcher
 
     @cached_property

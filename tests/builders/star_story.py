@@ -15,9 +15,9 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.cli.main import app
-from starcat.pipeline.build import Built, build
+from starcat.pipeline.build import Built, build_database
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.stars.star_table import directions_of
@@ -75,7 +75,7 @@ class Story:
     later: Built
 
     @cached_property
-    def artifact(self) -> Artifact:
+    def artifact(self) -> DatabaseFolder:
         return open_artifact(self.built.folder)
 
     @cached_property
@@ -116,4 +116,4 @@ def tell(catalogs: Path, folder: Path) -> Story:
     spec = preset(PRESET)
     inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
     later = spec.model_copy(update={"version": "1.0.1", "epoch_jyear": LATER_JYEAR})
-    return Story(spec, build(spec, inputs, folder), build(later, inputs, folder))
+    return Story(spec, build_database(spec, inputs, folder), build_database(later, inputs, folder))

@@ -21,8 +21,15 @@ from typing import Any, TypeVar
 
 from starcat.errors import StarcatError
 from starcat.progress import Progress, no_progress
-from starcat_lab.experiment import Experiment, Paper, Row, Statistic, frame_count, run_experiment
-from starcat_lab.rates import ExperimentRates, Share, failures_of, rates_of
+from starcat_lab.experiment import (
+    Experiment,
+    ExperimentRow,
+    Paper,
+    Statistic,
+    frame_count,
+    run_experiment,
+)
+from starcat_lab.rates import ExperimentRates, Share, failures_of, rates_by_condition
 from starcat_lab.sweep import axis_label
 
 Result = TypeVar("Result")
@@ -32,7 +39,7 @@ Result = TypeVar("Result")
 class MeasuredRow:
     """A row of a paper and what was measured."""
 
-    row: Row  # the paper's
+    row: ExperimentRow  # the paper's
     rates: ExperimentRates  # rates of the row's experiment
     # frames without success by the row's rule, by cause
     failures: dict[str, int] = field(default_factory=dict)
@@ -64,7 +71,7 @@ class MeasuredRow:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CampaignOutcome:
     """All that was measured of a paper."""
 
     paper: Paper  # what it prints
@@ -111,7 +118,7 @@ def run_paper(
     quick: bool = False,
     workers: int = 2,
     progress: Progress = no_progress,
-) -> Outcome:
+) -> CampaignOutcome:
     """Run all experiments of a paper, but those whose records are there."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, artifacts)
@@ -125,10 +132,12 @@ def run_paper(
             done += frame_count(experiment)
             progress(paper.name, done, total)
     measured = tuple(_measured(row, place / f"{row.experiment.name}.parquet") for row in rows)
-    return Outcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
+    return CampaignOutcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
 
 
-def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Experiment, Path]]:
+def _tasks(
+    rows: list[ExperimentRow], artifacts: Mapping[str, Path]
+) -> list[tuple[Experiment, Path]]:
     """Return each experiment once: rows may share one. The longest go first."""
     tasks: dict[str, tuple[Experiment, Path]] = {}
     for row in rows:
@@ -138,8 +147,8 @@ def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Experim
     return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
 
 
-def _measured(row: Row, records: Path) -> MeasuredRow:
-    rates = rates_of(records, row.rule, row.experiment.attitude_limit_px)
+def _measured(row: ExperimentRow, records: Path) -> MeasuredRow:
+    rates = rates_by_condition(records, row.rule, row.experiment.attitude_limit_px)
     return MeasuredRow(row, rates, failures_of(records, row.rule, row.experiment.attitude_limit_px))
 
 

@@ -16,7 +16,7 @@ from starcat.errors import ConfigError
 from starcat.progress import Progress
 
 if TYPE_CHECKING:
-    from starcat_lab.report.tables import Table
+    from starcat_lab.report.tables import ReportTable
     from starcat_lab.run import Evaluation
 
 app = typer.Typer()
@@ -89,8 +89,8 @@ EcssExample = Annotated[
 Output = Annotated[Path, to_folder("Where the records and reports go.")]
 
 
-@app.command()
-def evaluate(
+@app.command("evaluate")
+def evaluate_command(
     artifact: Folder = None,
     paper: PaperName = None,
     noise_px: NoisesPx = None,
@@ -165,7 +165,7 @@ def _evaluate_sensor(
     seed: int, quick: bool, workers: int, as_json: bool, has_others: bool,
 ) -> None:  # fmt: skip
     from starcat.specs.star_sensor import read_sensor
-    from starcat_lab.ecss.pages import tables_of
+    from starcat_lab.ecss.pages import sensor_tables
     from starcat_lab.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
 
     if artifact is None or has_others:
@@ -179,7 +179,7 @@ def _evaluate_sensor(
             artifact, sensor, output, method=method, seed=seed, workers=workers,
             pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
         )  # fmt: skip
-    checklist = tables_of(content)["checklist"]
+    checklist = sensor_tables(content)["checklist"]
     rows = tuple((subject, value) for subject, _, _, value, *_ in checklist.rows)
     short = replace(checklist, title="Star sensor", heads=("subject", "value"), rows=rows)
     show(as_json, content, _print, short)
@@ -211,6 +211,6 @@ def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
         say(f"{head}: {meaning}")
 
 
-def _print(table: Table, prefix: str = "") -> None:
+def _print(table: ReportTable, prefix: str = "") -> None:
     heads = [head.replace(" guide stars", "\nguide stars") for head in table.heads]
     print_table(prefix + table.title, heads, table.rows, table.numbers)

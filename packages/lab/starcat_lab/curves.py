@@ -11,7 +11,7 @@ from typing import Any
 
 from starcat.progress import Progress, no_progress
 from starcat_lab.experiment import run_experiment
-from starcat_lab.rates import rates_of
+from starcat_lab.rates import rates_by_condition
 from starcat_lab.sweep import NOISE_PX, PARAMETERS, plan_sweep, sweep_paper
 
 QUANTITIES = ("noise_px", "false_stars", "drop_probability")
@@ -35,7 +35,7 @@ def measure_curves(
         progress(STAGE, number, len(rows))
         experiment = replace(row.experiment, engine="auto")
         records = run_experiment(experiment, artifact, folder)
-        rates = rates_of(records, row.rule, experiment.attitude_limit_px)
+        rates = rates_by_condition(records, row.rule, experiment.attitude_limit_px)
         point = {"x": row.x, **rates.by_rule.as_dict(), "wrong": rates.wrong}
         curves[row.group]["points"].append(point)
     progress(STAGE, len(rows), len(rows))

@@ -257,7 +257,7 @@ def blend(sky: Sky, limit_rad: float) -> Sky:
 
 
 @dataclass(frozen=True)
-class Row:
+class ExperimentRow:
     """One line of a paper's table or one point of its curves."""
 
     group: str  # title of the table or curve
@@ -299,7 +299,9 @@ class Paper:
     title: str  # what it is about; who, where, when
     citation: str
     presets: tuple[str, ...]  # databases that it needs
-    rows: Callable[[bool], list[Row]] = lambda quick: []  # for a quick run (True) with fewer frames
+    rows: Callable[[bool], list[ExperimentRow]] = (
+        lambda quick: []
+    )  # for a quick run (True) with fewer frames
     # from the databases' folders by preset
     statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
     deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead

@@ -107,7 +107,7 @@ class ExperimentRates:
     p95_ms: float
 
 
-def rates_of(records: Path, rule: str, reach_px: float) -> ExperimentRates:
+def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentRates:
     """Return the rates of an experiment."""
     query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
     (row,) = _rows(query, records, reach_px)

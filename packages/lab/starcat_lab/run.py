@@ -18,7 +18,7 @@ from typing import Any
 
 from starcat.artifact.manifest import read_manifest
 from starcat.errors import ConfigError
-from starcat.pipeline.build import build
+from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.progress import Progress, no_progress
 from starcat.specs.reading import preset
@@ -71,7 +71,7 @@ def prepare_artifacts(
 
         spec = preset(name)
         given = {source: paths for source, paths in inputs.items() if source in spec.sources}
-        built = build(spec, given, folder, replace=True, workers=workers, progress=forward)
+        built = build_database(spec, given, folder, replace=True, workers=workers, progress=forward)
         artifacts[name] = built.folder
     return artifacts
 

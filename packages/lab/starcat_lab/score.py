@@ -18,7 +18,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import ARCSEC
-from starcat.simulation.simulate import Frame
+from starcat.simulation.simulate import SimulatedFrame
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ FIELDS = tuple(field.name for field in fields(Score))
 
 def score(
     number: int,
-    frame: Frame,
+    frame: SimulatedFrame,
     result: MatchResult,
     database: Database,
     camera: Camera,
@@ -81,7 +81,7 @@ def score(
     )
 
 
-def reference_of(frame: Frame, camera: Camera) -> int | None:
+def reference_of(frame: SimulatedFrame, camera: Camera) -> int | None:
     """Return the centroid of the guide star that is nearest to the centre."""
     guides = np.flatnonzero(frame.star_index >= 0)
     if not len(guides):
@@ -90,7 +90,7 @@ def reference_of(frame: Frame, camera: Camera) -> int | None:
     return int(guides[np.argmin(np.hypot(*offset.T))])
 
 
-def _is_reference_right(frame: Frame, right: NDArray[np.bool_], camera: Camera) -> bool:
+def _is_reference_right(frame: SimulatedFrame, right: NDArray[np.bool_], camera: Camera) -> bool:
     reference = reference_of(frame, camera)
     return reference is not None and bool(right[reference])
 

@@ -17,7 +17,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database, products_in
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.simulation.simulate import Noise
-from starcat_lab.experiment import Attitudes, Experiment, Paper, Row, tolerance_for
+from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, tolerance_for
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def sweep_paper(sweep: Sweep) -> Paper:
     return Paper(name, title, "", (name,), lambda is_quick: rows)
 
 
-def _rows(sweep: Sweep, preset: str) -> list[Row]:
+def _rows(sweep: Sweep, preset: str) -> list[ExperimentRow]:
     """Return a group a quantity that varies, or one group of a single point.
 
     What is held at another value than usual is part of a group's title and of an experiment's name,
@@ -260,7 +260,9 @@ def _rows(sweep: Sweep, preset: str) -> list[Row]:
     if not varied:
         for method in sweep.methods:
             experiment = _experiment(sweep, method, single, prefix)
-            rows.append(Row(held or "clean", method, preset, experiment, "starcat", note=note))
+            rows.append(
+                ExperimentRow(held or "clean", method, preset, experiment, "starcat", note=note)
+            )
     for name, values in varied.items():
         group = PARAMETERS[name].label + (f" ({held})" if held else "")
         for method in sweep.methods:
@@ -269,7 +271,9 @@ def _rows(sweep: Sweep, preset: str) -> list[Row]:
                     sweep, method, single | {name: value}, f"{prefix}{name}_{value:g}_"
                 )
                 rows.append(
-                    Row(group, f"{value:g}", preset, experiment, "starcat", x=value, note=note)
+                    ExperimentRow(
+                        group, f"{value:g}", preset, experiment, "starcat", x=value, note=note
+                    )
                 )
     return rows
 

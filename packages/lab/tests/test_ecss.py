@@ -28,7 +28,7 @@ from starcat_lab.ecss.bench import (
     PLANETS,
     Bench,
     Condition,
-    answer_of,
+    bench_answer,
     error_arcsec,
     planet_in_field,
     random_day,
@@ -36,7 +36,7 @@ from starcat_lab.ecss.bench import (
 )
 from starcat_lab.ecss.errors import _centroids, attitude_variance, centroid_noise_px, contributions
 from starcat_lab.ecss.figures import expected_bias, spread, temporal_noise
-from starcat_lab.ecss.trials import Trial, guide_stars, point, star_noise, trials_of
+from starcat_lab.ecss.trials import SensorTrial, guide_stars, point, star_noise, trials_of
 
 PERFECT = {
     "zero_point_e_s": 6e6, "exposure_s": 0.1, "psf_sigma_px": 0.8, "pixel_um": 12.0,
@@ -99,7 +99,7 @@ def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_
     fields = random_attitudes(400, generator)
     truth = next(matrix for matrix in fields if _has_stars_apart(bench, matrix))
     answers = [
-        answer_of(bench, image, truth)
+        bench_answer(bench, image, truth)
         for image in bench.exposures(truth, Condition(), generator, 1200)
     ]
     named = [tuple(sorted(one.star_index)) for one in answers]
@@ -140,7 +140,7 @@ BIASES = {
 )
 def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(name, bench_of):
     bench = bench_of(**BIASES[name], zero_point_e_s=3e7)
-    trial = Trial("bias", Condition(), 16, 1)
+    trial = SensorTrial("bias", Condition(), 16, 1)
     records = [point(bench, trial, number) for number in range(trial.pointings)]
     errors = [one["error"][0] for one in records if one["right"][0]]
     assert len(errors) == trial.pointings
@@ -180,7 +180,7 @@ def test_a_motion_makes_trails_about_the_attitude_in_the_middle(bench_of):
     moved = next(bench.exposures(truth, Condition(rate_deg_s=3.0), generator, 1)).astype(float)
     assert moved.sum() == pytest.approx(still.sum(), rel=0.01)
     assert moved.max() < 0.8 * still.max()
-    answer = answer_of(bench, moved.astype(np.uint16), truth)
+    answer = bench_answer(bench, moved.astype(np.uint16), truth)
     assert answer.is_right
     assert np.abs(answer.error[:2]).max() < 20.0
 

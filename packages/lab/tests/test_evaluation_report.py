@@ -29,10 +29,18 @@ from starcat.simulation.simulate import Noise
 from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
 from starcat_lab import run as evaluate
-from starcat_lab.campaign import MeasuredRow, Outcome, _measured, is_goal_reached, run_paper
+from starcat_lab.campaign import CampaignOutcome, MeasuredRow, _measured, is_goal_reached, run_paper
 from starcat_lab.commands import print_evaluation
-from starcat_lab.experiment import Attitudes, Experiment, Paper, Row, Statistic
-from starcat_lab.rates import CAUSES, MEANINGS, RULES, ExperimentRates, Share, failures_of, rates_of
+from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, Statistic
+from starcat_lab.rates import (
+    CAUSES,
+    MEANINGS,
+    RULES,
+    ExperimentRates,
+    Share,
+    failures_of,
+    rates_by_condition,
+)
 from starcat_lab.report.files import (
     RESULTS,
     rates_csv,
@@ -60,17 +68,21 @@ def experiment_of(name: str, method: str = "triangle", **noise: Any) -> Experime
     return Experiment(name, method, FRAMES, Noise(**{"limit_mag": 6.0, **noise}))
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[ExperimentRow]:
     few = experiment_of("few", limit_mag=2.6)  # mostly frames with fewer than four stars
     table = [
-        Row("A table", "few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"),
-        Row(
+        ExperimentRow(
+            "A table", "few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"
+        ),
+        ExperimentRow(
             "A table", "few | again", "small", few, "two_stars", 1.5, note="of the same experiment"
         ),
-        Row("A table", "all", "small", experiment_of("all"), "reference", goal_percent=10.0),
+        ExperimentRow(
+            "A table", "all", "small", experiment_of("all"), "reference", goal_percent=10.0
+        ),
     ]
     curve = [
-        Row("Position noise", f"{method}, {x:g} px", "small",
+        ExperimentRow("Position noise", f"{method}, {x:g} px", "small",
             experiment_of(f"noise-{x:g}-{method}", method, noise_px=x), "starcat",
             95.0 if x == 1.0 and method == "pairs" else None, x=x)
         for method in ("triangle", "pairs") for x in (1.0, 0.0)
@@ -97,12 +109,12 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def outcome(small_artifact: Path, records: Path) -> Outcome:
+def outcome(small_artifact: Path, records: Path) -> CampaignOutcome:
     return run_paper(PAPER, {"small": small_artifact}, records, workers=1)
 
 
 @pytest.fixture(scope="module")
-def content(outcome: Outcome) -> dict[str, Any]:
+def content(outcome: CampaignOutcome) -> dict[str, Any]:
     return outcome.as_dict()
 
 
@@ -184,7 +196,7 @@ def test_every_rule_has_a_meaning():
 @pytest.mark.parametrize("rule", RULES)
 def test_rates_are_what_a_loop_counts(rule, random_file):
     made, path = random_file
-    rates = rates_of(path, rule, REACH_PX)
+    rates = rates_by_condition(path, rule, REACH_PX)
     enough = [r for r in made if r["n_guide_stars"] >= 4]
     times = [r["time_ms"] for r in made]
     expected = ExperimentRates(
@@ -220,7 +232,9 @@ def test_failures_have_the_first_cause_that_holds(rule, random_file):
 
 def test_rows_are_judged_by_their_trials_limit(random_file):
     made, path = random_file
-    row = Row("g", "l", "small", replace(experiment_of("t"), tolerance_px=1.0), "attitude")
+    row = ExperimentRow(
+        "g", "l", "small", replace(experiment_of("t"), tolerance_px=1.0), "attitude"
+    )
     assert row.experiment.attitude_limit_px == pytest.approx(REACH_PX)
     found = _measured(row, path)
     assert found.rates.by_rule.hits == sum(map(right, made))
@@ -293,7 +307,7 @@ def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_p
 
 
 def test_two_trials_of_one_name_are_refused(small_artifact, tmp_path):
-    one = Row("g", "a", "small", experiment_of("same"), "starcat")
+    one = ExperimentRow("g", "a", "small", experiment_of("same"), "starcat")
     two = replace(one, experiment=replace(one.experiment, seed=2))
     paper = replace(PAPER, rows=lambda quick: [one, two])
     with pytest.raises(ValueError, match="'same'"):
@@ -305,7 +319,9 @@ def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> Measure
     rates = ExperimentRates(
         Share(5, 10), Share(hits, 10), enough, Share(0, 10), Share(0, 5), 0, mean_ms, 1.0, 1.0
     )
-    return MeasuredRow(Row("g", "l", "small", experiment_of("t"), "starcat", **row), rates)
+    return MeasuredRow(
+        ExperimentRow("g", "l", "small", experiment_of("t"), "starcat", **row), rates
+    )
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.c_engine import library_version
-from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 from starcat_lab.experiment import Attitudes, Experiment, description, run_experiment
 from starcat_lab.papers import s2, s4
 
@@ -20,7 +20,7 @@ CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 LIMITED = Noise(noise_mag=1.0, limit_mag=6.0)
 
 
-def seen(u: np.ndarray, noise: Noise) -> Frame:
+def seen(u: np.ndarray, noise: Noise) -> SimulatedFrame:
     sky = Sky(u, np.linspace(3.0, 9.0, len(u)), np.arange(len(u)))
     return simulate_frame(sky, CAMERA, np.eye(3), noise, np.random.default_rng(3))
 

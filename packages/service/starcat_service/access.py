@@ -26,9 +26,9 @@ from starlette.types import Scope
 from starcat_service.problems import Problem
 from starcat_service.records import Records
 from starcat_service.sandbox.limiter import asker
-from starcat_service.security.request_limits import Buckets, address_of, later
+from starcat_service.security.request_limits import Buckets, client_ip, later
 from starcat_service.security.tokens import SessionStore, Token, TokenStore, digest_of
-from starcat_service.settings import Role, Settings
+from starcat_service.settings import Role, ServiceSettings
 
 VOSI = ("/tap/availability", "/tap/capabilities")
 """What clients look at before they know that a token is needed (VOSI 1.1)."""
@@ -51,7 +51,7 @@ BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8
 KNOWN_S = 5.0
 """Seconds that a secret is believed without looking it up; a revoked token ends within them."""
 
-MOST_KNOWN = 1_000
+MAX_KNOWN = 1_000
 
 GUESSES_PER_MINUTE = 10
 """Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
@@ -107,7 +107,7 @@ Publisher = Annotated[Principal, Depends(needs(Role.PUBLISHER))]
 class Identities:
     """Who there is: tokens and sign-ins."""
 
-    def __init__(self, records: Records, settings: Settings) -> None:
+    def __init__(self, records: Records, settings: ServiceSettings) -> None:
         self.tokens = TokenStore(records)
         self.sessions = SessionStore(records, settings.session_hours)
         self.guessed = Buckets(GUESSES_PER_MINUTE)
@@ -140,7 +140,7 @@ class Identities:
                 self._known.pop(key, None)
                 return None
             self._known[key] = token, now_s + KNOWN_S
-            if len(self._known) > MOST_KNOWN:
+            if len(self._known) > MAX_KNOWN:
                 self._known.popitem(last=False)
             return token
 
@@ -148,7 +148,7 @@ class Identities:
 class Authentication:
     """Finds the principal of each request, and refuses those who may not ask, or not so often."""
 
-    def __init__(self, settings: Settings, identities: Identities) -> None:
+    def __init__(self, settings: ServiceSettings, identities: Identities) -> None:
         self._settings = settings
         self._identities = identities
         self._anonymous = Principal(ANONYMOUS, settings.anonymous_role)
@@ -156,7 +156,7 @@ class Authentication:
 
     def check(self, scope: Scope) -> None:
         """Give a request its principal, or refuse it."""
-        address = network_of(address_of(scope))
+        address = network_of(client_ip(scope))
         found = self._found(Headers(scope=scope), address)
         who = address if found is None else f"token {found.name}"
         asker.set(who)
@@ -254,12 +254,12 @@ def network_of(address: str) -> str:
     return str(ipaddress.ip_network(f"{found}/64", strict=False).network_address)
 
 
-def cookie_name(settings: Settings) -> str:
+def cookie_name(settings: ServiceSettings) -> str:
     """Return the name of the cookie; behind https one that only this very host can set."""
     return "__Host-starcat" if settings.is_secure else "starcat"
 
 
-def session_in(cookies: str, settings: Settings) -> str | None:
+def session_in(cookies: str, settings: ServiceSettings) -> str | None:
     """Return the secret of a session."""
     name = cookie_name(settings)
     if name not in cookies:

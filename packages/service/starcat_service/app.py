@@ -23,7 +23,7 @@ from starcat_service.security.middleware import Defects, Refusals, RequestContex
 from starcat_service.security.origin import Origins
 from starcat_service.security.request_limits import BodyLimits, check_shape
 from starcat_service.service import Service
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 from starcat_service.vo import cone_search, tap, tap_async
 
 API = "/api/v1"
@@ -52,7 +52,7 @@ OTHERS: tuple[APIRouter, ...] = (
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
-def make_app(settings: Settings) -> FastAPI:
+def make_app(settings: ServiceSettings) -> FastAPI:
     """Make the application."""
     service = Service(settings)
     figures, identities = metrics.Metrics(service), Identities(service.records, settings)

@@ -15,7 +15,7 @@ from starcat.errors import StarcatError
 from starcat.images.second_look import FOV_ERROR
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem, problem_of
 
 MAX_DATABASES = 5
@@ -39,12 +39,12 @@ FieldsDeg = tuple[float, float]
 """Narrowest and widest field of view across the width of a frame, degrees."""
 
 
-def spec_of(database: Database) -> BuildSpec:
+def spec_of(database: ListedDatabase) -> BuildSpec:
     """Return the spec of a database."""
     return spec_from_dict(database.spec, database.title)
 
 
-def fits(database: Database, fields_deg: FieldsDeg) -> bool:
+def fits(database: ListedDatabase, fields_deg: FieldsDeg) -> bool:
     """Return whether a database is for one of some fields, within the usual error of a field."""
     narrowest, widest = spec_of(database).fields_deg
     return (
@@ -53,7 +53,7 @@ def fits(database: Database, fields_deg: FieldsDeg) -> bool:
     )
 
 
-def field_line(database: Database, fields_deg: FieldsDeg | None) -> str:
+def field_line(database: ListedDatabase, fields_deg: FieldsDeg | None) -> str:
     """Return a line of a camera file: the field that is nearest to that of a database.
 
     It is empty if the camera of the database has such a field: then the camera counts, with the
@@ -67,12 +67,14 @@ def field_line(database: Database, fields_deg: FieldsDeg | None) -> str:
     return "" if is_own or nearest_deg >= MAX_FLAT_DEG else f"fov_x_deg = {nearest_deg!r}"
 
 
-def candidates(
-    databases: Sequence[Database], fields_deg: FieldsDeg | None, first: Database | None = None
-) -> list[Database]:
+def databases_to_try(
+    databases: Sequence[ListedDatabase],
+    fields_deg: FieldsDeg | None,
+    first: ListedDatabase | None = None,
+) -> list[ListedDatabase]:
     """Return the databases that a frame is identified with, in the order in which to try them."""
 
-    def order(one: Database) -> tuple[bool, bool, bool, float, str]:
+    def order(one: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
         has_levels = spec_of(one).products.levels.enabled
         is_fitting = fields_deg is not None and fits(one, fields_deg)
         is_first = first is not None and one.id == first.id
@@ -87,7 +89,9 @@ class Attempts(Generic[T]):
     """What several databases made of a frame."""
 
     reasons: list[str] = field(default_factory=list)  # why each did not identify it
-    found: tuple[Database, T] | None = None  # the last answer; the first if none identifies it
+    found: tuple[ListedDatabase, T] | None = (
+        None  # the last answer; the first if none identifies it
+    )
     is_identified: bool = False
 
     @property
@@ -97,7 +101,9 @@ class Attempts(Generic[T]):
 
 
 def try_each(
-    databases: Sequence[Database], identify: Callable[[Database], T], refusal_of: Callable[[T], str]
+    databases: Sequence[ListedDatabase],
+    identify: Callable[[ListedDatabase], T],
+    refusal_of: Callable[[T], str],
 ) -> Attempts[T]:
     """Identify a frame with one database after the other until one succeeds.
 

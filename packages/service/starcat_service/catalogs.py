@@ -26,12 +26,12 @@ from starcat.pipeline.estimate import (
     Estimate,
     choose_stars,
     chosen_bytes,
-    estimate,
+    estimate_draft,
     magnitude_range,
     read_draft,
     reading_keys,
 )
-from starcat.pipeline.guide_stars import MOST_FIELD_STARS
+from starcat.pipeline.guide_stars import MAX_FIELD_STARS
 from starcat.pipeline.starter import Starter, enough_limit, starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset, preset_names
@@ -52,10 +52,10 @@ RETRY_S = 5
 READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 640 << 20, 128 << 20, 64 << 20
 """Memory for catalogs that were read, for guide stars, and for estimates."""
 
-MOST_INPUT_BYTES = 2 << 30
+MAX_INPUT_BYTES = 2 << 30
 """Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
 
-MOST_WAITING = 8
+MAX_WAITING = 8
 """Catalogs that wait to be read; more are refused."""
 
 AT_ONCE = 2
@@ -139,7 +139,7 @@ class Catalogs:
             read = self.read(spec, key)
             with self._slot():
                 choice = self._choice(read, key, spec)
-                found = estimate(read, choice, spec, self._max_memory_bytes)
+                found = estimate_draft(read, choice, spec, self._max_memory_bytes)
             self._cache(self._estimates, whole, found)
         return found
 
@@ -160,7 +160,7 @@ class Catalogs:
                 faint_limit_mag,
                 widest_fov_x_deg=widest_fov_x_deg,
                 sky=sky,
-                most_field_stars=MOST_FIELD_STARS,
+                most_field_stars=MAX_FIELD_STARS,
             )
 
     def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
@@ -186,7 +186,7 @@ class Catalogs:
         with self._lock:
             future = self._underway.get(key)
             if future is None:
-                if len(self._underway) >= MOST_WAITING:
+                if len(self._underway) >= MAX_WAITING:
                     raise _busy("too many catalogs wait to be read", RETRY_S)
                 future = self._reader.submit(self._read_files, key, spec)
                 self._underway[key] = future
@@ -292,7 +292,7 @@ def _check_size(spec: BuildSpec) -> None:
             limit = spec.products.crossmatch.read_limit_mag
             key = "products.crossmatch.read_limit_mag"
         size = sum(stamp[1] for stamp in _stamps(name))
-        if limit is None and size > MOST_INPUT_BYTES:
+        if limit is None and size > MAX_INPUT_BYTES:
             raise Problem(
                 413,
                 f"{name}: its files have {size / 1e9:,.1f} GB, more than an estimate reads whole; "

@@ -30,8 +30,8 @@ app.add_typer(tokens)
 Root = Annotated[Path, typer.Option(help="Folder with all data of the service.")]
 
 
-@app.command()
-def serve(
+@app.command("serve")
+def serve_command(
     root: Root = Path("service"),
     host: Annotated[str | None, typer.Option(help="Address; default: 127.0.0.1.")] = None,
     port: Annotated[
@@ -62,7 +62,7 @@ def serve(
     run_server(read_settings(root, host=host, port=port, workers=workers), announce)
 
 
-@tokens.command()
+@tokens.command("create")
 def create(
     name: Annotated[str, typer.Argument(help="Of who gets it: letters, digits and ._@-.")],
     role: Annotated[
@@ -101,7 +101,7 @@ def list_tokens(root: Root = Path("service"), json: Json = False) -> None:
         _show_tokens(store.all(), as_json=json)
 
 
-@tokens.command()
+@tokens.command("revoke")
 def revoke(
     name: Annotated[str, typer.Argument(help="Name or id of the token.")],
     root: Root = Path("service"),

@@ -151,7 +151,7 @@ class ChildCatalogs(Catalogs):
     def _started(self) -> WorkerProcess:
         # Each arena keeps the memory of a catalog that is not needed any more.
         worker = WorkerProcess(
-            "starcat_service.estimates:serve", environment={"MALLOC_ARENA_MAX": "2"}
+            "starcat_service.estimates:serve_estimates", environment={"MALLOC_ARENA_MAX": "2"}
         )
         worker.send([self._max_memory_bytes, self._wait_s])
         self._pending = {}
@@ -194,7 +194,7 @@ def _limit_row(content: Mapping[str, Any]) -> LimitRow:
     return LimitRow(**{**content, "stars": Spread(**content["stars"])})
 
 
-def serve() -> None:
+def serve_estimates() -> None:
     """Answer requests until there are no more: what the worker runs."""
     channel = Channel()
     with suppress(EOFError), ThreadPoolExecutor(THREADS, "estimate") as threads:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
 from starcat.geometry.camera import Camera
-from starcat.releases.tree import Blob, files_of
+from starcat.releases.tree import Blob, tree_files
 from starcat.sections import version_numbers
 from starcat.specs.build_spec import CameraSpec
 from starcat.storage.digests import file_sha256
@@ -23,7 +23,7 @@ CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re
 """How jobs name the files and folders of catalogs."""
 
 
-class Database(BaseModel):
+class ListedDatabase(BaseModel):
     """A built database: what it was made from, and what it holds."""
 
     model_config = ConfigDict(frozen=True)
@@ -49,7 +49,9 @@ class Database(BaseModel):
     software: dict[str, str] = Field(description="Versions of what built it.")
 
     @classmethod
-    def of_manifest(cls, database_id: str, folder: Path, manifest: dict[str, Any]) -> Database:
+    def of_manifest(
+        cls, database_id: str, folder: Path, manifest: dict[str, Any]
+    ) -> ListedDatabase:
         """Return the database that a manifest describes."""
         spec = manifest["spec"]
         products = {name: int(facts["rows"]) for name, facts in manifest["products"].items()}
@@ -100,7 +102,7 @@ class Database(BaseModel):
 
         Raises `ProductError` if the manifest lists what is no plain path.
         """
-        return {MANIFEST_NAME: self.manifest_blob, **files_of(self.manifest, self.title)}
+        return {MANIFEST_NAME: self.manifest_blob, **tree_files(self.manifest, self.title)}
 
 
 class Library:
@@ -108,9 +110,9 @@ class Library:
 
     def __init__(self, paths: ServicePaths) -> None:
         self._paths = paths
-        self._known: dict[Path, tuple[int, Database]] = {}
+        self._known: dict[Path, tuple[int, ListedDatabase]] = {}
 
-    def databases(self) -> list[Database]:
+    def databases(self) -> list[ListedDatabase]:
         """Return all databases that can be read, by name, version and id."""
         found = []
         paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
@@ -125,7 +127,7 @@ class Library:
                 continue
         return sorted(found, key=lambda one: (one.name, version_numbers(one.version), one.id))
 
-    def database(self, database_id: str) -> Database:
+    def database(self, database_id: str) -> ListedDatabase:
         """Return the database of an id."""
         for path in self._paths.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
@@ -133,7 +135,7 @@ class Library:
             f"no database has the id {database_id!r}; the list of them tells theirs"
         )
 
-    def find(self, name: str) -> Database:
+    def find(self, name: str) -> ListedDatabase:
         """Return the database of an id or a title."""
         return self._titled(name) or self.database(name)
 
@@ -163,7 +165,7 @@ class Library:
             return []
         return sorted(path.name for path in folder.iterdir() if CATALOG.fullmatch(path.name))
 
-    def _titled(self, title: str) -> Database | None:
+    def _titled(self, title: str) -> ListedDatabase | None:
         if DATABASE_ID.fullmatch(title):
             return None
         found = [one for one in self.databases() if one.title == title]
@@ -172,12 +174,12 @@ class Library:
             raise Problem(409, f"{len(found)} databases are called {title}; say which: {ids}")
         return found[0] if found else None
 
-    def _at(self, path: Path) -> Database:
+    def _at(self, path: Path) -> ListedDatabase:
         changed_ns = path.stat().st_mtime_ns
         known = self._known.get(path)
         if known is None or known[0] != changed_ns:
             folder = path.parent
             manifest = read_manifest(folder)
-            known = changed_ns, Database.of_manifest(folder.parent.name, folder, manifest)
+            known = changed_ns, ListedDatabase.of_manifest(folder.parent.name, folder, manifest)
             self._known[path] = known
         return known[1]

@@ -30,13 +30,13 @@ from starcat_service.paths import ServicePaths
 from starcat_service.security.middleware import log_settings
 from starcat_service.security.request_limits import (
     CONNECTIONS,
-    MOST_HEADER_BYTES,
-    MOST_TARGET_BYTES,
+    MAX_HEADER_BYTES,
+    MAX_TARGET_BYTES,
     OWN_CONNECTIONS,
 )
 from starcat_service.security.tokens import TokenStore
 from starcat_service.service import Service
-from starcat_service.settings import Role, Settings
+from starcat_service.settings import Role, ServiceSettings
 
 SWITCH_S = 0.001
 """Seconds until a thread that works lets others in, five times less than usual: the event loop is
@@ -124,7 +124,7 @@ class OurProtocol(H11Protocol):
             self.transport.close()
 
 
-def run_server(settings: Settings, announce: Announce) -> None:
+def run_server(settings: ServiceSettings, announce: Announce) -> None:
     """Serve until a signal ends it."""
     paths = ServicePaths(settings.root)
     if not settings.is_private and not paths.records.exists():
@@ -158,7 +158,7 @@ def _only_server(paths: ServicePaths) -> Iterator[None]:
         yield
 
 
-def _serve(settings: Settings, announce: Announce) -> None:
+def _serve(settings: ServiceSettings, announce: Announce) -> None:
     sys.setswitchinterval(SWITCH_S)
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
@@ -171,7 +171,7 @@ def _serve(settings: Settings, announce: Announce) -> None:
         server_header=False,
         proxy_headers=settings.public_url is not None,
         limit_concurrency=CONNECTIONS,
-        h11_max_incomplete_event_size=MOST_HEADER_BYTES + MOST_TARGET_BYTES,
+        h11_max_incomplete_event_size=MAX_HEADER_BYTES + MAX_TARGET_BYTES,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
     with _signals_end_nothing_else():
@@ -230,12 +230,12 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _address(settings: Settings, port: int) -> str:
+def _address(settings: ServiceSettings, port: int) -> str:
     host = f"[{settings.host}]" if ":" in settings.host else settings.host
     return f"{(settings.public_url or f'http://{host}:{port}').rstrip('/')}/"
 
 
-def listen(settings: Settings) -> socket.socket:
+def listen(settings: ServiceSettings) -> socket.socket:
     """Return the socket that the server listens at."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
@@ -269,7 +269,7 @@ def _signals_end_nothing_else() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
+def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
     """See that somebody can do more than read: make the first token, or say how."""
     if tokens.has_valid():
         return
@@ -285,7 +285,7 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
     _say(f"the first token, shown once: {text}\nuse it to sign in on the page, or with curl")
 
 
-def _without_token(settings: Settings) -> ConfigError:
+def _without_token(settings: ServiceSettings) -> ConfigError:
     return ConfigError(
         f"others are to reach {settings.public_url or settings.host}, and no token exists; "
         f"make one first: {_how_to_make_one(settings)}",
@@ -294,7 +294,7 @@ def _without_token(settings: Settings) -> ConfigError:
     )
 
 
-def _how_to_make_one(settings: Settings) -> str:
+def _how_to_make_one(settings: ServiceSettings) -> str:
     return f"starcat token create NAME --role publisher --root {settings.root}"
 
 

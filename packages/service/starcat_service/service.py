@@ -14,7 +14,7 @@ from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
 from starcat_service.sandbox.pool import QueryPool
 from starcat_service.sandbox.sandbox import Sandbox
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 from starcat_service.vo.tap_jobs import QueryJobs
 from starcat_service.vo.tap_queries import Tap
 
@@ -24,7 +24,7 @@ GIB = 2**30
 class Service:
     """A running service: its folders and records, and what works with them."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
         self.paths = ServicePaths(settings.root)
         self.paths.make()

@@ -34,7 +34,7 @@ class Role(IntEnum):
         return cls[name.upper()]
 
 
-class Settings(BaseModel):
+class ServiceSettings(BaseModel):
     """Everything that an operator may set; docs/howto-serve.md prints the descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -131,7 +131,7 @@ class Settings(BaseModel):
         return Role.named(self.anonymous or ("reader" if self.is_private else "none"))
 
 
-def read_settings(root: Path, **options: object) -> Settings:
+def read_settings(root: Path, **options: object) -> ServiceSettings:
     """Read the settings of a service."""
     path = root / FILE_NAME
     content: dict[str, object] = {}
@@ -149,18 +149,18 @@ def read_settings(root: Path, **options: object) -> Settings:
             value=content["queue_url"],
         )
     try:
-        settings = Settings.model_validate({**content, "root": root.resolve()})
+        settings = ServiceSettings.model_validate({**content, "root": root.resolve()})
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
-        known = ", ".join(Settings.model_fields)
-        hint = f"; {suggest(key, Settings.model_fields)}known: {known}"
-        advice = "" if key.partition(".")[0] in Settings.model_fields else hint
+        known = ", ".join(ServiceSettings.model_fields)
+        hint = f"; {suggest(key, ServiceSettings.model_fields)}known: {known}"
+        advice = "" if key.partition(".")[0] in ServiceSettings.model_fields else hint
         raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None
     _check_signing_key(settings, path)
     return settings
 
 
-def _check_signing_key(settings: Settings, path: Path) -> None:
+def _check_signing_key(settings: ServiceSettings, path: Path) -> None:
     """Refuse a key that lies among what the service writes, or is none."""
     if settings.signing_key is None:
         return

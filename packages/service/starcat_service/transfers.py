@@ -243,10 +243,10 @@ def open_attachment(path: Path, name: str, media_type: str) -> StreamingResponse
         "Content-Length": str(path.stat().st_size),
         "Content-Disposition": f'attachment; filename="{name}"',
     }
-    return StreamingResponse(chunks_of(file), media_type=media_type, headers=headers)
+    return StreamingResponse(file_chunks(file), media_type=media_type, headers=headers)
 
 
-def chunks_of(file: IO[bytes]) -> Iterator[bytes]:
+def file_chunks(file: IO[bytes]) -> Iterator[bytes]:
     """Give the rest of an open file, and close it."""
     with file:
         while chunk := file.read(CHUNK_BYTES):

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from starcat.errors import QueryError
 from starcat.geometry.sphere import directions_from_radec
 from starcat.query.session import Session, open_session
-from starcat_service.protocols.adql import ask, translate
-from starcat_service.protocols.tables import Column, Schema, Table, Tables, session_schemas
+from starcat_service.protocols.adql import translate, translate_adql
+from starcat_service.protocols.tables import Schema, Tables, TapColumn, TapTable, session_schemas
 
 COUNT = 1500
 
@@ -60,7 +60,7 @@ def find(session, tables):
     """Return the columns of the answer to a query."""
 
     def found(text: str) -> dict[str, list[object]]:
-        return dict(ask(session, translate(text, tables)).read_all().to_pydict())
+        return dict(translate_adql(session, translate(text, tables)).read_all().to_pydict())
 
     return found
 
@@ -501,14 +501,14 @@ def test_units_are_those_that_are_asked_for(measured, places):
 
 
 def test_columns_keep_what_is_known_of_them(session):
-    ra = Column("ra_deg", unit="deg", ucd="pos.eq.ra", description="where")
-    table = Table("places", "places", (ra, Column("row", "long")))
+    ra = TapColumn("ra_deg", unit="deg", ucd="pos.eq.ra", description="where")
+    table = TapTable("places", "places", (ra, TapColumn("row", "long")))
     known = Tables((Schema("places", "", (table,)),))
     query = (
         "WITH w AS (SELECT ra_deg AS r, row FROM places) SELECT r, r AS other, r + 1, w.*, "
         "MAX(row) AS biggest_deg FROM (SELECT * FROM w) AS w GROUP BY r, row"
     )
-    fields = ask(session, translate(query, known)).schema
+    fields = translate_adql(session, translate(query, known)).schema
     assert fields.names == ["r", "other", "col_3", "r_2", "row", "biggest_deg"]
     meanings = [(field.metadata or {}).get(b"description") for field in fields]
     assert meanings == [b"where", b"where", None, b"where", None, None]

@@ -15,7 +15,7 @@ from served import serve
 
 from starcat_service.security.metrics import Metrics
 from starcat_service.service import Service
-from starcat_service.settings import Settings, read_settings
+from starcat_service.settings import ServiceSettings, read_settings
 
 PAGE = Path(__file__).parents[3] / "docs" / "howto-serve.md"
 BLOCK = re.compile(r"```(console|python)\n(.*?)```", re.DOTALL)
@@ -65,12 +65,12 @@ def test_the_way_of_a_newcomer_runs_as_printed(tmp_path: Path) -> None:
 
 def test_the_table_of_settings_is_that_of_the_program() -> None:
     page = PAGE.read_text()
-    for name, field in Settings.model_fields.items():
+    for name, field in ServiceSettings.model_fields.items():
         if name != "root":
             default = "" if field.default is None else f"`{json.dumps(field.default)}`"
             assert f"| `{name}` | {default} | {field.description} |" in page
     named = set(re.findall(r"^\| `(\w+)` \|[^|]*\|[^|]*\|$", page, re.MULTILINE))
-    assert named == set(Settings.model_fields) - {"root"}
+    assert named == set(ServiceSettings.model_fields) - {"root"}
 
 
 def test_the_table_of_figures_is_that_of_the_program(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
 from starcat.report import coverage_map
-from starcat.report.coverage_map import project
-from starcat_service.pages.facts import star_columns
+from starcat.report.coverage_map import project_sky
+from starcat_service.pages.facts import star_fact_columns
 from starcat_service.pages.rendering import time_text
 from starcat_service.pages.wording import in_page_words
 
@@ -115,7 +115,7 @@ def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, sm
     manifest = json.loads((small_artifact / "manifest.json").read_bytes())
     manifest["spec"]["epoch_jyear"] = [2027.0, 2042.0]
     manifest["spec"]["selection"]["neighbours"] = {"psf_sigma_px": 1.0}
-    assert star_columns(manifest)[2:5] == [
+    assert star_fact_columns(manifest)[2:5] == [
         "drift_arcsec",
         "centroid_offset_arcsec",
         "contamination",
@@ -192,10 +192,10 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_art
     fields = coverage_map.Fields(
         *(np.array(content[name]) for name in ("ra_deg", "dec_deg", "stars", "stars", "stars"))
     )
-    x, y = project(fields.ra_deg, fields.dec_deg)
+    x, y = project_sky(fields.ra_deg, fields.dec_deg)
     column = ((x / coverage_map.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
     row = ((1.0 - y / coverage_map.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
-    bins = coverage_map.bins_of(fields.stars)
+    bins = coverage_map.colour_bins(fields.stars)
     inside = pixels[row, column, 3] > 0
     assert inside.mean() > 0.95  # some lie in the last pixel of the edge
     for number in np.flatnonzero(inside):
@@ -207,7 +207,7 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_art
 
 @given(st.lists(st.integers(0, 400), min_size=1, max_size=60))
 def test_every_number_of_stars_has_one_colour(stars):
-    bins = coverage_map.bins_of(np.array(stars))
+    bins = coverage_map.colour_bins(np.array(stars))
     assert len({one.name for one in bins}) == len(bins) <= 10
     for count in range(min(stars), max(stars) + 1):
         fitting = [b for b in bins if b.least <= count and (b.most is None or count <= b.most)]

@@ -23,7 +23,7 @@ from services import DATABASE
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
-from starcat.matcher.centroids import read_frames
+from starcat.matcher.centroids import read_centroid_files
 from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat_service.pages.answers import link_of, shown_frames
@@ -331,7 +331,7 @@ def test_pasted_numbers_arrive_as_they_are(pairs, separator):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"frame{suffix}"
         path.write_text(content)
-        [frame] = read_frames(path)
+        [frame] = read_centroid_files(path)
     assert frame.centroids_px.tolist() == [list(pair) for pair in pairs]
     assert frame.mag is None
 

@@ -11,8 +11,8 @@ from services import client_of, token_of
 
 from starcat.errors import ConfigError
 from starcat.specs.reading import preset_names
-from starcat_service.pages.design import differences, draft_of_query, pinned_draft, query_of
-from starcat_service.pages.draft import Draft, draft_of_form, draft_of_text, draft_with
+from starcat_service.pages.design import design_query, differences, draft_of_query, pinned_draft
+from starcat_service.pages.draft import SpecForm, draft_of_form, draft_of_text, draft_with
 from starcat_service.pages.response import keys_of_file
 
 SETTINGS = {"anonymous": "builder"}
@@ -36,7 +36,7 @@ def _sent(client: TestClient, address: str, text: str, **more: str):
 def test_a_preset_has_a_short_address(name):
     is_default = name == preset_names()[0]
     draft = draft_of_query({"preset": name})
-    assert query_of(draft, name) == ("" if is_default else f"?preset={name}")
+    assert design_query(draft, name) == ("" if is_default else f"?preset={name}")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_preset_has_a_short_address(name):
 def test_an_address_gives_the_design_again(changes):
     for base in ("gaia-12deg", "sao-12deg-512"):
         draft = draft_with(draft_of_query({"preset": base}), changes)
-        again = pinned_draft(query_of(draft, base))
+        again = pinned_draft(design_query(draft, base))
         assert again.content == draft.content
         assert again.errors == draft.errors
 
@@ -82,7 +82,7 @@ def test_an_address_gives_the_design_again(changes):
     ids=["a comment", "no TOML", "a dotted name", "nothing", "a name of the address"],
 )
 def test_a_text_that_is_more_than_keys_is_in_the_address_as_it_is(text):
-    assert pinned_draft(query_of(draft_of_text(text), "gaia-12deg")).text == text
+    assert pinned_draft(design_query(draft_of_text(text), "gaia-12deg")).text == text
 
 
 def test_a_design_that_is_too_long_for_an_address_has_none(client):
@@ -90,7 +90,7 @@ def test_a_design_that_is_too_long_for_an_address_has_none(client):
     table = {"wavelength_nm": nm, "value": [0.1234567890123456] * len(nm)}
     changes = {f"camera.response.{key}": value for key, value in table.items()}
     draft = draft_with(draft_of_query({}), {"camera.fov_x_deg": 500.0, **changes})
-    assert query_of(draft, "") is None
+    assert design_query(draft, "") is None
     sent = {"toml": draft.text, "toml-before": "", "do": "pin", "pinned": ""}
     state = client.post("/new/preview", data=sent).json()
     assert (state["address"], state["pinned_query"]) == ("", "")
@@ -147,7 +147,7 @@ def reader(tmp_path):
 # The sensor
 
 
-def _changed(text: str, **changes: str) -> Draft:
+def _changed(text: str, **changes: str) -> SpecForm:
     known = draft_of_text(text)
     form = {**known.values, "toml": known.text, "toml-before": known.text}
     return draft_of_form(form | {key.replace("__", "."): value for key, value in changes.items()})
@@ -234,7 +234,7 @@ def test_a_design_keeps_its_name_and_description():
     wider = draft_with(draft, {"camera.fov_x_deg": 20.0})
     names = ("name", "description")
     assert [wider.values[key] for key in names] == [draft.values[key] for key in names]
-    assert query_of(wider, "") == "?camera.fov_x_deg=20.0"
+    assert design_query(wider, "") == "?camera.fov_x_deg=20.0"
     assert draft_of_query({"camera.fov_x_deg": "20.0"}).content == wider.content
 
 

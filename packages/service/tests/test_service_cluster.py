@@ -39,7 +39,7 @@ from starcat_service.jobs.submission import (
 )
 from starcat_service.paths import ServicePaths
 from starcat_service.service import Service
-from starcat_service.settings import Role, Settings
+from starcat_service.settings import Role, ServiceSettings
 
 CHIEF = Principal("chief", Role.PUBLISHER)
 START = "from distributed.cli.dask_{0} import main; main()"
@@ -59,7 +59,7 @@ def catalogs(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyP
 
 @pytest.fixture
 def service(tmp_path: Path, catalogs: Path) -> Iterator[Service]:
-    service = Service(Settings(root=tmp_path / "service", workers=0))
+    service = Service(ServiceSettings(root=tmp_path / "service", workers=0))
     yield service
     service.close()
 
@@ -294,7 +294,7 @@ class TestCluster:
         self, tmp_path, catalogs, cluster, small_spec
     ):
         cluster.worker("one")
-        settings = Settings(root=tmp_path / "s", scheduler=cluster.address, shutdown_s=0.0)
+        settings = ServiceSettings(root=tmp_path / "s", scheduler=cluster.address, shutdown_s=0.0)
         service = Service(settings)
         slots = JobSlots(service)
         slots.start()

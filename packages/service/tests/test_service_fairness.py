@@ -27,7 +27,7 @@ from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import Limiter, asker
 from starcat_service.sandbox.pool import SHORT_PLACES, SHORT_S, QueryPool
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 from starcat_service.vo import tap_jobs
 
 ENDLESS = "SELECT sum(a.i * b.j + c.i) FROM pairs a, pairs b, pairs c"
@@ -35,7 +35,7 @@ ENDLESS = "SELECT sum(a.i * b.j + c.i) FROM pairs a, pairs b, pairs c"
 
 @pytest.fixture
 def pool(tmp_path: Path) -> Iterator[QueryPool]:
-    opened = QueryPool(Settings(root=tmp_path, queries=2, query_time_s=30.0))
+    opened = QueryPool(ServiceSettings(root=tmp_path, queries=2, query_time_s=30.0))
     yield opened
     opened.close()
 

@@ -34,7 +34,7 @@ from starcat_service.security.middleware import JsonFormatter
 from starcat_service.security.request_limits import Buckets
 from starcat_service.security.tokens import TokenStore
 from starcat_service.server import listen, run_server
-from starcat_service.settings import Role, Settings, read_settings
+from starcat_service.settings import Role, ServiceSettings, read_settings
 
 Make = Callable[..., TestClient]
 
@@ -280,7 +280,7 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
     now[0] = 30.0
     assert buckets.take("a") == 0.0
     assert buckets.take("a") == 30.0
-    monkeypatch.setattr("starcat_service.security.request_limits.MOST_BUCKETS", 2)
+    monkeypatch.setattr("starcat_service.security.request_limits.MAX_BUCKETS", 2)
     buckets.take("b")
     buckets.take("c")
     assert buckets.take("a") == 0.0  # full again, for it was forgotten
@@ -482,7 +482,7 @@ def test_an_address_for_others_is_an_origin(tmp_path):
     for wrong in ("stars.example", "https://stars.example/path", "https://a@b", "ftp://x"):
         with pytest.raises(ConfigError, match="public_url"):
             read_settings(tmp_path, public_url=wrong)
-    assert Settings(root=tmp_path, public_url="https://x:8443").is_secure
+    assert ServiceSettings(root=tmp_path, public_url="https://x:8443").is_secure
 
 
 def test_the_page_of_the_interface_names_every_address(client):
@@ -496,7 +496,7 @@ def test_the_page_of_the_interface_names_every_address(client):
 
 def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
     with (
-        listen(Settings(root=tmp_path, port=0)) as listening,
+        listen(ServiceSettings(root=tmp_path, port=0)) as listening,
         socket.create_connection(listening.getsockname()),
         listening.accept()[0] as accepted,
     ):
@@ -504,10 +504,10 @@ def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
 
 
 def test_a_port_that_is_taken_is_told(tmp_path):
-    with listen(Settings(root=tmp_path, port=0)) as listening:
+    with listen(ServiceSettings(root=tmp_path, port=0)) as listening:
         port = listening.getsockname()[1]
         with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1:{port}: .*port"):
-            listen(Settings(root=tmp_path, port=port))
+            listen(ServiceSettings(root=tmp_path, port=port))
 
 
 def test_a_path_that_begins_as_an_open_one_is_not_open(client):

@@ -43,7 +43,7 @@ from starcat_service.problems import Problem
 from starcat_service.records import MIGRATIONS
 from starcat_service.server import run_server
 from starcat_service.service import Service
-from starcat_service.settings import Role, Settings, read_settings
+from starcat_service.settings import Role, ServiceSettings, read_settings
 
 JOBS = "/api/v1/jobs"
 ANNE, BOB = Principal("anne", Role.BUILDER), Principal("bob", Role.BUILDER)
@@ -75,7 +75,7 @@ def opened(tmp_path: Path) -> Iterator[Open]:
     services = []
 
     def make(**options: Any) -> Service:
-        service = Service(Settings(root=tmp_path / "service", **options))
+        service = Service(ServiceSettings(root=tmp_path / "service", **options))
         services.append(service)
         return service
 
@@ -356,7 +356,7 @@ def test_a_service_of_an_earlier_version_opens(tmp_path):
     with sqlite3.connect(tmp_path / "records.sqlite") as connection:
         connection.executescript(";".join([*MIGRATIONS[:3], "PRAGMA user_version = 3", old]))
     connection.close()
-    service = Service(Settings(root=tmp_path))
+    service = Service(ServiceSettings(root=tmp_path))
     assert begin(service, service.jobs.all()[0]).job.id == f"{1:032x}"
     assert service.jobs.count() == 1
     csv, failed = service.query_jobs.jobs("anne", "")
@@ -368,7 +368,7 @@ def test_a_service_of_an_earlier_version_opens(tmp_path):
 
 
 def test_two_servers_do_not_share_a_root(tmp_path):
-    settings = Settings(root=tmp_path / "service", port=0)
+    settings = ServiceSettings(root=tmp_path / "service", port=0)
     with (
         locked(tmp_path / "service" / "server.lock"),
         pytest.raises(ConfigError, match=r"service: another server runs there"),

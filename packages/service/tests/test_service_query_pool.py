@@ -13,14 +13,14 @@ import pytest
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
 from starcat_service.sandbox.pool import Pool, QueryPool
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 COUNT = "SELECT count(*) > 100 FROM stars"
 
 
 @pytest.fixture
 def sessions(tmp_path: Path) -> Iterator[QueryPool]:
-    opened = QueryPool(Settings(root=tmp_path, queries=1))
+    opened = QueryPool(ServiceSettings(root=tmp_path, queries=1))
     yield opened
     opened.close()
 

@@ -296,7 +296,7 @@ def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
 
 
 def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
-    monkeypatch.setattr(catalogs_module, "MOST_INPUT_BYTES", 1000)
+    monkeypatch.setattr(catalogs_module, "MAX_INPUT_BYTES", 1000)
     catalogs = Catalogs()
     with pytest.raises(Problem, match="more than an estimate reads whole") as told:
         catalogs.estimate(small)

@@ -27,10 +27,10 @@ from starcat.query.session import open_session
 from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER
-from starcat_service.protocols.parameters import Question
+from starcat_service.protocols.parameters import TapQuestion
 from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 from starcat_service.vo.tap import ClientGone, Spool
 
 SETTINGS = {"upload_mib": 0.5, "max_rows": 1_000_000}
@@ -148,7 +148,7 @@ def test_who_reads_slowly_keeps_nobody_waiting(root):
     """More clients than places begin to read large answers and stop; the next is answered."""
     with client_of(root, queries=2) as client:
         service = client.app.state.service
-        asked = Question("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
+        asked = TapQuestion("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
         spools = []
         for _ in range(4):
             parts = service.tap.answer(asked, {})
@@ -185,7 +185,7 @@ def test_a_query_ends_when_its_client_goes(root):
             if gone.is_set():
                 raise ClientGone
 
-        asked = Question(SLOW, response_format("csv"), 10)
+        asked = TapQuestion(SLOW, response_format("csv"), 10)
         spool = Spool(service.tap.answer(asked, {}, progress=watch), root, gone)
         time.sleep(0.5)
         spool.close()
@@ -557,7 +557,7 @@ def test_a_job_that_is_not_there_is_not_found(client, job):
 def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     root = tmp_path / "service"
     add_database(root, small_artifact)
-    settings = Settings(root=root)
+    settings = ServiceSettings(root=root)
     service = Service(settings)
     jobs = service.query_jobs
     client_of_jobs = asker.set("testclient")  # without a token, jobs belong to their client

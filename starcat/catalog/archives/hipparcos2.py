@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.star_table import Columns, join_flags, known, numbered
 from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
@@ -24,12 +24,12 @@ _DOUBLE, _VARIABLE, _PHOTOCENTRE = 1, 2, 4
 _SINGLE_SOLUTION = 5  # five parameters; others move or scatter as companions make stars do
 
 
-def magnitudes(records: Records, _: str) -> Array:
+def magnitudes(records: ParsedRecords, _: str) -> Array:
     """Return the magnitudes of records of the new reduction, all of which are Hp."""
     return records["hp_mag"]
 
 
-def stars(records: Records, band: str, _: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of records of the new reduction."""
     number, kind = records.integers("hip"), np.nan_to_num(records["sn"]).astype(np.int64)
     told, solution = kind // 10, kind % 10
@@ -69,7 +69,7 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _errors(records: Records) -> Columns:
+def _errors(records: ParsedRecords) -> Columns:
     """Return the errors of positions, which are at the epoch of the positions, and of motions."""
     columns: Columns = {}
     for axis, own, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):

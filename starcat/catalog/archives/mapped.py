@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.frames import icrs_from
-from starcat.catalog.readers.records import Problem, Records, Rows, TableColumn
+from starcat.catalog.readers.records import MalformedRecord, ParsedRecords, Rows, TableColumn
 from starcat.catalog.readers.tables import BLANKS, OpenTable
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of
+from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of_column
 from starcat.errors import ConfigError, quoted
-from starcat.stars.expressions import columns_in, evaluate
+from starcat.stars.expressions import columns_in, evaluate_expression
 from starcat.stars.star_table import Columns, known, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
@@ -89,7 +89,7 @@ def _unit(
             key=key,
         )
     try:
-        found = unit_of(text)
+        found = unit_of_column(text)
         if kind == "magnitudes" and found.physical_type == "spectral flux density":
             return text, lambda flux: _ab_magnitudes(flux, found)
         if kind == "magnitudes" and isinstance(found, units.MagUnit):
@@ -98,7 +98,7 @@ def _unit(
         second, arcsec = units.s, units.Unit(15.0 * units.arcsec)
         same = [(second, arcsec), (second / units.yr, arcsec / units.yr)]
         turns = same if name in ("ra", "ra_error", "pm_ra", "pm_ra_cosdec", "pm_ra_error") else []
-        factor = float(found.to(unit_of(str(wanted)), 1.0, equivalencies=turns))
+        factor = float(found.to(unit_of_column(str(wanted)), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
         raise ConfigError(
@@ -140,7 +140,7 @@ class _Reading:
         self.count = len(rows.number)
         self.found = understand(table, rows.columns, where)
         self.bad = np.zeros(self.count, dtype=bool)
-        self.problems: list[Problem] = []
+        self.problems: list[MalformedRecord] = []
         self._nulls = {str(one) for one in table.null} | set(BLANKS)
         self._null_numbers = [float(one) for one in table.null if _is_number(one)]
 
@@ -191,7 +191,7 @@ class _Reading:
         for i in np.flatnonzero(wrong & ~self.bad):
             text = quoted(str(values[i].as_py()))
             row = int(self.rows.number[i])
-            self.problems.append(Problem(row, key, None, text, expected, what="row"))
+            self.problems.append(MalformedRecord(row, key, None, text, expected, what="row"))
         self.bad |= wrong
 
     def value(self, key: str, *, as_text: bool = False) -> pa.Array:
@@ -202,7 +202,7 @@ class _Reading:
         if found.is_column:
             return self.column(found.columns[0], key, as_text=as_text)
         columns = {name: self.column(name, key) for name in found.columns}
-        return evaluate(found.value.value, columns, self.count, key)
+        return evaluate_expression(found.value.value, columns, self.count, key)
 
     def numbers(self, key: str) -> Array:
         """Return numbers in the unit of the star table, NaN where there is none."""
@@ -301,7 +301,7 @@ def _is_number(value: str | float) -> bool:
     return True
 
 
-def records_of(table: TableMap, rows: Rows, file: InputFile) -> Records:
+def records_of(table: TableMap, rows: Rows, file: InputFile) -> ParsedRecords:
     """Return rows as records: the values of the map by their keys, in the map's frame."""
     reading = _Reading(table, rows, file.path.name)
     columns: dict[str, NDArray[Any]] = {}
@@ -315,15 +315,15 @@ def records_of(table: TableMap, rows: Rows, file: InputFile) -> Records:
             columns[key] = reading.texts(key)
         else:
             columns[key] = reading.numbers(key)
-    records = Records(table.name, rows.number, columns, rows.problems)
+    records = ParsedRecords(table.name, rows.number, columns, rows.problems)
     records = records.without(reading.bad, reading.problems)
     return hook_of(table)(records) if table.python else records
 
 
-def hook_of(table: TableMap) -> Callable[[Records], Records]:
+def hook_of(table: TableMap) -> Callable[[ParsedRecords], ParsedRecords]:
     """Return the function that a shipped map names, for what expressions cannot say."""
     module, _, name = table.python.partition(":")
-    hook: Callable[[Records], Records] = getattr(importlib.import_module(module), name)
+    hook: Callable[[ParsedRecords], ParsedRecords] = getattr(importlib.import_module(module), name)
     return hook
 
 
@@ -334,11 +334,11 @@ class MappedTable:
     table: TableMap
     COLUMNS: Mapping[str, Sequence[str]]
 
-    def magnitudes(self, records: Records, band: str, /) -> Array:
+    def magnitudes(self, records: ParsedRecords, band: str, /) -> Array:
         """Return the magnitudes of records."""
         return np.asarray(records[f"magnitudes.{band}"])
 
-    def stars(self, records: Records, band: str, verdicts: Verdicts, /) -> Columns:
+    def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
         """Return the star-table columns of records, and reject those that are no stars."""
         verdicts.reject(_is_missing(records["star_text"]), Reason.no_identity)
         for key, reason in _reasons(records, "reject"):
@@ -351,7 +351,7 @@ class MappedTable:
         columns["quality_flags"] = quality_flags(len(records), flags)
         return {**columns, **self._light(records, band), **self._remarks(records)}
 
-    def _light(self, records: Records, band: str) -> Columns:
+    def _light(self, records: ParsedRecords, band: str) -> Columns:
         bands = self.table.ordered_bands
         columns: Columns = {
             "mag": self.magnitudes(records, band),
@@ -366,7 +366,7 @@ class MappedTable:
             columns |= {"colour_mag": first - second, "colour_bands": str(self.table.colour)}
         return columns
 
-    def _remarks(self, records: Records) -> Columns:
+    def _remarks(self, records: ParsedRecords) -> Columns:
         amplitude = _number(records, "columns.amplitude")
         own = records["star_text"]
         names = records.columns.get("columns.designation", np.full(len(own), None, dtype=object))
@@ -396,7 +396,7 @@ class MappedTable:
         return columns
 
 
-def _number(records: Records, key: str) -> Array:
+def _number(records: ParsedRecords, key: str) -> Array:
     found = records.columns.get(key)
     return np.full(len(records), np.nan) if found is None else np.asarray(found)
 
@@ -405,11 +405,11 @@ def _is_missing(texts: NDArray[Any]) -> Mask:
     return np.array([text is None for text in texts], dtype=bool)
 
 
-def _reasons(records: Records, kind: str) -> list[tuple[str, str]]:
+def _reasons(records: ParsedRecords, kind: str) -> list[tuple[str, str]]:
     return [(key, key.split(".", 1)[1]) for key in records.columns if key.startswith(f"{kind}.")]
 
 
-def _placed(table: TableMap, records: Records, verdicts: Verdicts) -> Columns:
+def _placed(table: TableMap, records: ParsedRecords, verdicts: Verdicts) -> Columns:
     """Return positions, proper motions and their errors in ICRS; the errors keep their axes."""
     ra, dec = records["columns.ra"], records["columns.dec"]
     outside = (np.abs(ra) > 360.0) | (np.abs(dec) > 90.0)

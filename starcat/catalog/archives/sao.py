@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column
 from starcat.stars.verdict import Reason, Verdicts
@@ -30,12 +30,12 @@ PRINTED_PM_DEC_ARCSEC_YR = {208759: -0.180, 208795: -0.042, 212470: -0.072}
 """Proper motions that the printed catalog has and the file leaves blank (ReadMe of I/131A)."""
 
 
-def magnitudes(records: Records, band: str) -> Array:
+def magnitudes(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes of SAO records."""
     return records["v_mag" if band == "V" else "p_mag"]
 
 
-def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
     """Return the star-table columns of SAO records."""
     number = records.integers("sao")
     ra_deg, dec_deg = _positions(records)
@@ -101,7 +101,7 @@ def icrs_from_fk5(
     )
 
 
-def _positions(records: Records) -> tuple[Array, Array]:
+def _positions(records: ParsedRecords) -> tuple[Array, Array]:
     """Return positions from the radians, good to 2 mas, or else from hours and degrees (15 mas)."""
     sign = np.where(records["de2000_sign"] == b"-", -1.0, 1.0)
     hours = records["ra2000_h"] + records["ra2000_m"] / 60.0 + records["ra2000_s"] / 3600.0
@@ -113,7 +113,7 @@ def _positions(records: Records) -> tuple[Array, Array]:
 
 
 def _proper_motions(
-    records: Records, number: NDArray[np.int64], dec_deg: Array
+    records: ParsedRecords, number: NDArray[np.int64], dec_deg: Array
 ) -> tuple[Array, Array]:
     pm_ra = records["pm_ra2000"] * 15.0 * 1000.0 * np.cos(np.radians(dec_deg))
     pm_dec = records["pm_de2000"] * 1000.0
@@ -122,7 +122,7 @@ def _proper_motions(
     return pm_ra, pm_dec
 
 
-def _duplicity(records: Records) -> tuple[pa.Array, Mask, Array]:
+def _duplicity(records: ParsedRecords) -> tuple[pa.Array, Mask, Array]:
     rem, m_hd = records["rem"], records["m_hd"]
     by_rem = np.isin(rem, [1, 2, 3, 7])
     by_hd = np.isin(m_hd, [1, 2, 9])

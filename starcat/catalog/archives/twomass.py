@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.star_table import Columns, join_flags, known, text_column
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
@@ -31,7 +31,7 @@ _BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
 _ERRORS = {"J": "j_msigcom", "H": "h_msigcom", "Ks": "k_msigcom"}
 
 
-def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
     """Return the star-table columns of 2MASS records."""
     weights = blend_weights(band)
     mags = {name: _measured(records, name) for name in _BANDS}
@@ -83,7 +83,7 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     }
 
 
-def magnitudes(records: Records, band: str) -> Array:
+def magnitudes(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes of 2MASS records."""
     weights = blend_weights(band)
     return _blend({name: _measured(records, name) for name in weights}, weights)
@@ -93,7 +93,7 @@ def _blend(mags: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
     return np.asarray(np.sum([weight * mags[name] for name, weight in weights.items()], 0))
 
 
-def _measured(records: Records, band: str) -> Array:
+def _measured(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes that were measured: NaN for upper limits and bands without a source."""
     _, column = _BANDS[band]
     limit = _any_flag(records, "ph_qual", b"UX", {band: 1.0})
@@ -101,7 +101,7 @@ def _measured(records: Records, band: str) -> Array:
     return np.where(limit | unmeasured, np.nan, records[column])
 
 
-def _any_flag(records: Records, column: str, codes: bytes, bands: dict[str, float]) -> Mask:
+def _any_flag(records: ParsedRecords, column: str, codes: bytes, bands: dict[str, float]) -> Mask:
     """Return where a flag column has one of the codes in any of the bands."""
     text = records[column]
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
@@ -115,7 +115,7 @@ def _any_flag(records: Records, column: str, codes: bytes, bands: dict[str, floa
     return found
 
 
-def _identity(records: Records) -> NDArray[np.int64]:
+def _identity(records: ParsedRecords) -> NDArray[np.int64]:
     """Return pts_key, or else the designation as a number above all keys; 0 where it has neither.
 
     The digits of ``hhmmssss+ddmmsss`` are the last 15 of the number. A component letter behind

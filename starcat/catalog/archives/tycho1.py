@@ -11,7 +11,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.catalog.archives.hipparcos import ASTROMETRY, shared_columns
 from starcat.catalog.archives.tycho2 import tycho_identity, tycho_magnitude_error
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.star_table import Columns, join_flags, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
@@ -26,12 +26,12 @@ COLUMNS = {
 _MAGNITUDES = {"V": "v_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
 
-def magnitudes(records: Records, band: str) -> Array:
+def magnitudes(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes of Tycho-1 records."""
     return records[_MAGNITUDES[band]]
 
 
-def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
     """Return the star-table columns of Tycho-1 records."""
     number, designation = tycho_identity(records)
     verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["de_deg"]), Reason.no_position)
@@ -61,7 +61,7 @@ def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     }
 
 
-def _duplicity(records: Records) -> Columns:
+def _duplicity(records: ParsedRecords) -> Columns:
     is_suspect = records["q"] == 6
     flag = join_flags(
         {
@@ -74,7 +74,7 @@ def _duplicity(records: Records) -> Columns:
     return {"double_flag": flag, "is_flagged_double": is_double}
 
 
-def _variability(records: Records) -> Columns:
+def _variability(records: ParsedRecords) -> Columns:
     variable = np.isin(records["var_flag"], [b"U", b"V", b"W"])
     named = np.isin(records["var"], [b"G", b"N"])
     # VTmax and VTmin are percentiles of noisy transits: an amplitude only if flagged.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import JOHNSON_SLOPE, johnson_v
-from starcat.catalog.readers.records import Records
+from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.star_table import Columns, join_flags, known
 from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
@@ -51,12 +51,12 @@ def _region_texts() -> pa.Array:
     return pc.binary_join_element_wise("TYC", _number_texts()[:10_000], " ")
 
 
-def magnitudes(records: Records, band: str) -> Array:
+def magnitudes(records: ParsedRecords, band: str) -> Array:
     """Return the magnitudes of Tycho-2 records."""
     return _magnitudes(records, band)[0]
 
 
-def stars(records: Records, band: str, _: Verdicts) -> Columns:
+def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Tycho-2 records."""
     place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
     number, designation = tycho_identity(records)
@@ -91,7 +91,7 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _place_tyc2(records: Records) -> dict[str, Any]:
+def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
     """Return the mean positions at J2000, or the observed ones where there is no mean."""
     no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
     observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
@@ -112,7 +112,7 @@ def _place_tyc2(records: Records) -> dict[str, Any]:
     }
 
 
-def _place_suppl(records: Records) -> dict[str, Any]:
+def _place_suppl(records: ParsedRecords) -> dict[str, Any]:
     nowhere = np.zeros(len(records), dtype=bool)
     return {
         "ra_deg": records["ra_deg"],
@@ -127,7 +127,7 @@ def _place_suppl(records: Records) -> dict[str, Any]:
     }
 
 
-def _magnitudes(records: Records, band: str) -> tuple[Array, dict[Quality, Mask]]:
+def _magnitudes(records: ParsedRecords, band: str) -> tuple[Array, dict[Quality, Mask]]:
     bt, vt = records["bt_mag"], records["vt_mag"]
     if band == "BT":
         return bt, {}
@@ -145,7 +145,7 @@ def _magnitudes(records: Records, band: str) -> tuple[Array, dict[Quality, Mask]
     return v.mag, bits
 
 
-def tycho_magnitude_error(records: Records, band: str) -> Array:
+def tycho_magnitude_error(records: ParsedRecords, band: str) -> Array:
     """Return the errors of the magnitudes of Tycho records; NaN where V is an estimate."""
     bt_error, vt_error = known(records["e_bt_mag"]), known(records["e_vt_mag"])
     if band == "V":
@@ -153,7 +153,7 @@ def tycho_magnitude_error(records: Records, band: str) -> Array:
     return bt_error if band == "BT" else vt_error
 
 
-def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
+def tycho_identity(records: ParsedRecords) -> tuple[NDArray[np.int64], pa.Array]:
     """Return the packed number and the designation of Tycho records."""
     parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
     number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]

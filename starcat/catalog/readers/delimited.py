@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from starcat.catalog.readers.records import (
-    Problem,
-    Records,
+    MalformedRecord,
+    ParsedRecords,
     apply_nulls,
-    check_fields,
+    check_record_fields,
     line_ends,
     read_fields,
 )
-from starcat.catalog.source import Column, RecordFile
+from starcat.catalog.source import RecordFile, SourceColumn
 
 _CACHED_BYTES = 1 << 20
 """Text that is split at once, and is then still in the processor's cache for its numbers."""
@@ -32,18 +32,18 @@ _CACHED_BYTES = 1 << 20
 
 def parse_delimited(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
-) -> Records:
+) -> ParsedRecords:
     """Parse a block of delimited lines."""
     chosen = [layout.column(name) for name in names]
     records = _parse_regular(data, layout, chosen, first_line)
     if records is None:
         records = _parse_lines(data, layout, chosen, first_line)
-    return check_fields(records, layout)
+    return check_record_fields(records, layout)
 
 
 def _parse_regular(
-    data: bytes, layout: RecordFile, chosen: Sequence[Column], first_line: int
-) -> Records | None:
+    data: bytes, layout: RecordFile, chosen: Sequence[SourceColumn], first_line: int
+) -> ParsedRecords | None:
     """Parse a block in which every line is a good record; return None for any other block."""
     comment = layout.comment.encode()
     has_comment = comment and (data.startswith(comment) or b"\n" + comment in data)
@@ -57,12 +57,12 @@ def _parse_regular(
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         return None
     line = np.arange(first_line, first_line + len(table), dtype=np.int64)
-    return Records(layout.name, line, columns)
+    return ParsedRecords(layout.name, line, columns)
 
 
 def _parse_lines(
-    data: bytes, layout: RecordFile, chosen: Sequence[Column], first_line: int
-) -> Records:
+    data: bytes, layout: RecordFile, chosen: Sequence[SourceColumn], first_line: int
+) -> ParsedRecords:
     """Parse a block line by line, and list the lines that are no records."""
     delimiter, comment = layout.delimiter.encode(), layout.comment.encode()
     number, kept, problems = [], [], []
@@ -76,14 +76,14 @@ def _parse_lines(
         else:
             expected = f"{len(layout.columns)} fields"
             problems.append(
-                Problem(first_line + offset, "record", None, f"{fields} fields", expected)
+                MalformedRecord(first_line + offset, "record", None, f"{fields} fields", expected)
             )
     line = np.array(number, dtype=np.int64)
     if not kept:
         empty: dict[str, NDArray[Any]] = {
             column.name: np.empty(0, "S1" if column.is_text else float) for column in chosen
         }
-        return Records(layout.name, line, empty, problems)
+        return ParsedRecords(layout.name, line, empty, problems)
     clean = b"\n".join(kept)
     bad = np.zeros(len(line), dtype=bool)
     try:
@@ -92,13 +92,13 @@ def _parse_lines(
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         table = _read_csv(clean, layout, chosen, as_text=True)
         columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in chosen}
-    return Records(layout.name, line, columns).without(bad, problems)
+    return ParsedRecords(layout.name, line, columns).without(bad, problems)
 
 
 def _read_csv(
     data: bytes,
     layout: RecordFile,
-    chosen: Sequence[Column],
+    chosen: Sequence[SourceColumn],
     *,
     as_text: bool = False,
     block_bytes: int = 1 << 30,
@@ -123,7 +123,7 @@ def _read_csv(
     )
 
 
-def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
+def _array(values: pa.ChunkedArray, column: SourceColumn) -> NDArray[Any]:
     if column.is_text:
         return _text_array(values)
     if not pc.all(pc.is_finite(values), min_count=0).as_py():
@@ -146,10 +146,10 @@ def _text_array(values: pa.ChunkedArray) -> NDArray[Any]:
 
 def _array_by_field(
     values: pa.ChunkedArray,
-    column: Column,
+    column: SourceColumn,
     line: NDArray[np.int64],
     bad: NDArray[np.bool_],
-    problems: list[Problem],
+    problems: list[MalformedRecord],
 ) -> NDArray[Any]:
     """Parse one column field by field; mark and report the records that cannot be read."""
     if column.is_text:

@@ -15,8 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.readers.records import Problem, Records, apply_nulls, check_fields, read_fields
-from starcat.catalog.source import Column, RecordFile
+from starcat.catalog.readers.records import (
+    MalformedRecord,
+    ParsedRecords,
+    apply_nulls,
+    check_record_fields,
+    read_fields,
+)
+from starcat.catalog.source import RecordFile, SourceColumn
 from starcat.errors import quoted
 
 _NEWLINE, _RETURN, _SPACE, _PLUS, _MINUS, _POINT = b"\n\r +-."
@@ -24,7 +30,7 @@ _NEWLINE, _RETURN, _SPACE, _PLUS, _MINUS, _POINT = b"\n\r +-."
 
 def parse_fixed_width(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
-) -> Records:
+) -> ParsedRecords:
     """Parse a block of fixed-width lines."""
     chars, line, problems = _split_lines(data, layout, first_line)
     columns: dict[str, NDArray[Any]] = {}
@@ -42,13 +48,13 @@ def parse_fixed_width(
             problems += read_fields(values, texts, column, line, bad)
             apply_nulls(values, column)
             columns[name] = values
-    records = Records(layout.name, line, columns).without(bad, problems)
-    return check_fields(records, layout)
+    records = ParsedRecords(layout.name, line, columns).without(bad, problems)
+    return check_record_fields(records, layout)
 
 
 def parse_binary(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
-) -> Records:
+) -> ParsedRecords:
     """Parse a block of packed little-endian records."""
     size = layout.record_bytes or 1
     columns = [layout.column(name) for name in names]
@@ -71,12 +77,12 @@ def parse_binary(
     problems = []
     if rest:
         problems.append(
-            Problem(first_line + count, "record", None, f"{rest} bytes", f"{size} bytes")
+            MalformedRecord(first_line + count, "record", None, f"{rest} bytes", f"{size} bytes")
         )
-    return check_fields(Records(layout.name, line, values, problems), layout)
+    return check_record_fields(ParsedRecords(layout.name, line, values, problems), layout)
 
 
-def _byte_range(column: Column) -> tuple[int, int]:
+def _byte_range(column: SourceColumn) -> tuple[int, int]:
     if column.bytes is None:  # the model of a source refuses such a column, which mypy cannot know
         raise ValueError(f"column {column.name} has no byte range")
     return column.bytes
@@ -84,7 +90,7 @@ def _byte_range(column: Column) -> tuple[int, int]:
 
 def _split_lines(
     data: bytes, layout: RecordFile, first_line: int
-) -> tuple[NDArray[np.uint8], NDArray[np.int64], list[Problem]]:
+) -> tuple[NDArray[np.uint8], NDArray[np.int64], list[MalformedRecord]]:
     """Return the lines of the right length as a matrix, with their numbers."""
     length = layout.record_bytes or 0
     if not data.endswith(b"\n"):
@@ -103,7 +109,7 @@ def _split_lines(
 
 def _split_uneven(
     raw: NDArray[np.uint8], length: int, first_line: int
-) -> tuple[NDArray[np.uint8], NDArray[np.int64], list[Problem]]:
+) -> tuple[NDArray[np.uint8], NDArray[np.int64], list[MalformedRecord]]:
     end = np.flatnonzero(raw == _NEWLINE)
     start = np.concatenate([[0], end[:-1] + 1])
     size = end - start
@@ -111,7 +117,7 @@ def _split_uneven(
     line = np.arange(first_line, first_line + len(end), dtype=np.int64)
     wrong = (size != length) & (size > 0)
     problems = [
-        Problem(int(line[i]), "record", None, f"{size[i]} bytes", f"{length} bytes")
+        MalformedRecord(int(line[i]), "record", None, f"{size[i]} bytes", f"{length} bytes")
         for i in np.flatnonzero(wrong)
     ]
     good = size == length
@@ -123,9 +129,9 @@ def _split_uneven(
 
 def _check_literals(
     chars: NDArray[np.uint8], line: NDArray[np.int64], layout: RecordFile, bad: Mask
-) -> list[Problem]:
+) -> list[MalformedRecord]:
     """Mark the records that lack a separator where the layout has one."""
-    problems: list[Problem] = []
+    problems: list[MalformedRecord] = []
     places = np.array([int(position) - 1 for position in layout.literals], dtype=np.intp)
     texts = np.array([ord(text) for text in layout.literals.values()], dtype=np.uint8)
     if bool((chars[:, places] == texts).all()):
@@ -135,7 +141,9 @@ def _check_literals(
         wrong = (chars[:, byte - 1] != ord(text)) & ~bad
         for i in np.flatnonzero(wrong):
             found = quoted(chars[i, byte - 1].tobytes())
-            problems.append(Problem(int(line[i]), "separator", (byte, byte), found, repr(text)))
+            problems.append(
+                MalformedRecord(int(line[i]), "separator", (byte, byte), found, repr(text))
+            )
         bad |= wrong
     return problems
 

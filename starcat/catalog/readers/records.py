@@ -19,7 +19,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.source import Column, RecordFile
+from starcat.catalog.source import RecordFile, SourceColumn
 from starcat.errors import quoted
 
 _NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
@@ -32,7 +32,7 @@ def line_ends(data: bytes) -> int:
 
 
 @dataclass(frozen=True)
-class Problem:
+class MalformedRecord:
     """Why one line is not a record."""
 
     line: int  # 1-based in its file (record number in a binary file)
@@ -66,17 +66,17 @@ class Rows:
     columns: dict[str, TableColumn]  # of the file
     table: pa.Table  # the columns that were asked for
     number: NDArray[np.int64]  # 1-based, of each row in the file
-    problems: list[Problem] = field(default_factory=list)  # rows that could not be read
+    problems: list[MalformedRecord] = field(default_factory=list)  # rows that could not be read
 
 
 @dataclass(frozen=True)
-class Records:
+class ParsedRecords:
     """Columns of the good records of a block, in file order."""
 
     layout: str  # name of the record layout
     line: NDArray[np.int64]  # 1-based line of each record in its file
     columns: dict[str, NDArray[Any]]  # float64, NaN for "no value"; int64; or fixed-width bytes
-    problems: list[Problem] = field(default_factory=list)  # lines left out, in file order
+    problems: list[MalformedRecord] = field(default_factory=list)  # lines left out, in file order
 
     def __len__(self) -> int:
         return len(self.line)
@@ -99,12 +99,12 @@ class Records:
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
-    def where(self, chosen: Mask) -> Records:
+    def where(self, chosen: Mask) -> ParsedRecords:
         """Return some of the records, with all problems."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, line=self.line[chosen], columns=columns)
 
-    def without(self, bad: Mask, problems: Sequence[Problem]) -> Records:
+    def without(self, bad: Mask, problems: Sequence[MalformedRecord]) -> ParsedRecords:
         """Return the records that are not bad, with more problems listed."""
         merged = sorted([*self.problems, *problems], key=lambda problem: problem.line)
         if not bad.any():
@@ -112,23 +112,25 @@ class Records:
         return replace(self.where(~bad), problems=merged)
 
 
-def check_fields(records: Records, layout: RecordFile) -> Records:
+def check_record_fields(records: ParsedRecords, layout: RecordFile) -> ParsedRecords:
     """Leave out the records that lack a required field, or have a number that cannot be."""
     columns = [column for column in layout.columns if column.name in records.columns]
     bad = np.zeros(len(records), dtype=bool)
-    problems: list[Problem] = []
+    problems: list[MalformedRecord] = []
     for column, is_wrong, expected in chain(_blanks(records, columns), _outside(records, columns)):
         for i in np.flatnonzero(is_wrong & ~bad):
             is_blank = expected == _A_VALUE
             found = "a blank field" if is_blank else f"{records[column.name][i]:.10g}"
             problems.append(
-                Problem(int(records.line[i]), column.name, column.bytes, found, expected)
+                MalformedRecord(int(records.line[i]), column.name, column.bytes, found, expected)
             )
         bad |= is_wrong
     return records.without(bad, problems)
 
 
-def _blanks(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Column, Mask, str]]:
+def _blanks(
+    records: ParsedRecords, columns: Sequence[SourceColumn]
+) -> Iterator[tuple[SourceColumn, Mask, str]]:
     for column in columns:
         values = records[column.name]
         if column.required and values.dtype.kind == "f":
@@ -137,7 +139,9 @@ def _blanks(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Colum
             yield column, records.is_blank(column.name), _A_VALUE
 
 
-def _outside(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Column, Mask, str]]:
+def _outside(
+    records: ParsedRecords, columns: Sequence[SourceColumn]
+) -> Iterator[tuple[SourceColumn, Mask, str]]:
     for column in columns:
         values = records[column.name]
         if values.dtype.kind == "S":
@@ -154,10 +158,10 @@ def _outside(records: Records, columns: Sequence[Column]) -> Iterator[tuple[Colu
 def read_fields(
     values: Array,
     texts: Iterable[tuple[int, bytes]],
-    column: Column,
+    column: SourceColumn,
     line: NDArray[np.int64],
     bad: Mask,
-) -> list[Problem]:
+) -> list[MalformedRecord]:
     """Read the fields of some rows one by one; mark and report those that are no numbers."""
     problems = []
     for i, text in texts:
@@ -166,7 +170,9 @@ def read_fields(
         except ValueError:
             if not bad[i]:
                 found, expected = quoted(text), f"a number like {column.format}"
-                problems.append(Problem(int(line[i]), column.name, column.bytes, found, expected))
+                problems.append(
+                    MalformedRecord(int(line[i]), column.name, column.bytes, found, expected)
+                )
             bad[i] = True
     return problems
 
@@ -184,7 +190,7 @@ def number_from_text(text: bytes) -> float:
     return number
 
 
-def apply_nulls(values: Array, column: Column) -> None:
+def apply_nulls(values: Array, column: SourceColumn) -> None:
     """Set the numbers that stand for "no value" to NaN, in place."""
     for text in column.null:
         if _NUMBER.fullmatch(text.encode()):

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.catalog.readers.blocks import DigestReader, open_input
-from starcat.catalog.readers.records import Problem, Rows, TableColumn
+from starcat.catalog.readers.records import MalformedRecord, Rows, TableColumn
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import TableMap
 from starcat.errors import StarcatError, quoted
@@ -45,7 +45,7 @@ class OpenTable:
     form: str
     columns: dict[str, TableColumn]
     read: Callable[
-        [Sequence[str]], Iterator[tuple[pa.Table, NDArray[np.int64] | None, list[Problem]]]
+        [Sequence[str]], Iterator[tuple[pa.Table, NDArray[np.int64] | None, list[MalformedRecord]]]
     ]
 
     def rows(self, names: Sequence[str]) -> Iterator[Rows]:
@@ -67,7 +67,7 @@ def open_table(file: InputFile) -> OpenTable:
     except StarcatError:
         raise
     except _DAMAGE as error:
-        raise damaged(file, error) from error
+        raise damaged_table(file, error) from error
     if not opened.columns:
         raise file.error("has no column that holds one value a row; expected a table of stars")
     return opened
@@ -88,7 +88,7 @@ def read_tables(
             if len(rows.number) or rows.problems:
                 yield rows
     except _DAMAGE as error:
-        raise damaged(file, error) from error
+        raise damaged_table(file, error) from error
     if not count:
         raise file.error(f"the table ({opened.form}) has no row; expected stars")
     buffer = memoryview(bytearray(1 << 20))
@@ -98,7 +98,7 @@ def read_tables(
         on_end(raw)
 
 
-def damaged(file: InputFile, error: Exception) -> StarcatError:
+def damaged_table(file: InputFile, error: Exception) -> StarcatError:
     """Return what to say of a table that a library cannot read."""
     if isinstance(error, UnicodeDecodeError):
         return file.error(
@@ -122,7 +122,7 @@ _DAMAGE = (
     *(OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SyntaxError, EOFError),
     *(ExpatError, pa.ArrowException, csv.Error, LookupError),
 )
-_Part = tuple[pa.Table, NDArray[np.int64] | None, list[Problem]]
+_Part = tuple[pa.Table, NDArray[np.int64] | None, list[MalformedRecord]]
 
 
 def _head(path: Path) -> bytes:
@@ -239,12 +239,12 @@ class _TextOptions:
 
     def read(self, file: InputFile, wanted: Sequence[str]) -> Iterator[_Part]:
         """Read columns as texts, in blocks of lines; lines of another length are problems."""
-        bad: list[Problem] = []
+        bad: list[MalformedRecord] = []
 
         def note(row: pacsv.InvalidRow) -> str:
             number = (row.number or 0) - before
             found, expected = f"{row.actual_columns}", f"{row.expected_columns}"
-            bad.append(Problem(number, "fields", None, found, expected, what="row"))
+            bad.append(MalformedRecord(number, "fields", None, found, expected, what="row"))
             return "skip"
 
         before = self.skipped + self.after + (0 if self.how.names else 1)

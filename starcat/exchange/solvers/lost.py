@@ -16,11 +16,11 @@ from starcat.errors import ConfigError
 from starcat.exchange.solvers.sky import SolverSky
 from starcat.geometry.proximity import pairs_within
 
-MOST_STARS = 32_767
+MAX_STARS = 32_767
 _CATALOG, _PAIRS = 0xF9A283BC, 0x2536F009
 _HAS_MAGNITUDE, _HAS_NAME = 1, 2
 _BIN_ARCSEC = 5.0
-_LEAST_DEG = 0.5
+_MIN_DEG = 0.5
 """Pairs that are closer tell little, and centroids of such stars often run into each other."""
 
 _STAR = np.dtype([("direction", "<f8", (3,)), ("mag", "<f4"), ("name", "<i2"), ("", "V2")])
@@ -31,9 +31,9 @@ _INDEX = np.dtype(
 
 def write_lost(sky: SolverSky, path: Path) -> dict[str, Any]:
     """Write the database of LOST; returns its figures."""
-    if len(sky.mag) > MOST_STARS:
+    if len(sky.mag) > MAX_STARS:
         raise ConfigError(
-            f"{sky.name} has {len(sky.mag):,} stars; LOST numbers {MOST_STARS:,} at most: build it "
+            f"{sky.name} has {len(sky.mag):,} stars; LOST numbers {MAX_STARS:,} at most: build it "
             "again with a brighter selection.faint_limit_mag",
             key="to",
         )
@@ -59,7 +59,7 @@ def _catalog(sky: SolverSky) -> bytes:
 
 def _pairs(sky: SolverSky) -> tuple[int, bytes]:
     focal_px = 0.5 * sky.camera.width_px / np.tan(0.5 * np.radians(sky.fov_deg[1]))
-    least_rad = np.radians(_LEAST_DEG)
+    least_rad = np.radians(_MIN_DEG)
     most_rad = sky.camera.with_focal_length(float(focal_px)).diagonal_rad
     rows, angle = pairs_within(sky.directions, most_rad)
     rows, angle = rows[angle >= least_rad], angle[angle >= least_rad]

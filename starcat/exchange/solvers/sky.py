@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.artifact.reader import Artifact
+from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
 from starcat.stars.star_table import directions_of, floats_of
@@ -51,7 +51,7 @@ class SolverSky:
         }
 
 
-def sky_of(artifact: Artifact) -> SolverSky:
+def sky_of(artifact: DatabaseFolder) -> SolverSky:
     """Return what a solver's file is made of."""
     manifest, spec = artifact.manifest, artifact.spec
     stars = artifact.stars

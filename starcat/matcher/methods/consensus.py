@@ -28,7 +28,7 @@ from starcat.matcher.star_cells import rows_between
 BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
 
-MOST_NAMES = 2048
+MAX_NAMES = 2048
 """Largest number of names that are compared; where there are more, low ranks are left out."""
 
 
@@ -94,7 +94,7 @@ def support(fits: Mask, centroid: Rows, count: int) -> NDArray[np.int64]:
 def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
     """Return centroid and star of every name, the first ranks of all centroids first."""
     rank, centroid = np.nonzero(ranked.T >= 0)
-    rank, centroid = rank[:MOST_NAMES], centroid[:MOST_NAMES]
+    rank, centroid = rank[:MAX_NAMES], centroid[:MAX_NAMES]
     # Products may keep rows in few bits.
     return centroid, ranked[centroid, rank].astype(np.intp)
 

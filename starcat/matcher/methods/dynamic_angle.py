@@ -142,14 +142,14 @@ def _walk(
     return begun[fits], observed[fits], row[fits]
 
 
-LEAST_OTHERS = 2
+MIN_OTHERS = 2
 """Centroids beside the base that have to be near a star: four in all, as an answer needs."""
 
 REACH = 3.0
 """Largest distance of another centroid from its star, in units of the tolerance. It is larger than
 that of an agreement, as two stars leave more of an error in an attitude."""
 
-MOST_PLACES = 2**20
+MAX_PLACES = 2**20
 """Largest number of places in the sky that a frame is looked up at: some tenths of a second."""
 
 
@@ -170,7 +170,7 @@ def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
     high = np.searchsorted(apart_rad, separation_rad + tolerance_rad, side="right")
     places = np.cumsum(high - low) * max(0, len(observation) - 2)
     for one, other, begin, end in zip(
-        *(ends[places <= MOST_PLACES].tolist() for ends in (first, second, low, high)), strict=True
+        *(ends[places <= MAX_PLACES].tolist() for ends in (first, second, low, high)), strict=True
     ):
         observation.budget.spend(LOOKUP + end - begin)
         found = _on_base(one, other, order[begin:end], observation, database)
@@ -190,7 +190,7 @@ def _on_base(
     reach_rad = REACH * observation.tolerance_rad
     near = cells_for(database, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
     near = near.reshape(len(rows), len(others))
-    row, third = np.nonzero(near & (near.sum(axis=1) >= LEAST_OTHERS)[:, None])
+    row, third = np.nonzero(near & (near.sum(axis=1) >= MIN_OTHERS)[:, None])
     star = (icrs[row, third] @ database.directions.T).argmax(axis=1)
     ends = np.broadcast_to([one, other], (len(row), 2))
     found = Candidates(np.column_stack([ends, others[third]]), np.column_stack([stars[row], star]))

@@ -17,7 +17,7 @@ from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
 from starcat.matcher.methods.triangle import select_triangles
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.settings import LOOKUP, MOST_TRIANGLES
+from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES
 from starcat.matcher.star_cells import rows_between
 
 JOINED_A_STEP = 50
@@ -50,7 +50,7 @@ def pyramid_candidates(observation: Observation, database: Database) -> Iterator
 
 def _triangles(observation: Observation, database: Database) -> Iterator[tuple[Rows, Rows]]:
     """Yield observed triangles, with the triangles of stars that they may be, shape (C, 3)."""
-    for triangle in select_triangles(observation)[:MOST_TRIANGLES]:
+    for triangle in select_triangles(observation)[:MAX_TRIANGLES]:
         observation.budget.spend(LOOKUP)
         stars = triangles_of_stars(triangle, observation, database)
         if len(stars):

@@ -37,7 +37,7 @@ from starcat.matcher.star_cells import rows_between
 ALIGNMENTS = 2
 """How many neighbours are tried as the alignment neighbour: the nearest may be a false star."""
 
-MOST_STARS = 64
+MAX_STARS = 64
 """Stars of most votes whose alignment star is looked at."""
 
 _TOUCHES = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]])
@@ -66,7 +66,7 @@ def _aligned(
     if alignment is None:
         nothing = np.zeros((0, 2), dtype=np.intp)
         return Candidates(nothing, nothing)
-    rows, _ = most_votes(around, alignment, observation.tolerance_rad, product, MOST_STARS)
+    rows, _ = most_votes(around, alignment, observation.tolerance_rad, product, MAX_STARS)
     stars = np.stack([product["star"][rows], product["alignment_star"][rows]], axis=-1)
     u = database.directions[stars.astype(np.intp)]
     difference = separation(u[:, 0], u[:, 1]) - around.separation_rad[alignment]
@@ -116,7 +116,7 @@ def _occupied(
 ROUNDS = ((3, 16), (12, 32), (48, 64))
 """How many centroids are compared, from the centre, and how many names each of them gets."""
 
-MOST_PAIRS = 200
+MAX_PAIRS = 200
 """Pairs of names proposed in a round at the most."""
 
 COMPARED = 2
@@ -147,7 +147,7 @@ def radial_candidates(observation: Observation, database: Database) -> Iterator[
             stars, _ = rank_by_rings(observation, database, int(reference), most=names.shape[1])
             names[reference, : len(stars)] = stars
         done = first
-        yield from consistent_candidates(names[:, :most], observation, database, MOST_PAIRS)
+        yield from consistent_candidates(names[:, :most], observation, database, MAX_PAIRS)
 
 
 def rank_by_rings(

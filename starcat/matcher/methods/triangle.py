@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.settings import LOOKUP, MOST_TRIANGLES, TriangleOrder
+from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES, TriangleOrder
 
-LEAST_ANGLE_DEG = 4.0
+MIN_ANGLE_DEG = 4.0
 """Smallest angle of a triangle that is tried at all."""
 
 NEIGHBOURS = 20
@@ -63,7 +63,7 @@ def select_triangles(observation: Observation) -> NDArray[np.intp]:
     good = good[order]
     if count > selection.few_centroids:
         return np.asarray(stars[order[good]])
-    poor = is_well_shaped(a, b, c, observation.tolerance_rad, np.radians(LEAST_ANGLE_DEG))[order]
+    poor = is_well_shaped(a, b, c, observation.tolerance_rad, np.radians(MIN_ANGLE_DEG))[order]
     return np.asarray(stars[np.concatenate([order[good], order[poor & ~good]])])
 
 
@@ -156,7 +156,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
     Liao and Zhang 2024 (S4), sections 2 and 3.
     """
-    triangles = select_triangles(observation)[:MOST_TRIANGLES]
+    triangles = select_triangles(observation)[:MAX_TRIANGLES]
     done = step = 0
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]

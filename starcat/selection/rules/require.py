@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from starcat.errors import BuildError, ConfigError
 from starcat.sections import NAME_PATTERN, Section
 from starcat.selection.rule import Context, Rejection, RuleReason
-from starcat.stars.expressions import columns_in, evaluate
+from starcat.stars.expressions import columns_in, evaluate_expression
 from starcat.storage.schema import product_schema
 
 POSITION = 75
@@ -74,7 +74,7 @@ def reject(context: Context, keys: Requirements) -> list[Rejection] | None:
         key = f"selection.require.{wanted.name}"
         names, _ = columns_in(wanted.expression, context.stars.column_names, key, "the star table")
         columns = {name: context.stars[name].combine_chunks() for name in names}
-        holds = evaluate(wanted.expression, columns, len(context.stars), key)
+        holds = evaluate_expression(wanted.expression, columns, len(context.stars), key)
         if not pa.types.is_boolean(holds.type):
             raise BuildError(
                 f"{key}: {wanted.expression!r} gives {holds.type}; write a condition, such as "

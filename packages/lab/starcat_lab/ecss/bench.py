@@ -42,7 +42,7 @@ from starcat_lab.experiment import catalog_of_artifact
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")
 _LIMIT_BEYOND_MAG = 0.3
-_MOST_ELECTRONS = 1e15  # numpy draws none above 9e18
+_MAX_ELECTRONS = 1e15  # numpy draws none above 9e18
 _STEP_SIGMA = 0.5  # a trail is drawn as spots at most so far apart, in standard deviations
 
 
@@ -159,7 +159,7 @@ class Bench:
     def recorded(self, mean_e: Array, generator: np.random.Generator) -> NDArray[np.uint16]:
         """Return what the converter makes of mean electrons."""
         sensor = self.sensor
-        electrons = generator.poisson(np.minimum(mean_e, _MOST_ELECTRONS)).astype(np.float64)
+        electrons = generator.poisson(np.minimum(mean_e, _MAX_ELECTRONS)).astype(np.float64)
         np.minimum(electrons, sensor.full_well_e, out=electrons)
         electrons += sensor.read_noise_e * generator.standard_normal(electrons.shape)
         adu = np.rint(electrons / sensor.gain_e_adu + sensor.offset_adu)
@@ -326,7 +326,7 @@ def _tracks(bench: Bench, flux_cm2_s: float, generator: np.random.Generator) -> 
 
 
 @dataclass(frozen=True)
-class Answer:
+class BenchAnswer:
     """What came of one frame."""
 
     is_acquired: bool  # whether an attitude was given
@@ -336,16 +336,16 @@ class Answer:
     star_index: NDArray[np.int64]  # guide stars that were named
 
 
-def answer_of(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> Answer:
+def bench_answer(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> BenchAnswer:
     """Find the spots of a frame and its attitude, and compare that with the truth."""
     none = np.full(3, np.nan)
     try:
         spots = bench.spots(image)
     except ConfigError:  # too much stands out to tell stars from the rest
-        return Answer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
+        return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
     result = bench.matcher.identify(spots.centroids_px, magnitudes=spots.mag)
     if not result.ok:
-        return Answer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
+        return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
     error = error_arcsec(truth, result.q_body_from_icrs)
     # Twice the reach of the matcher at the worst corner, as in the other evaluations.
     radius = bench.camera.radius_rad
@@ -358,4 +358,4 @@ def answer_of(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> Answer:
     is_right = bool(moved_px <= 2.0 * REACH * bench.matcher.tolerance_px + stated)
     named = result.star_index[result.star_index >= 0].astype(np.int64)
     chance = float(result.false_match_probability)
-    return Answer(True, is_right, chance, error if is_right else none, named)
+    return BenchAnswer(True, is_right, chance, error if is_right else none, named)

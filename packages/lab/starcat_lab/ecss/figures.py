@@ -13,7 +13,7 @@ from starcat.arrays import Array
 from starcat.matcher.stars import ARCSEC
 from starcat_lab.ecss.bench import Bench
 from starcat_lab.ecss.errors import CONTRIBUTORS
-from starcat_lab.ecss.trials import NOMINAL, WORST, Trial, expected_noise
+from starcat_lab.ecss.trials import NOMINAL, WORST, SensorTrial, expected_noise
 from starcat_lab.rates import Share
 
 Records = Sequence[Mapping[str, Any]]
@@ -26,9 +26,9 @@ RESIDUALS = ("no_orbit", "no_aberration")
 """Contributors that are shown, and in no sum: what correcting for aberration saves."""
 
 
-def figures(
+def sensor_figures(
     bench: Bench,
-    trials: Sequence[Trial],
+    trials: Sequence[SensorTrial],
     records: Mapping[str, Records],
     stars: Sequence[Mapping[str, float]],
 ) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def expected_bias(bench: Bench) -> list[float]:
     return [x + dy * scale, y - dx * scale, z]
 
 
-def _trial(trial: Trial, records: Records, confidence: float) -> dict[str, Any]:
+def _trial(trial: SensorTrial, records: Records, confidence: float) -> dict[str, Any]:
     count = len(records)
     frames = [flag for one in records for flag in one["acquired"]]
     right = [flag for one in records for flag in one["right"]]

@@ -12,7 +12,7 @@ from starcat.report.plots import STYLE, headline
 from starcat_lab.ecss.trials import NOMINAL, WORST
 from starcat_lab.report.files import html_of, markdown_of
 from starcat_lab.report.plots import COLOURS
-from starcat_lab.report.tables import Table
+from starcat_lab.report.tables import ReportTable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ CLAUSES = {"bias": "3.2.8.2", "fov": "3.2.8.3", "pixel": "3.2.8.4"}
 _AXES = ("x", "y", "z")
 
 
-def tables_of(content: Content) -> dict[str, Table]:
+def sensor_tables(content: Content) -> dict[str, ReportTable]:
     """Return all tables by the name of their CSV file, the page to tick first."""
     made = {
         "checklist": _checklist(content),
@@ -48,8 +48,8 @@ def _table(
     rows: Sequence[Sequence[str]],
     numbers: Sequence[int],
     notes: Sequence[str] = (),
-) -> Table:
-    return Table(title, tuple(heads), tuple(map(tuple, rows)), tuple(numbers), tuple(notes))
+) -> ReportTable:
+    return ReportTable(title, tuple(heads), tuple(map(tuple, rows)), tuple(numbers), tuple(notes))
 
 
 def number(value: float | None) -> str:
@@ -76,7 +76,7 @@ def _said(row: Content | None, key: str = "at_confidence_arcsec") -> str:
     return "no frame was right" if row is None else " / ".join(_triple(row[key])) + " arcsec"
 
 
-def _checklist(content: Content) -> Table:
+def _checklist(content: Content) -> ReportTable:
     stated, bias = f"{100.0 * content['confidence']:g} %", content["bias"]
     false, sky = content["false_attitude"], content["sky"]
     first = content["trials"][NOMINAL]["first_frame"]
@@ -105,7 +105,7 @@ def _checklist(content: Content) -> Table:
     ))  # fmt: skip
 
 
-def _errors(content: Content) -> Table:
+def _errors(content: Content) -> ReportTable:
     stated = f"{100.0 * content['confidence']:g} %"
     rows = [
         (
@@ -134,7 +134,7 @@ def _errors(content: Content) -> Table:
     )
 
 
-def _bias(content: Content) -> Table:
+def _bias(content: Content) -> ReportTable:
     bias = content["bias"]
     keys = {
         "mean error, measured": "mean_arcsec",
@@ -148,7 +148,7 @@ def _bias(content: Content) -> Table:
     return _table("Bias", heads, rows, (1, 2, 3), notes if bias else ())
 
 
-def _rates(content: Content) -> Table:
+def _rates(content: Content) -> ReportTable:
     rows = []
     for one in content["temporal"]:
         trial = content["trials"][one["trial"]]
@@ -166,7 +166,7 @@ def _rates(content: Content) -> Table:
     return _table("Temporal noise of the attitude by rate", heads, rows, (0, 2, 3, 4))
 
 
-def _magnitudes(content: Content) -> Table:
+def _magnitudes(content: Content) -> ReportTable:
     stars = content["stars"]
     rates = list(dict.fromkeys(one["rate_deg_s"] for one in stars))
     rows = []
@@ -185,7 +185,7 @@ def _magnitudes(content: Content) -> Table:
     return _table("Noise of a star by magnitude and rate", heads, rows, range(len(heads)), notes)
 
 
-def _acquisition(content: Content) -> Table:
+def _acquisition(content: Content) -> ReportTable:
     rows = [
         (str(one["frames"]), number(one["time_s"]), _share(one)) for one in content["acquisition"]
     ]
@@ -194,7 +194,7 @@ def _acquisition(content: Content) -> Table:
     return _table("Acquisition from lost in space, all over the sky", heads, rows, (0, 1), notes)
 
 
-def _robustness(content: Content) -> Table:
+def _robustness(content: Content) -> ReportTable:
     rows = [
         (name, number(one["guide_stars_median"]), _share(one["first_frame"]), _share(one["false"]))
         for name, one in content["trials"].items()
@@ -210,7 +210,7 @@ def _robustness(content: Content) -> Table:
     return _table("Acquisition under conditions", heads, rows, (1,), notes)
 
 
-def _sky(content: Content) -> Table:
+def _sky(content: Content) -> ReportTable:
     sky = content["sky"]
     few, middle = sky["guide_stars"], sky["median_arcsec"]
     worst = sky["worst_one_percent_arcsec"]
@@ -232,7 +232,7 @@ def _sky(content: Content) -> Table:
     return _table(f"Availability over {sky['boresights']:,} boresights", ("", ""), rows, ())
 
 
-def _simulation(content: Content) -> Table:
+def _simulation(content: Content) -> ReportTable:
     rows = [
         ("database", content["artifact"]),
         ("camera", content["camera"]),
@@ -260,11 +260,11 @@ body { max-width: 76rem; }
 """
 
 
-def page_of(content: Content, plot: bytes) -> str:
+def sensor_page(content: Content, plot: bytes) -> str:
     """Return the report as one HTML page."""
     title = _title(content)
     parts = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(_lead(content))}</p>']
-    for name, one in tables_of(content).items():
+    for name, one in sensor_tables(content).items():
         parts += [f"<h2>{escape(one.title)}</h2>", html_of(one)]
         if name == "noise_by_magnitude":
             parts.append(figure("Curves: noise of a star by magnitude, one for each rate", plot))
@@ -275,7 +275,7 @@ def page_of(content: Content, plot: bytes) -> str:
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     parts = [f"# {_title(content)}", _lead(content)]
-    for one in tables_of(content).values():
+    for one in sensor_tables(content).values():
         parts += [f"## {one.title}", markdown_of(one)]
     parts.append(f"## Sensor\n\n```toml\n{content['sensor_toml'].strip()}\n```")
     return "\n\n".join(parts) + "\n"

@@ -18,10 +18,10 @@ from starcat.report.plots import save_plot
 from starcat.specs.star_sensor import Sensor, sensor_toml
 from starcat.storage.atomic import write_file
 from starcat_lab.ecss.bench import Bench, cached_bench
-from starcat_lab.ecss.figures import figures
-from starcat_lab.ecss.pages import draw_noise, markdown_page, page_of, tables_of
+from starcat_lab.ecss.figures import sensor_figures
+from starcat_lab.ecss.pages import draw_noise, markdown_page, sensor_page, sensor_tables
 from starcat_lab.ecss.trials import run_trials, trials_of
-from starcat_lab.report.tables import Table
+from starcat_lab.report.tables import ReportTable
 
 POINTINGS, FEW_POINTINGS = 100, 10
 """Pointings of each trial, and of a quick one."""
@@ -52,9 +52,9 @@ def evaluate_sensor(
     records, noise = run_trials(
         artifact, sensor, seed, method, trials, stars, workers, progress
     )  # fmt: skip
-    content = _header(bench, artifact, seed) | figures(bench, trials, records, noise)
+    content = _header(bench, artifact, seed) | sensor_figures(bench, trials, records, noise)
     folder = output / f"{artifact.name}-ecss"
-    return finite(content), write_report(folder, content)
+    return finite(content), write_sensor_report(folder, content)
 
 
 def _header(bench: Bench, artifact: Path, seed: int) -> dict[str, Any]:
@@ -72,15 +72,15 @@ def _header(bench: Bench, artifact: Path, seed: int) -> dict[str, Any]:
     }
 
 
-def write_report(folder: Path, content: dict[str, Any]) -> Path:
+def write_sensor_report(folder: Path, content: dict[str, Any]) -> Path:
     """Write all files of a report."""
     folder.mkdir(parents=True, exist_ok=True)
     save_plot(draw_noise(content), folder, "noise_by_magnitude")
     files = {
         "report.json": json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n",
         "report.md": markdown_page(content),
-        "index.html": page_of(content, (folder / "noise_by_magnitude.svg").read_bytes()),
-        **{f"{name}.csv": _csv(one) for name, one in tables_of(content).items()},
+        "index.html": sensor_page(content, (folder / "noise_by_magnitude.svg").read_bytes()),
+        **{f"{name}.csv": _csv(one) for name, one in sensor_tables(content).items()},
     }
     if content["budget"]:
         files["SC_star_tracker_42.txt"] = input_of_42(content)
@@ -90,7 +90,7 @@ def write_report(folder: Path, content: dict[str, Any]) -> Path:
     return folder / "index.html"
 
 
-def _csv(one: Table) -> str:
+def _csv(one: ReportTable) -> str:
     text = StringIO()
     csv.writer(text, lineterminator="\n").writerows([one.heads, *one.rows])
     return text.getvalue()

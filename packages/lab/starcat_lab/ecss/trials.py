@@ -24,7 +24,7 @@ from starcat_lab.campaign import side_by_side
 from starcat_lab.ecss.bench import (
     Bench,
     Condition,
-    answer_of,
+    bench_answer,
     cached_bench,
     planet_in_field,
     random_day,
@@ -35,13 +35,13 @@ BORESIGHTS = 2000
 """Directions all over the sky, of which the worst hundredth is tried."""
 
 _CHUNK = 5  # pointings that a process takes at once
-_FEWEST_SPOTS = 1800  # stars of a magnitude that are measured at least
+_MIN_SPOTS = 1800  # stars of a magnitude that are measured at least
 _PITCH_PX = 24.0  # and how far apart, so that none is in another's window
 _REACH_PX = 2.0
 
 
 @dataclass(frozen=True)
-class Trial:
+class SensorTrial:
     """Pointings of one kind."""
 
     name: str
@@ -52,7 +52,7 @@ class Trial:
     boresights: tuple[tuple[float, float], ...] = ()  # right ascension and declination, degrees
 
 
-def trials_of(bench: Bench, pointings: int) -> list[Trial]:
+def trials_of(bench: Bench, pointings: int) -> list[SensorTrial]:
     """Return all trials of a sensor, the nominal one first and the worst of the sky last."""
     sensor = bench.sensor
     _check_trails(bench)
@@ -68,9 +68,9 @@ def trials_of(bench: Bench, pointings: int) -> list[Trial]:
     }  # fmt: skip
     worst = worst_boresights(bench)
     return [
-        Trial(NOMINAL, Condition(), pointings, 3, with_contributions=True),
-        *(Trial(n, c, pointings, 2 if c.rate_deg_s else 1) for n, c in conditions.items()),
-        Trial(WORST, Condition(), pointings, 2, boresights=worst),
+        SensorTrial(NOMINAL, Condition(), pointings, 3, with_contributions=True),
+        *(SensorTrial(n, c, pointings, 2 if c.rate_deg_s else 1) for n, c in conditions.items()),
+        SensorTrial(WORST, Condition(), pointings, 2, boresights=worst),
     ]
 
 
@@ -89,7 +89,7 @@ def _check_trails(bench: Bench) -> None:
 NOMINAL, WORST = "nominal", "worst 1 % of the sky"
 
 
-def point(bench: Bench, trial: Trial, number: int) -> dict[str, Any]:
+def point(bench: Bench, trial: SensorTrial, number: int) -> dict[str, Any]:
     """Take the frames of one pointing and return what came of them, as plain values."""
     name = zlib.crc32(trial.name.encode())
     generator = np.random.default_rng([bench.seed, name, number])
@@ -103,7 +103,7 @@ def point(bench: Bench, trial: Trial, number: int) -> dict[str, Any]:
         truth = random_attitudes(1, generator)[0]
     mounted = bench.mounted(truth)
     frames = bench.exposures(mounted, trial.condition, generator, trial.frames, observer)
-    answers = [answer_of(bench, image, truth) for image in frames]
+    answers = [bench_answer(bench, image, truth) for image in frames]
     record: dict[str, Any] = {
         "acquired": [one.is_acquired for one in answers],
         "right": [one.is_right for one in answers],
@@ -165,7 +165,7 @@ def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
     ]
     places = np.stack(np.meshgrid(*grid), axis=-1).reshape(-1, 2)
     differences, found, tried = [], 0, 0
-    while tried < _FEWEST_SPOTS:
+    while tried < _MIN_SPOTS:
         lit = places + generator.random(places.shape) + 0.25 * _PITCH_PX
         pair = [
             _nearest(image, lit, reach) for image in _twice(bench, lit, mag, rate_deg_s, generator)
@@ -213,7 +213,7 @@ def _task(
 ) -> tuple[Any, Any]:
     """Do one piece of work: pointings of a trial, or a magnitude at a rate."""
     bench = cached_bench(artifact, sensor, seed, method)
-    if isinstance(work[0], Trial):
+    if isinstance(work[0], SensorTrial):
         trial, first, last = work
         return (trial.name, first), [point(bench, trial, k) for k in range(first, last)]
     return work, star_noise(bench, *work)
@@ -224,7 +224,7 @@ def run_trials(
     sensor: Sensor,
     seed: int,
     method: str | None,
-    trials: Sequence[Trial],
+    trials: Sequence[SensorTrial],
     stars: Sequence[tuple[float, float]],
     workers: int,
     progress: Progress,
@@ -246,7 +246,9 @@ def run_trials(
 
 
 def _by_trial(
-    trials: Sequence[Trial], chunks: Sequence[tuple[Trial, int, int]], done: Mapping[Any, Any]
+    trials: Sequence[SensorTrial],
+    chunks: Sequence[tuple[SensorTrial, int, int]],
+    done: Mapping[Any, Any],
 ) -> dict[str, list[dict[str, Any]]]:
     records: dict[str, list[dict[str, Any]]] = {trial.name: [] for trial in trials}
     for trial, first, _ in chunks:

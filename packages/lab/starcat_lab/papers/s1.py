@@ -9,8 +9,8 @@ from starcat.simulation.simulate import Noise
 from starcat_lab.experiment import (
     Attitudes,
     Experiment,
+    ExperimentRow,
     Paper,
-    Row,
     Statistic,
     paper_experiment,
     product_mib,
@@ -41,7 +41,7 @@ def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
     return Camera(size, size, told * size / 1024), Camera(size, size, told)
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[ExperimentRow]:
     """Return the rows of S1."""
     count = 20 if quick else 200
     points = [("Roll", roll_deg, f"{roll_deg:g} deg", roll_deg, 1.0) for roll_deg in ROLLS_DEG]
@@ -53,11 +53,13 @@ def rows(quick: bool) -> list[Row]:
         for label, (method, answer) in WAYS.items():
             name = f"s1-{group}-{x:g}-{label}"
             experiment = _experiment(name, method, answer, stars, NOISE, *cameras)
-            made.append(Row(group, f"{label}, {text}", PRESET, experiment, "reference", x=x))
+            made.append(
+                ExperimentRow(group, f"{label}, {text}", PRESET, experiment, "reference", x=x)
+            )
     return made + _whole_library(5 * count)
 
 
-def _whole_library(count: int) -> list[Row]:
+def _whole_library(count: int) -> list[ExperimentRow]:
     group = "Whole library, any roll"
     made = []
     for value in (0.0, 0.5, 1.0):
@@ -70,7 +72,7 @@ def _whole_library(count: int) -> list[Row]:
             name, attitudes = f"s1-library-{value:g}-{label}", Attitudes(kind, count)
             experiment = _experiment(name, "hausdorff_l2", answer, attitudes, noise)
             label = f"{label}, {value:g} px"
-            made.append(Row(group, label, PRESET, experiment, "reference", x=value))
+            made.append(ExperimentRow(group, label, PRESET, experiment, "reference", x=value))
     return made
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.simulation.simulate import Noise
-from starcat_lab.experiment import Attitudes, Experiment, Paper, Row, paper_experiment
+from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, paper_experiment
 
 PRESET = "sao-12deg"
 
@@ -38,7 +38,7 @@ BARREL_TOLERANCE_PX = 8.0
 """What a matcher has to allow for a lens that it is not told of."""
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[ExperimentRow]:
     """Return the rows of S2."""
     grid = Attitudes("grid", 180, 2.0) if quick else GRID
     fewer = Attitudes("grid", 180, 2.0) if quick else FEWER
@@ -57,18 +57,18 @@ def _experiment(name: str, method: str, attitudes: Attitudes, noise: Noise) -> E
     return paper_experiment(f"s2-{name}-{method}", method, attitudes, noise, seed=2021)
 
 
-def _ideal(grid: Attitudes) -> list[Row]:
+def _ideal(grid: Attitudes) -> list[ExperimentRow]:
     made = []
     for method, (label, percent, ms, _) in PUBLISHED.items():
         is_own = method == "dynamic_angle"
         goal_percent, goal_ms = (99.81, 7.2) if is_own else (percent, None)
         made.append(
-            Row("Ideal images (table 3)", label, PRESET,
+            ExperimentRow("Ideal images (table 3)", label, PRESET,
                 _experiment("ideal", method, grid, Noise(limit_mag=LIMIT_MAG)), "reference",
                 percent, ms, goal_percent, goal_ms)
         )  # fmt: skip
     made.append(
-        Row("Ideal images (table 3)", "triangle of S4", PRESET,
+        ExperimentRow("Ideal images (table 3)", "triangle of S4", PRESET,
             _experiment("ideal", "triangle", grid, Noise(limit_mag=LIMIT_MAG)), "reference",
             note="not in the paper: starcat's default")
     )  # fmt: skip
@@ -83,7 +83,7 @@ def _curve(
     goal: float,
     grid: Attitudes,
     fewer: Attitudes,
-) -> list[Row]:
+) -> list[ExperimentRow]:
     made = []
     for value in values:
         is_last = value == values[-1]
@@ -93,26 +93,26 @@ def _curve(
             experiment = _experiment(f"{group}-{value:g}", method, attitudes, _noise(group, value))
             published, wanted = (percent, goal) if is_last and is_own else (None, None)
             made.append(
-                Row(group, f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
+                ExperimentRow(group, f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
                     PRESET, experiment, "reference", published, None, wanted, x=value)
             )  # fmt: skip
     return made
 
 
-def _guide_stars_alone(grid: Attitudes) -> Row:
+def _guide_stars_alone(grid: Attitudes) -> ExperimentRow:
     experiment = _experiment(
         "guides-magnitude-1", "dynamic_angle", grid, _noise("Magnitude noise", 1.0)
     )
-    return Row("Magnitude noise, guide stars alone", "dynamic angle, 1 mag", PRESET,
+    return ExperimentRow("Magnitude noise, guide stars alone", "dynamic angle, 1 mag", PRESET,
                replace(experiment, guide_stars_only=True), "reference", 98.84, None, 98.9,
                note="nothing else shines, as in the paper's images it seems")  # fmt: skip
 
 
-def _no_star_vanishes(grid: Attitudes) -> Row:
+def _no_star_vanishes(grid: Attitudes) -> ExperimentRow:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
     experiment = _experiment("seen-magnitude-1", "dynamic_angle", grid, noise)
     note = "the true magnitude decides what is seen, the noise only what is measured"
-    return Row("Magnitude noise, no star vanishes", "dynamic angle, 1 mag", PRESET, experiment,
+    return ExperimentRow("Magnitude noise, no star vanishes", "dynamic angle, 1 mag", PRESET, experiment,
                "reference", 98.84, None, 98.9, note=note)  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def _noise(group: str, value: float) -> Noise:
     return Noise(noise_mag=value, limit_mag=LIMIT_MAG)
 
 
-def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
+def _distorted(grid: Attitudes, fewer: Attitudes) -> list[ExperimentRow]:
     lens = Camera(1024, 1024, fov_x_deg=12.0, distortion=BARREL)
     told = Camera(1024, 1024, fov_x_deg=12.0)
     made = []
@@ -137,7 +137,7 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
             undistorted, camera=lens, assumed=told, tolerance_px=BARREL_TOLERANCE_PX
         )
         made.append(
-            Row("Barrel distortion (table 4)", label, PRESET, experiment, "reference", percent,
+            ExperimentRow("Barrel distortion (table 4)", label, PRESET, experiment, "reference", percent,
                 None, 99.6 if is_own else None, note=f"k1 = {BARREL.k1:g}, the matcher is not told")
         )  # fmt: skip
     return made

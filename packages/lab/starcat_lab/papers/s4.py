@@ -9,8 +9,8 @@ from starcat.simulation.simulate import Noise
 from starcat_lab.experiment import (
     Attitudes,
     Experiment,
+    ExperimentRow,
     Paper,
-    Row,
     Statistic,
     paper_experiment,
     product_mib,
@@ -25,7 +25,7 @@ METHODS = {"triangle": "double-feature triangle", "pairs": "improved triangle"}
 MIXED = Noise(noise_px=1.0, noise_mag=0.5, false_share=0.2, limit_mag=LIMIT_MAG)
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[ExperimentRow]:
     """Return the rows of S4."""
     count = 50 if quick else 1000
     return [
@@ -51,13 +51,13 @@ def _curve(
     published: tuple[float | None, float | None],
     goal: float,
     count: int,
-) -> list[Row]:
+) -> list[ExperimentRow]:
     made = []
     for value in values:
         is_last = value == values[-1]
         for (method, label), percent in zip(METHODS.items(), published, strict=True):
             made.append(
-                Row(group, f"{label}, {value:g} {unit}", PRESET,
+                ExperimentRow(group, f"{label}, {value:g} {unit}", PRESET,
                     _experiment(f"{group}-{value:g}", method, count, _noise(group, value)),
                     "attitude",
                     percent if is_last else None, None,
@@ -66,10 +66,10 @@ def _curve(
     return made
 
 
-def _unhidden(count: int) -> Row:
+def _unhidden(count: int) -> ExperimentRow:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
     experiment = _experiment("seen-magnitude-1", "triangle", count, noise)
-    return Row("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag", PRESET,
+    return ExperimentRow("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag", PRESET,
                experiment, "attitude", 98.0, None, 98.0, goal_over="4+",
                note="the true magnitude decides what is seen, the noise only what is measured",
     )  # fmt: skip
@@ -83,17 +83,17 @@ def _noise(group: str, value: float) -> Noise:
     return Noise(noise_mag=value, limit_mag=LIMIT_MAG)
 
 
-def _mixed(count: int) -> list[Row]:
+def _mixed(count: int) -> list[ExperimentRow]:
     note = "1 px, 20 % false stars, 0.5 mag"
     group = "Mixed noise"
     return [
-        Row(group, METHODS["triangle"], PRESET, _experiment("mixed", "triangle", count, MIXED),
+        ExperimentRow(group, METHODS["triangle"], PRESET, _experiment("mixed", "triangle", count, MIXED),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+", note=note),
-        Row(group, f"{METHODS['triangle']}, C library", PRESET,
+        ExperimentRow(group, f"{METHODS['triangle']}, C library", PRESET,
             replace(_experiment("mixed-installed", "triangle", count, MIXED), engine="auto"),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+",
             note="as it is installed: the C library, numpy where there was no compiler"),
-        Row(group, METHODS["pairs"], PRESET, _experiment("mixed", "pairs", count, MIXED),
+        ExperimentRow(group, METHODS["pairs"], PRESET, _experiment("mixed", "pairs", count, MIXED),
             "attitude", 82.4, 68.45, note=note),
     ]  # fmt: skip
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcat.simulation.simulate import Noise
-from starcat_lab.experiment import Attitudes, Paper, Row, Statistic, paper_experiment, product_mib
+from starcat_lab.experiment import (
+    Attitudes,
+    ExperimentRow,
+    Paper,
+    Statistic,
+    paper_experiment,
+    product_mib,
+)
 
 PRESET = "sao-12deg"
 
@@ -20,7 +27,7 @@ WAYS = {
 """Label to method and answer: ranked candidates with verification, and the bare method twice."""
 
 
-def rows(quick: bool) -> list[Row]:
+def rows(quick: bool) -> list[ExperimentRow]:
     """Return the rows of S5."""
     count = 40 if quick else 1000
     made = []
@@ -45,7 +52,7 @@ def _point(
     noise: Noise,
     count: int,
     published: tuple[float, float, float] | None,
-) -> list[Row]:
+) -> list[ExperimentRow]:
     made = []
     for label, (method, answer) in WAYS.items():
         # The bare method meets every reference set with every separation.
@@ -57,7 +64,7 @@ def _point(
         percent = published[1] if published and here and is_method else None
         goal = published[2] if published and here and label == "starcat" else None
         made.append(
-            Row(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment, "two_stars",
+            ExperimentRow(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment, "two_stars",
                 percent, 112.5 if percent and group == "Position noise" else None, goal, x=value)
         )  # fmt: skip
     return made

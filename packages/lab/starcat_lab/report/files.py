@@ -22,7 +22,7 @@ from starcat_lab.report.tables import (
     LEGEND,
     LONG,
     Line,
-    Table,
+    ReportTable,
     failure_table,
     method_of,
     rate_tables,
@@ -208,7 +208,7 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
         yield f"<ul>{items}</ul>"
 
 
-def html_of(one: Table) -> str:
+def html_of(one: ReportTable) -> str:
     """Return a table as HTML."""
     notes = "<br>".join(map(escape, one.notes))
     below = f'<p class="notes">{notes}</p>' if notes else ""
@@ -252,7 +252,7 @@ def _paper_markdown(content: Content) -> Iterator[str]:
         yield "\n".join(f"- {text}" for text in content["deviations"])
 
 
-def markdown_of(one: Table) -> str:
+def markdown_of(one: ReportTable) -> str:
     """Return a table as Markdown."""
     notes = "\n".join(f"- {note}" for note in one.notes)
     return _grid(one.heads, one.rows, one.numbers) + (f"\n\n{notes}" if notes else "")
@@ -264,7 +264,7 @@ def _grid(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _other_tables(content: Content) -> list[Table]:
+def _other_tables(content: Content) -> list[ReportTable]:
     failed = failure_table(content)
     return [*statistic_tables(content), *([failed] if failed else [])]
 

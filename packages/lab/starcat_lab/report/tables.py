@@ -16,7 +16,7 @@ Line = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Column:
+class ReportColumn:
     """A column of a table of rates."""
 
     head: str  # heading of the column
@@ -46,7 +46,7 @@ def method_of(line: Line) -> str:
     return str(method if answer == "matcher" else f"{method} ({answer.replace('_', ' ')})")
 
 
-def difference(line: Line) -> str:
+def rate_difference(line: Line) -> str:
     """Return measured less published."""
     published, measured = line["published_percent"], line["by_rule"]["percent"]
     return "" if None in (published, measured) else f"{measured - published:+.2f}"
@@ -102,46 +102,48 @@ def _share(key: str) -> Callable[[Line], str]:
     return lambda line: percent(line[key]["percent"])
 
 
-_PAPER = Column("paper", lambda line: percent(line["published_percent"]), _any("published_percent"))
-_PAPER_MS = Column(
+_PAPER = ReportColumn(
+    "paper", lambda line: percent(line["published_percent"]), _any("published_percent")
+)
+_PAPER_MS = ReportColumn(
     "paper ms", lambda line: milliseconds(line["published_ms"]), _any("published_ms")
 )
-_CEILING = Column("ceiling", _share("ceiling"))
-_ENOUGH = Column("4+", _share("by_rule_enough"))
-_OWN_ENOUGH = Column("own 4+", _share("starcat_enough"), _has_other_rule)
-_WRONG = Column("wrong", lambda line: f"{line['wrong']:,}")
-_BOTH_MS = Column("ms (paper)", _times, _any("published_ms"))
-_MS = Column("ms", lambda line: milliseconds(line["mean_ms"]))
-_REACHED = Column("goal", verdict, _any("is_goal_reached"))
+_CEILING = ReportColumn("ceiling", _share("ceiling"))
+_ENOUGH = ReportColumn("4+", _share("by_rule_enough"))
+_OWN_ENOUGH = ReportColumn("own 4+", _share("starcat_enough"), _has_other_rule)
+_WRONG = ReportColumn("wrong", lambda line: f"{line['wrong']:,}")
+_BOTH_MS = ReportColumn("ms (paper)", _times, _any("published_ms"))
+_MS = ReportColumn("ms", lambda line: milliseconds(line["mean_ms"]))
+_REACHED = ReportColumn("goal", verdict, _any("is_goal_reached"))
 
 SHORT = (
-    Column("method", method_of, _is_ambiguous),
+    ReportColumn("method", method_of, _is_ambiguous),
     _PAPER,
-    Column("measured", _with_interval),
+    ReportColumn("measured", _with_interval),
     _CEILING,
     _ENOUGH,
     _OWN_ENOUGH,
     _WRONG,
-    Column("ms", _MS.cell, lambda lines: not _BOTH_MS.is_wanted(lines)),
+    ReportColumn("ms", _MS.cell, lambda lines: not _BOTH_MS.is_wanted(lines)),
     _BOTH_MS,
     _REACHED,
 )
 """Columns that fit a terminal."""
 
 LONG = (
-    Column("method", method_of, _has_methods),
+    ReportColumn("method", method_of, _has_methods),
     _PAPER,
-    Column("measured [95 %]", _with_interval),
-    Column("difference", difference, _any("published_percent")),
+    ReportColumn("measured [95 %]", _with_interval),
+    ReportColumn("difference", rate_difference, _any("published_percent")),
     _CEILING,
     _ENOUGH,
-    Column("own rule", _share("starcat"), _has_other_rule),
+    ReportColumn("own rule", _share("starcat"), _has_other_rule),
     _OWN_ENOUGH,
     _WRONG,
     _MS,
     _PAPER_MS,
-    Column("goal", _goal, _any("is_goal_reached")),
-    Column("reached", marked_verdict, _any("is_goal_reached")),
+    ReportColumn("goal", _goal, _any("is_goal_reached")),
+    ReportColumn("reached", marked_verdict, _any("is_goal_reached")),
 )
 """Columns of a page."""
 
@@ -162,7 +164,7 @@ LEGEND = (
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table of texts."""
 
     title: str
@@ -180,7 +182,7 @@ def groups_of(lines: Iterable[Line]) -> dict[str, list[Line]]:
     return groups
 
 
-def rate_tables(content: Mapping[str, Any], columns: Sequence[Column]) -> list[Table]:
+def rate_tables(content: Mapping[str, Any], columns: Sequence[ReportColumn]) -> list[ReportTable]:
     """Return a table of rates a group."""
     tables = []
     for group, lines in groups_of(content["rows"]).items():
@@ -189,13 +191,13 @@ def rate_tables(content: Mapping[str, Any], columns: Sequence[Column]) -> list[T
         heads = ("", *(column.head for column in shown))
         texts = {"", "method", "goal" if columns is LONG else "", "reached"}
         numbers = tuple(k for k, head in enumerate(heads) if head not in texts)
-        tables.append(Table(group, heads, cells, numbers, _notes(lines)))
+        tables.append(ReportTable(group, heads, cells, numbers, _notes(lines)))
     return tables
 
 
 def statistic_tables(
     content: Mapping[str, Any], reached: Callable[[Line], str] = marked_verdict
-) -> list[Table]:
+) -> list[ReportTable]:
     """Return a table of the numbers that need no experiment, a group."""
     tables = []
     for group, lines in groups_of(content["statistics"]).items():
@@ -207,7 +209,7 @@ def statistic_tables(
             rows.append((line["label"], line["unit"], *values[:2], *ends))
         heads = ("", "unit", "paper", "measured", *(("goal", "reached") if has_goal else ()))
         numbers = (2, 3, 4) if has_goal else (2, 3)
-        tables.append(Table(group, heads, tuple(rows), numbers, _notes(lines)))
+        tables.append(ReportTable(group, heads, tuple(rows), numbers, _notes(lines)))
     return tables
 
 
@@ -229,7 +231,7 @@ def _number(value: float | None) -> str:
     return f"{value:,.0f}" if value == int(value) else f"{value:,.4g}"
 
 
-def failure_table(content: Mapping[str, Any]) -> Table | None:
+def failure_table(content: Mapping[str, Any]) -> ReportTable | None:
     """Return why frames failed, for the rows that miss their goal."""
     lines = [line for line in content["rows"] if line["is_goal_reached"] is False]
     if not lines:
@@ -245,10 +247,12 @@ def failure_table(content: Mapping[str, Any]) -> Table | None:
         for line in lines
     )
     heads = ("", "frames", "failed", *causes)
-    return Table("Goals that are missed: what failed", heads, rows, tuple(range(1, len(heads))))
+    return ReportTable(
+        "Goals that are missed: what failed", heads, rows, tuple(range(1, len(heads)))
+    )
 
 
-def summary_table(contents: Sequence[Mapping[str, Any]]) -> Table | None:
+def summary_table(contents: Sequence[Mapping[str, Any]]) -> ReportTable | None:
     """Return what each paper came to."""
     rows, has_any = [], False
     for content in contents:
@@ -271,4 +275,4 @@ def summary_table(contents: Sequence[Mapping[str, Any]]) -> Table | None:
     note = "As good as the paper: its figure is not above the interval of the measured one."
     if not has_any:
         return None
-    return Table("At a glance", heads, tuple(rows), (2, 3, 4), (note,))
+    return ReportTable("At a glance", heads, tuple(rows), (2, 3, 4), (note,))

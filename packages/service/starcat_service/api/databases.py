@@ -15,12 +15,12 @@ from pydantic import BaseModel, Field
 
 from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.artifact.reader import Artifact
+from starcat.artifact.reader import DatabaseFolder
 from starcat.errors import ProductError, TargetMissing
 from starcat.releases.tree import Blob
 from starcat.report.coverage_map import Fields
 from starcat_service.access import Publisher, Reader
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem
 from starcat_service.removal import remove_database
 from starcat_service.service import Service, TheService
@@ -48,7 +48,7 @@ SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
 class Databases(BaseModel):
     """All databases there are."""
 
-    databases: list[Database]
+    databases: list[ListedDatabase]
 
 
 class DatabaseFile(BaseModel):
@@ -85,7 +85,7 @@ def all_databases(service: TheService, reader: Reader) -> Databases:
 
 
 @router.get("/{database}", summary="One database")
-def one_database(database: DatabaseId, service: TheService, reader: Reader) -> Database:
+def one_database(database: DatabaseId, service: TheService, reader: Reader) -> ListedDatabase:
     """Return what a database was made from, and what it holds."""
     return service.library.database(database)
 
@@ -137,7 +137,7 @@ async def difference(
     return await service.query_pool.run(_difference, service, database, other, most)
 
 
-def fields_of(database: Database) -> Fields:
+def fields_of(database: ListedDatabase) -> Fields:
     """Read the fields of a database."""
     path = database.folder / FIELDS
     try:
@@ -160,7 +160,7 @@ def _read_fields(path: Path, changed_ns: int) -> Fields:
 def difference_of(service: Service, database: str, other: str) -> Difference:
     """Return what differs between two databases."""
     sides = (service.library.database(one) for one in (database, other))
-    return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
+    return diff_artifacts(*(DatabaseFolder(one.folder, one.manifest) for one in sides))
 
 
 def _difference(service: Service, database: str, other: str, most: int) -> dict[str, Any]:
@@ -231,7 +231,7 @@ def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> N
     remove_database(service, database)
 
 
-def _listed(database: Database, name: str) -> Blob:
+def _listed(database: ListedDatabase, name: str) -> Blob:
     found = database.files.get(name)
     if found is None:
         raise TargetMissing(
@@ -251,7 +251,7 @@ def _file(
     return file_answer(request, path, blob.sha256, file_name=path.name, **options)
 
 
-def _path_in(found: Database, name: str) -> Path:
+def _path_in(found: ListedDatabase, name: str) -> Path:
     """Return where a file of a database is, which no link leads out of."""
     path = found.folder / name
     is_own = path.resolve().is_relative_to(found.folder.resolve())

@@ -31,14 +31,14 @@ from starcat_service.api.identify import FrameUpload, identify_upload
 from starcat_service.candidates import (
     MAX_SEARCH_S,
     FieldsDeg,
-    candidates,
+    databases_to_try,
     field_line,
     spec_of,
     try_each,
 )
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem, problem_of
-from starcat_service.security.request_limits import address_of
+from starcat_service.security.request_limits import client_ip
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
 
@@ -122,7 +122,7 @@ async def login(request: Request) -> Response:
         return JSONResponse({"status": "success", "session": identities.sessions.open(token)})
     if principal_of(request).role >= Role.READER:
         return JSONResponse({"status": "success", "session": _ANONYMOUS})
-    wait_s = identities.guessed.take(network_of(address_of(request.scope)))
+    wait_s = identities.guessed.take(network_of(client_ip(request.scope)))
     return _error(
         429 if wait_s else 401, "bad apikey: give a token of this service ('starcat token create')"
     )
@@ -277,7 +277,7 @@ def calibration_of(wcs: str) -> dict[str, float]:
 def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
     scale_deg = _scale_deg(given)
 
-    def identify(database: Database) -> dict[str, Any]:
+    def identify(database: ListedDatabase) -> dict[str, Any]:
         options = _options_for(database, scale_deg, given)
         options = options.model_copy(update={"time_limit_s": MAX_SEARCH_S})
         frames.content.seek(0)
@@ -326,15 +326,15 @@ def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
     return width, height
 
 
-def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[Database]:
+def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedDatabase]:
     """Return the databases that pictures are solved with, in the order in which to try them."""
     wanted = service.settings.plate_solver
     first = None if wanted is None else service.library.find(wanted)
-    return candidates(service.library.databases(), scale_deg, first)
+    return databases_to_try(service.library.databases(), scale_deg, first)
 
 
 def _options_for(
-    database: Database, scale_deg: FieldsDeg | None, given: dict[str, Any]
+    database: ListedDatabase, scale_deg: FieldsDeg | None, given: dict[str, Any]
 ) -> IdentifyOptions:
     """Return how a picture of some scale is identified with a database."""
     if spec_of(database).products.levels.enabled:
@@ -350,7 +350,7 @@ def _options_for(
     return IdentifyOptions(camera="\n".join(lines))
 
 
-def _fields_of(database: Database, scale_deg: FieldsDeg | None) -> FieldsDeg:
+def _fields_of(database: ListedDatabase, scale_deg: FieldsDeg | None) -> FieldsDeg:
     """Return the fields to try: those of the scale that the database has."""
     narrow, wide = known = spec_of(database).fields_deg
     if scale_deg is not None:

@@ -15,7 +15,7 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
 
-MOST_FIELDS = 50_000  # fields that are listed one by one at the most
+MAX_FIELDS = 50_000  # fields that are listed one by one at the most
 
 
 class CheckedSpec(BaseModel):
@@ -214,7 +214,7 @@ def starter_answer(starter: Starter) -> StarterAnswer:
 def coverage_answer(found: Estimate) -> CoverageMap:
     """Return the guide stars of each field, or of some of very many."""
     count = found.fields.count
-    step = -(-len(count) // MOST_FIELDS)
+    step = -(-len(count) // MAX_FIELDS)
     ra_deg, dec_deg = radec_from_directions(found.fields.boresights[::step])
     return CoverageMap(
         ra_deg=np.round(ra_deg, 4).tolist(),

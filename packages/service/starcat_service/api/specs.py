@@ -14,7 +14,7 @@ from starcat.errors import ConfigError
 from starcat.failures import validation_message
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import (
-    MOST_CHARACTERS,
+    MAX_CHARACTERS,
     changed,
     content_of_toml,
     preset,
@@ -43,10 +43,10 @@ router = APIRouter(prefix="/specs", tags=["specs"])
 ORIGIN = "spec"  # what messages call the spec of a request
 TOML_TYPES = ("application/toml", "text/")
 
-MOST_BODY_BYTES = 4 * MOST_CHARACTERS
+MAX_BODY_BYTES = 4 * MAX_CHARACTERS
 """Of a body: text of so many characters may be that long."""
 
-MOST_CHANGES = 200
+MAX_CHANGES = 200
 
 Change = Annotated[str, Field(max_length=2000)]
 Key = Annotated[str, Field(min_length=1, max_length=100)]
@@ -67,7 +67,7 @@ class GivenSpec(BaseModel):
     preset: str | None = Field(None, description="Name of a preset.", max_length=100)
     changes: dict[Key, Change] = Field(
         {},
-        max_length=MOST_CHANGES,
+        max_length=MAX_CHANGES,
         description="Values by dotted key of the spec; an empty one removes the key.",
     )
 
@@ -89,10 +89,10 @@ async def _body_of(request: Request) -> bytes:
     found = bytearray()
     async for part in request.stream():
         found += part
-        if len(found) > MOST_BODY_BYTES:
+        if len(found) > MAX_BODY_BYTES:
             raise Problem(
                 413,
-                f"the request has more than {MOST_BODY_BYTES:,} bytes; a spec with every key "
+                f"the request has more than {MAX_BODY_BYTES:,} bytes; a spec with every key "
                 "explained has 12,000. Leave out what is no spec",
             )
     return bytes(found)

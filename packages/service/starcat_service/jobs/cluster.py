@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ProductError, SourceError
 from starcat.specs.reading import spec_from_dict
-from starcat.storage.atomic import READ_ONLY, sync
+from starcat.storage.atomic import READ_ONLY, sync_to_disk
 from starcat.store.cluster import cluster
 from starcat_service.jobs.job import Attempt, Job, Outcome, failed, interrupt
 from starcat_service.jobs.keys import build_key, ingest_key
@@ -261,7 +261,7 @@ def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> 
     name = f"{job.request['source']}-{job.key[:16]}"  # after its rejected records
     for path in sorted(made.catalogs.iterdir(), key=lambda one: one.stem == name):
         path.replace(paths.catalogs / path.name)
-    sync(paths.catalogs)
+    sync_to_disk(paths.catalogs)
 
 
 def do_task(order: Order, job_time_s: float, database: bytes | None) -> ClusterResult:

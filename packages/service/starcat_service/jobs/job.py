@@ -204,13 +204,13 @@ def interrupt(records: Records, job: Job) -> None:
         if row is None:
             return
         if row["cancel_requested"]:
-            end_job(connection, job.id, "cancelled")
+            finish_job(connection, job.id, "cancelled")
         elif row["interrupted"] >= MAX_INTERRUPTED:
             detail = (
                 f"the service ended {row['interrupted']} times while this job ran, which may be "
                 "because of it; ask for less, or try it again"
             )
-            end_job(connection, job.id, "failed", failed("Interrupted", 500, detail).content)
+            finish_job(connection, job.id, "failed", failed("Interrupted", 500, detail).content)
         else:
             _requeue(connection, job.id)
 
@@ -293,7 +293,7 @@ class Attempt:
             if outcome.state == "queued":
                 _requeue(connection, self.job.id)
             else:
-                end_job(connection, self.job.id, outcome.state, outcome.content)
+                finish_job(connection, self.job.id, outcome.state, outcome.content)
 
     def _is_mine(self, connection: sqlite3.Connection) -> bool:
         return self._update(connection, "attempt = ?", self.job.attempt)
@@ -311,7 +311,7 @@ def _requeue(connection: sqlite3.Connection, job_id: str) -> None:
     add_event(connection, job_id, "state", {"state": "queued"})
 
 
-def end_job(
+def finish_job(
     connection: sqlite3.Connection, job_id: str, state: State, content: Mapping[str, Any] = {}
 ) -> None:
     """Record how a job ended, within a transaction."""

@@ -21,7 +21,7 @@ from starcat.workers.process import WorkerProcess
 from starcat_service.jobs.job import Outcome, failed
 from starcat_service.jobs.work import Order, out_of_memory
 
-TASK = "starcat_service.jobs.work:main"
+TASK = "starcat_service.jobs.work:work_main"
 
 TICK_S = 0.2
 """How often it is looked whether a process has to end."""

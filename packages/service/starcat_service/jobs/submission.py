@@ -20,7 +20,7 @@ from starcat.sections import version_numbers
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 from starcat_service.access import Principal
-from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, end_job, job_in, job_of
+from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, finish_job, job_in, job_of
 from starcat_service.jobs.keys import build_key, ingest_key, key_of
 from starcat_service.problems import Problem
 from starcat_service.security.request_limits import GIB, check_disk
@@ -231,7 +231,7 @@ def cancel_job(service: Service, job_id: str, principal: Principal) -> Job:
     with service.records.writing() as connection:
         job = job_in(connection, job_id)
         if job.state == "queued":
-            end_job(connection, job_id, "cancelled")
+            finish_job(connection, job_id, "cancelled")
         elif job.state == "running":
             connection.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job_id,))
         elif job.state != "cancelled":

@@ -28,7 +28,7 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.storage.atomic import sync
+from starcat.storage.atomic import sync_to_disk
 from starcat.storage.locks import locked
 from starcat.workers.channel import Channel
 from starcat.workers.confinement import limit_memory
@@ -36,7 +36,7 @@ from starcat.workers.messages import DONE, ERROR, PROGRESS
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 NICENESS = 10
 """Requests come before jobs."""
@@ -46,7 +46,7 @@ STAGES_A_SECOND = 4.0
 MAX_LINE = 2000
 """Characters of a line of the log that are kept."""
 
-MOST_CURVE_FRAMES = 200
+MAX_CURVE_FRAMES = 200
 """Frames of a point of the curves that an evaluation draws."""
 
 NO_THREAD = "can't start new thread"
@@ -82,7 +82,7 @@ class Order:
         return self.paths.job_work(self.job_id)
 
 
-def prepare(kind: Kind) -> None:
+def prepare_worker(kind: Kind) -> None:
     """Load what a kind of job needs: programs do not count as memory that a job takes."""
     for name in _NEEDS[kind]:
         import_module(name)
@@ -105,12 +105,12 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     else:
         log("info", f"database {database_id} is there already")
         return result
-    from starcat.pipeline.build import build
+    from starcat.pipeline.build import build_database
     from starcat.specs.reading import spec_from_dict
 
     spec = spec_from_dict(dict(order.request["spec"]), "spec")
     made = order.work / database_id
-    built = build(
+    built = build_database(
         spec,
         {},
         made,
@@ -138,9 +138,9 @@ def place_database(made: Path, final: Path) -> None:
         aside = made.with_name("aside")
         final.rename(aside)
         shutil.rmtree(aside, ignore_errors=True)
-    sync(made)
+    sync_to_disk(made)
     made.rename(final)
-    sync(final.parent)
+    sync_to_disk(final.parent)
 
 
 def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         shutil.rmtree(made)
     else:
         made.replace(final)
-    sync(final.parent)
+    sync_to_disk(final.parent)
     return {**result, "rows": rows}
 
 
@@ -207,7 +207,7 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         f"{clean.identified} of {clean.frames} clean pointings were identified, "
         f"{clean.wrong} wrongly",
     )
-    few = max(1, min(MOST_CURVE_FRAMES, int(asked["frames"])))
+    few = max(1, min(MAX_CURVE_FRAMES, int(asked["frames"])))
     log("info", f"{few} frames for each point of the curves")
     curves = measure_curves(database.folder, order.work, few, int(asked["seed"]), progress)
     return {
@@ -229,7 +229,7 @@ _NEEDS: Mapping[Kind, tuple[str, ...]] = {
 }
 
 
-def order_of(job: Job, settings: Settings, root: str) -> Order:
+def order_of(job: Job, settings: ServiceSettings, root: str) -> Order:
     """Return the order of a job in a service, or in a folder of another machine."""
     return Order(
         root=root,
@@ -291,7 +291,7 @@ class _Lines(logging.Handler):
         self._messages.log(level, record.getMessage())
 
 
-def main() -> None:
+def work_main() -> None:
     """Read the order, and do it."""
     _end_with_parent()
     channel = Channel()
@@ -308,7 +308,7 @@ def main() -> None:
         logger.setLevel(logging.INFO)
         logger.addHandler(lines)
     with locked(order.paths.job_lock(order.job_id)):
-        prepare(order.kind)
+        prepare_worker(order.kind)
         limit_memory(order.memory_bytes)
         try:
             channel.send(DONE, _do_job(order, messages.stage, messages.log))

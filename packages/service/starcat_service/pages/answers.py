@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlencode
 
-from starcat.images.picture import short_name
+from starcat.images.picture import picture_name
 from starcat.images.second_look import WIDE_FOV_ERROR
-from starcat_service.pages.sky import names_of
+from starcat_service.pages.sky import star_names_of
 
-MOST_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
+MAX_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
 COLUMNS = (
     *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
     *("dx_px", "dy_px", "separation_arcsec", "dropped"),
@@ -104,9 +104,9 @@ def unusable_frame(name: str, why: str) -> ShownFrame:
 def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
     """Give each star the name that the picture has for it."""
     stars = [one for one in content["stars"] if one["star"] is not None]
-    names = names_of([{**one, "label": one["star"]} for one in stars], epoch_jyear)
+    names = star_names_of([{**one, "label": one["star"]} for one in stars], epoch_jyear)
     for one, name in zip(stars, names, strict=True):
-        one["name"] = name or short_name(one["star"])
+        one["name"] = name or picture_name(one["star"])
 
 
 def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
         values.pop("camera.flip", None)  # of what was measured y counts down
     query = urlencode({name: text for name, text in values.items() if text})
-    return f"/identify?{query}" if len(query) <= MOST_LINK else ""
+    return f"/identify?{query}" if len(query) <= MAX_LINK else ""
 
 
 def csv_of(contents: Sequence[Mapping[str, Any]]) -> str:

@@ -17,11 +17,11 @@ from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_qu
 from starcat.query.result import ResultTable
 from starcat_service.access import Reader
 from starcat_service.api.sql import Form, SqlQuery, SqlQuestion, query_of, result_file, result_table
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.facts import database_rows, products_of
 from starcat_service.pages.notebook import Notebook, query_code
-from starcat_service.pages.rendering import address_of, page_router, render
-from starcat_service.pages.sky import around, view_of
+from starcat_service.pages.rendering import page_router, page_url, render
+from starcat_service.pages.sky import around, sky_view
 from starcat_service.problems import Problem, ProblemDetails, problem_of
 from starcat_service.service import Service, TheService
 
@@ -165,16 +165,16 @@ def _page(
 
 
 def _notebook(
-    request: Request, service: Service, database: Database, form: ConsoleForm
+    request: Request, service: Service, database: ListedDatabase, form: ConsoleForm
 ) -> Notebook:
     asked = _query(service, database.id, form)
     code = query_code(
-        address_of(request, service), list(asked.targets), asked.text, asked.values, asked.max_rows
+        page_url(request, service), list(asked.targets), asked.text, asked.values, asked.max_rows
     )
     return Notebook(f"{database.title}-query", code)
 
 
-def _view(database: Database, answer: ResultTable) -> dict[str, Any] | None:
+def _view(database: ListedDatabase, answer: ResultTable) -> dict[str, Any] | None:
     """Return the rows of an answer as places in the sky, if that is what they are."""
     columns = {column.name: k for k, column in enumerate(answer.columns)}
     if not {"ra_deg", "dec_deg"} <= set(columns):
@@ -191,7 +191,7 @@ def _view(database: Database, answer: ResultTable) -> dict[str, Any] | None:
         reason = None if said["reason"] is None else str(said["reason"]).replace("_", " ")
         one = {"label": label, "ra_deg": ra, "dec_deg": dec, "mag": mag, "reason": reason}
         marks.append(one if said["star_id"] is None else {**one, "id": str(said["star_id"])})
-    return view_of(database, marks=marks, at=around(marks)) if marks else None
+    return sky_view(database, marks=marks, at=around(marks)) if marks else None
 
 
 def _chosen(name: str) -> NamedQuery | None:

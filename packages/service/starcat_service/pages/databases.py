@@ -17,7 +17,7 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
 from starcat.report.coverage_map import (
     Fields,
-    bins_of,
+    colour_bins,
     field_at,
     nearest_raster,
     raster_png,
@@ -27,18 +27,18 @@ from starcat.sections import version_numbers
 from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of
 from starcat_service.jobs.submission import submit_evaluation
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.downloads import image_choices
 from starcat_service.pages.facts import (
     database_rows,
     products_of,
     rejections_of,
     report_of,
-    star_columns,
+    star_fact_columns,
 )
 from starcat_service.pages.notebook import Notebook, database_code, difference_code, query_code
-from starcat_service.pages.rendering import address_of, page_router, render
-from starcat_service.pages.sky import CACHED, view_of
+from starcat_service.pages.rendering import page_router, page_url, render
+from starcat_service.pages.sky import CACHED, sky_view
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
 
@@ -77,7 +77,7 @@ def list_of_databases(request: Request, service: TheService, _: Reader) -> Respo
 
 
 @router.get("/databases/{database_id}")
-def one_database(
+def database_page(
     request: Request, service: TheService, reader: Reader, database_id: str
 ) -> Response:
     """Show what is known of a database."""
@@ -91,7 +91,7 @@ def one_database(
         products=products_of(manifest),
         rejections=rejections_of(manifest),
         image=image_choices(database),
-        notebook=Notebook(database.title, database_code(address_of(request, service), database.id)),
+        notebook=Notebook(database.title, database_code(page_url(request, service), database.id)),
         methods=[
             name
             for name, method in METHODS.items()
@@ -131,9 +131,9 @@ def coverage_page(
         report=report_of(database),
         sky_map=sky_map(fields),
         fields=[field_at(fields, number) for number in numbers],
-        star_columns=["designation", "mag", *star_columns(database.manifest)],
+        star_columns=["designation", "mag", *star_fact_columns(database.manifest)],
         fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
-        view=view_of(database, fields=f"/databases/{database.id}/fields.json"),
+        view=sky_view(database, fields=f"/databases/{database.id}/fields.json"),
         order=order,
         page=page,
         pages=pages,
@@ -154,7 +154,12 @@ _SQL_ORDER = {
 
 
 def _fields_notebook(
-    request: Request, service: Service, database: Database, order: Order, page: int, at_most: str
+    request: Request,
+    service: Service,
+    database: ListedDatabase,
+    order: Order,
+    page: int,
+    at_most: str,
 ) -> Notebook | None:
     """Return Python that asks for the fields on the page; None where no product has them."""
     if "boresights" not in database.products:
@@ -164,7 +169,7 @@ def _fields_notebook(
         + (f"WHERE star_count <= {int(at_most)}\n" if at_most else "")
         + f"ORDER BY {_SQL_ORDER[order]} LIMIT {FIELDS_SHOWN} OFFSET {(page - 1) * FIELDS_SHOWN}"
     )
-    code = query_code(address_of(request, service), [database.id], query, {}, FIELDS_SHOWN)
+    code = query_code(page_url(request, service), [database.id], query, {}, FIELDS_SHOWN)
     return Notebook(f"{database.title}-fields", code)
 
 
@@ -198,7 +203,7 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
         "ra_deg": fields.ra_deg.round(4).tolist(),
         "dec_deg": fields.dec_deg.round(4).tolist(),
         "stars": fields.stars.tolist(),
-        "bins": [{"least": one.least, "colour": one.colour} for one in bins_of(fields.stars)],
+        "bins": [{"least": one.least, "colour": one.colour} for one in colour_bins(fields.stars)],
     }
     return JSONResponse(content, headers=CACHED)
 
@@ -216,7 +221,7 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     return Response(page, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _way_back(database: Database) -> str:
+def _way_back(database: ListedDatabase) -> str:
     return (
         f'<p><a href="/databases/{database.id}">← {escape(database.name)} '
         f'{escape(database.version)}</a> · <a href="/databases">Databases</a></p>'
@@ -247,7 +252,7 @@ def _comparison(
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
     earlier, later = _older_first(service, database_id, other) if other else (database, None)
-    code = later and difference_code(address_of(request, service), earlier.id, later.id)
+    code = later and difference_code(page_url(request, service), earlier.id, later.id)
     versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
@@ -264,7 +269,9 @@ def _comparison(
     )
 
 
-def _older_first(service: Service, database_id: str, other: str) -> tuple[Database, Database]:
+def _older_first(
+    service: Service, database_id: str, other: str
+) -> tuple[ListedDatabase, ListedDatabase]:
     """Return two databases as they were chosen, but of two versions of one the older first."""
     first, second = map(service.library.database, (database_id, other))
     is_newer = first.name == second.name and (
@@ -274,11 +281,11 @@ def _older_first(service: Service, database_id: str, other: str) -> tuple[Databa
 
 
 @router.post("/databases/{database_id}/evaluate")
-def evaluate(service: TheService, builder: Builder, database_id: str) -> Response:
+def evaluate_page(service: TheService, builder: Builder, database_id: str) -> Response:
     """Have it measured how often frames are identified, and show the job."""
     submitted = submit_evaluation(service, database_id, builder.name)
     return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
 
 
-def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
+def _head(service: Service, database: ListedDatabase, tab: str) -> dict[str, Any]:
     return {"row": database_rows(service, database)[0], "database": database, "tab": tab}

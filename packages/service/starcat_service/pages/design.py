@@ -16,7 +16,7 @@ from starcat.errors import ConfigError
 from starcat.specs.reading import changed, preset, preset_names
 from starcat_service.pages.draft import (
     TEXT,
-    Draft,
+    SpecForm,
     draft_of_content,
     draft_of_text,
     without_defaults,
@@ -26,11 +26,11 @@ PRESET, PINNED = "preset", "pinned"
 OTHERS = (PRESET, PINNED, TEXT, "job", "database")
 """What is in an address besides keys of a spec."""
 
-MOST_CHARACTERS = 12_000
+MAX_CHARACTERS = 12_000
 """Of an address: servers on the way refuse longer ones."""
 
 
-def query_of(draft: Draft, chosen: str, pinned: str = "") -> str | None:
+def design_query(draft: SpecForm, chosen: str, pinned: str = "") -> str | None:
     """Return the query of the address of a design: empty, or with its question mark.
 
     None where it is too long for an address, as one with a large table of a response is.
@@ -42,12 +42,12 @@ def query_of(draft: Draft, chosen: str, pinned: str = "") -> str | None:
     if pinned:
         query[PINNED] = pinned
     text = urlencode(query, safe="/:, ").replace(" ", "+")
-    if len(text) > MOST_CHARACTERS:
+    if len(text) > MAX_CHARACTERS:
         return None
     return f"?{text}" if text else ""
 
 
-def draft_of_query(query: Mapping[str, str]) -> Draft:
+def draft_of_query(query: Mapping[str, str]) -> SpecForm:
     """Return the design of an address."""
     if TEXT in query:
         return draft_of_text(query[TEXT])
@@ -58,7 +58,7 @@ def draft_of_query(query: Mapping[str, str]) -> Draft:
         raise ConfigError(f"the address is of no design: {error}", key="address") from None
 
 
-def pinned_draft(query: str) -> Draft:
+def pinned_draft(query: str) -> SpecForm:
     """Return the design that is pinned, from the query of its address."""
     return draft_of_query(dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True)))
 
@@ -67,7 +67,7 @@ def _base(name: str) -> dict[str, Any]:
     return without_defaults(preset(name).recorded())
 
 
-def _changes(draft: Draft, base: str) -> dict[str, str] | None:
+def _changes(draft: SpecForm, base: str) -> dict[str, str] | None:
     """Return what differs from a preset by key; None where that would lose some of the text."""
     before, after = dict(_leaves(_base(base))), dict(_leaves(draft.content))
     if "#" in draft.text or not draft.content:
@@ -98,7 +98,7 @@ def _typed(value: Any) -> str:
     return str(tomlkit.item(value).as_string())
 
 
-def differences(now: Draft, pinned: Draft) -> list[tuple[str, str, str]]:
+def differences(now: SpecForm, pinned: SpecForm) -> list[tuple[str, str, str]]:
     """Return key, value and pinned value of what two designs differ in."""
     mine, others = dict(_leaves(now.content)), dict(_leaves(pinned.content))
     keys = [*mine, *(key for key in others if key not in mine)]

@@ -49,7 +49,7 @@ class Page:
 
 
 @dataclass(frozen=True)
-class Part:
+class PagePart:
     """Pages that belong together."""
 
     caption: str
@@ -73,7 +73,7 @@ def page_of(request: Request, name: str) -> Response:
 
 
 @router.get("/docs/figures/{name}")
-def figure(name: str) -> Response:
+def documentation_figure(name: str) -> Response:
     """Give a picture of a page."""
     if name not in FIGURES:
         raise Problem(404, "there is no such picture; /docs lists the pages")
@@ -87,11 +87,11 @@ def _shown(request: Request, name: str) -> Response:
 
 
 @cache
-def table_of_pages() -> list[Part]:
+def table_of_pages() -> list[PagePart]:
     """Return the pages by part, as the index has them."""
     text = (FOLDER / f"{INDEX}.md").read_text(encoding="utf-8")
     return [
-        Part(caption, [(name, _title(name)) for name in names.split()])
+        PagePart(caption, [(name, _title(name)) for name in names.split()])
         for caption, names in _TREE.findall(text)
     ]
 

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 
 from starcat.onboard.layout import BYTE_ORDERS, FEATURES
 from starcat_service.access import Reader
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.rendering import page_router
 from starcat_service.service import Service, TheService
 from starcat_service.transfers import BYTES, TYPES, open_attachment, scratch_folder
@@ -21,7 +21,7 @@ Method = Literal["triangle", "pyramid"]
 Endian = Literal["little", "big"]
 
 
-def image_choices(database: Database) -> dict[str, list[tuple[str, str]]]:
+def image_choices(database: ListedDatabase) -> dict[str, list[tuple[str, str]]]:
     """Return the methods and the byte orders that an image of a database can have."""
     methods = [name for name, (product, _) in FEATURES.items() if product in database.products]
     return {
@@ -31,7 +31,7 @@ def image_choices(database: Database) -> dict[str, list[tuple[str, str]]]:
 
 
 @router.get("/databases/{database_id}/image")
-async def flight_image(
+async def flight_image_page(
     service: TheService,
     _: Reader,
     database_id: str,
@@ -43,7 +43,7 @@ async def flight_image(
     return await service.sandbox.run(_image, service, database, method, endian)
 
 
-def _image(service: Service, database: Database, method: str, endian: str) -> Response:
+def _image(service: Service, database: ListedDatabase, method: str, endian: str) -> Response:
     with scratch_folder(service.paths) as folder:
         target = folder / "image.img"
         arguments = {"artifact": str(database.folder), "target": str(target)}

@@ -80,7 +80,7 @@ _KEYS: Mapping[str, SpecKey] = {key.path: key for part in spec_sections() for ke
 
 
 @dataclass(frozen=True)
-class Draft:
+class SpecForm:
     """A spec as far as it is."""
 
     text: str  # TOML
@@ -123,7 +123,7 @@ class Draft:
         return {(named or told or [TEXT])[0]: words}
 
 
-def draft_of_text(text: str) -> Draft:
+def draft_of_text(text: str) -> SpecForm:
     """Return the draft that a text is."""
     text = text.replace("\r\n", "\n")
     try:
@@ -132,7 +132,7 @@ def draft_of_text(text: str) -> Draft:
         return _draft({}, text, ConfigError(str(error), key=TEXT))
 
 
-def draft_of_form(form: Mapping[str, str]) -> Draft:
+def draft_of_form(form: Mapping[str, str]) -> SpecForm:
     """Return the draft that a form was sent as."""
     text = form.get(TEXT, "").replace("\r\n", "\n")
     before = form.get(BEFORE, "").replace("\r\n", "\n")
@@ -150,7 +150,7 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     return _edited(known, edit)
 
 
-def draft_with(draft: Draft, changes: Mapping[str, Any]) -> Draft:
+def draft_with(draft: SpecForm, changes: Mapping[str, Any]) -> SpecForm:
     """Return a draft with other values of some keys; None removes one."""
     edit = _Edit(copy.deepcopy(dict(draft.content)))
     for path, value in changes.items():
@@ -159,12 +159,12 @@ def draft_with(draft: Draft, changes: Mapping[str, Any]) -> Draft:
     return _edited(draft, edit)
 
 
-def _edited(draft: Draft, edit: _Edit) -> Draft:
+def _edited(draft: SpecForm, edit: _Edit) -> SpecForm:
     """Return a draft with the changes of an edit."""
     return _draft(edit.content, edit.text(draft.text)) if edit.changes else draft
 
 
-def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
+def _with_fields_of(form: Mapping[str, str], draft: SpecForm) -> SpecForm:
     """Return a draft whose text cannot be read with the fields as they were."""
     values = {key: form.get(key, value) for key, value in draft.values.items()}
     return replace(
@@ -177,7 +177,7 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
     )
 
 
-def draft_of_content(content: Mapping[str, Any]) -> Draft:
+def draft_of_content(content: Mapping[str, Any]) -> SpecForm:
     """Return the draft of a spec that is parsed."""
     return _draft(content, tomlkit.dumps(content))
 
@@ -192,7 +192,7 @@ def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = None) -> Draft:
+def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = None) -> SpecForm:
     spec = None
     wrong: tuple[ConfigError, ...] = () if error is None else (error,)
     if error is None:
@@ -209,7 +209,7 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
     }
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
-    return Draft(
+    return SpecForm(
         text=text,
         values=values,
         lens="focal" if has_focal else "field",

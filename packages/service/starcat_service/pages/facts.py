@@ -18,7 +18,7 @@ from starcat.simulation.selftest import rates_of
 from starcat.stars.verdict import Reason
 from starcat.storage.schema import product_schema
 from starcat_service.api.databases import REPORT
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.service import Service
 
 NOT_LISTED = (Reason.beyond_read_limit.name,)
@@ -34,16 +34,16 @@ MAX_JOBS = 1000  # jobs that are looked through for the time of a build
 
 
 @dataclass(frozen=True)
-class Row:
+class FactRow:
     """A database as lists and heads of pages show it."""
 
-    database: Database
+    database: ListedDatabase
     rates: list[Mapping[str, Any]]  # of the self-test, the clean frames first
     is_released: bool  # whether exactly this is in the registry
     built_s: float  # seconds since 1970
 
 
-def database_rows(service: Service, *databases: Database) -> list[Row]:
+def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]:
     """Return databases as the list shows them: these, or all."""
     released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
     built: dict[str, float] = {}
@@ -52,7 +52,7 @@ def database_rows(service: Service, *databases: Database) -> list[Row]:
         if job.kind == "build" and made and job.ended_s:
             built[str(made)] = job.ended_s
     return [
-        Row(
+        FactRow(
             one,
             _rates(one),
             one.title in released and released[one.title] == one.manifest_blob.sha256,
@@ -62,7 +62,7 @@ def database_rows(service: Service, *databases: Database) -> list[Row]:
     ]
 
 
-def _rates(database: Database) -> list[Mapping[str, Any]]:
+def _rates(database: ListedDatabase) -> list[Mapping[str, Any]]:
     """Return the rates of the self-test: a damaged report does not hide other databases."""
     try:
         # A report of an older version has no share of all pointings.
@@ -85,7 +85,7 @@ def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def star_columns(manifest: Mapping[str, Any]) -> list[str]:
+def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
     """Return the columns of ``stars`` with errors and blends that the database knows."""
     spec = manifest["spec"]
     schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
@@ -121,7 +121,7 @@ def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def report_of(database: Database) -> dict[str, Any]:
+def report_of(database: ListedDatabase) -> dict[str, Any]:
     """Return the report of a build."""
     path = database.folder / REPORT
     if REPORT not in database.manifest["files"]:

@@ -11,10 +11,10 @@ from starcat_service.access import Identities, Reader, cookie_name, network_of, 
 from starcat_service.api import releases as api
 from starcat_service.jobs.job import ENDED
 from starcat_service.pages.facts import database_rows
-from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.pages.rendering import page_router, page_url, render
 from starcat_service.security import request_limits
 from starcat_service.service import TheService
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 router = page_router()
 MAX_ADDRESS = 16_000  # characters of an address: a design of a database is in one
@@ -36,7 +36,7 @@ def home(request: Request, service: TheService, reader: Reader) -> Response:
         releases=sorted(releases, key=lambda one: -(one.published_s or 0.0))[:SHOWN],
         release_count=len(releases),
         jobs=[job for job in jobs if job.state not in ENDED],
-        address=address_of(request, service),
+        address=page_url(request, service),
         example=newest_first[0].database if newest_first else None,
         needs_token=reader.name != "anonymous",
     )
@@ -87,7 +87,7 @@ def sign_in(
     identities: Identities = request.app.state.identities
     found = identities.of_token(token.strip())
     if found is None:
-        wait_s = identities.guessed.take(network_of(request_limits.address_of(request.scope)))
+        wait_s = identities.guessed.take(network_of(request_limits.client_ip(request.scope)))
         form = sign_in_form(request, next_address, NOT_VALID, 429 if wait_s else 401)
         form.headers.update(request_limits.later(wait_s) if wait_s else {})
         return form
@@ -100,7 +100,7 @@ def sign_in(
     return answer
 
 
-def _cookie(settings: Settings) -> dict[str, Any]:
+def _cookie(settings: ServiceSettings) -> dict[str, Any]:
     """Return what setting and deleting the cookie of a sign-in have to agree in."""
     secure = settings.is_secure
     return {"key": cookie_name(settings), "secure": secure, "httponly": True, "samesite": "strict"}

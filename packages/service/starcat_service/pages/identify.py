@@ -37,16 +37,16 @@ from starcat_service.api.identify import (
 from starcat_service.candidates import (
     MAX_SEARCH_S,
     FieldsDeg,
-    candidates,
+    databases_to_try,
     field_line,
     spec_of,
     try_each,
 )
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.answers import Shown, ShownFrame, marks_of, shown_frames, unusable_frame
 from starcat_service.pages.notebook import Notebook, identify_code
-from starcat_service.pages.rendering import address_of, page_router, render
-from starcat_service.pages.sky import view_of
+from starcat_service.pages.rendering import page_router, page_url, render
+from starcat_service.pages.sky import sky_view
 from starcat_service.pages.wording import advice_in_page_words, page_problem
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
@@ -68,7 +68,7 @@ FIELDS = (
 )  # fmt: skip
 """Fields of the form that are texts."""
 
-MOST_FILES = 50  # pictures at once
+MAX_FILES = 50  # pictures at once
 
 ANY = "the one that fits the frame"
 """The choice of a database by the field of view; others are tried if it identifies nothing."""
@@ -84,9 +84,9 @@ async def identify_page(request: Request, service: TheService, _: Reader) -> Res
 
 
 @router.post("/identify")
-async def identify(request: Request, service: TheService, _: Reader) -> Response:
+async def identify_form(request: Request, service: TheService, _: Reader) -> Response:
     """Identify the frames of a form, and show the form again with the answer."""
-    async with request.form(max_files=MOST_FILES, max_fields=40) as form:
+    async with request.form(max_files=MAX_FILES, max_fields=40) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
         return await _answered(request, service, form, given)
 
@@ -104,7 +104,7 @@ async def _answered(
 
 @dataclass(frozen=True)
 class _Asked:
-    databases: list[Database]  # those to try, in this order
+    databases: list[ListedDatabase]  # those to try, in this order
     uploads: list[FrameUpload]
 
 
@@ -112,7 +112,7 @@ class _Asked:
 class _Found:
     """What the databases made of a file."""
 
-    database: Database  # the one that has identified a frame, else the first one
+    database: ListedDatabase  # the one that has identified a frame, else the first one
     frames: list[ShownFrame]
     picture: bytes
     method: str
@@ -125,7 +125,7 @@ def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
     if given["database"]:
         databases = [service.library.database(given["database"])]
     else:
-        databases = candidates(service.library.databases(), _fields_deg(given))
+        databases = databases_to_try(service.library.databases(), _fields_deg(given))
     if not databases:
         raise Problem(404, "this service has no database yet; build one first", key="database")
     return _Asked(databases, frames_of(form, given, databases[0], service))
@@ -185,7 +185,7 @@ def _frames(
     kind: Literal["png"] | None = "png" if draw else None
     is_chosen = bool(given["database"])
 
-    def identify(database: Database) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
+    def identify(database: ListedDatabase) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
         options = options_of(given, service, database)
         if not is_chosen:
             limit_s = min(options.time_limit_s or MAX_SEARCH_S, MAX_SEARCH_S)
@@ -221,14 +221,14 @@ def _options_told(options: IdentifyOptions) -> dict[str, Any]:
     return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
 
 
-def _view(frame: ShownFrame, database: Database, camera: Camera) -> dict[str, Any] | None:
+def _view(frame: ShownFrame, database: ListedDatabase, camera: Camera) -> dict[str, Any] | None:
     """Return what the view of the sky is told of an answer."""
     content = frame.content
     if not frame.is_identified:
         return None
     found = camera.with_focal_length(float(content["focal_length_px"]))
     ra, dec, roll = (content[f"{name}_deg"] for name in ("boresight_ra", "boresight_dec", "roll"))
-    return view_of(
+    return sky_view(
         database,
         found,
         frame={"ra": ra, "dec": dec, "roll": roll},
@@ -259,14 +259,14 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     nothing = dict.fromkeys(
         ("shown", "picture", "problem", "errors_arcsec", "field_deg", "view", "tried")
     )
-    chosen: Database | None = answer.pop("used", None)
+    chosen: ListedDatabase | None = answer.pop("used", None)
     chosen = chosen or next((one for one in databases if one.id == given["database"]), None)
     camera = (chosen or databases[0]).camera if databases else None
     shown: Shown | None = answer.get("shown")
     notebook = None
     if shown is not None and shown.first.measured and chosen is not None:
         asked = shown.first.measured, answer.pop("options")
-        code = identify_code(address_of(request, service), chosen.id, *asked)
+        code = identify_code(page_url(request, service), chosen.id, *asked)
         notebook = Notebook(f"{shown.first.content['frame']}-answer", code)
     return render(
         request,
@@ -285,14 +285,14 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         errors={problem.key: problem.detail} if problem and problem.key else {},
         suffixes=",".join(SUFFIXES),
         most_mib=service.settings.upload_mib,
-        most_files=MOST_FILES,
+        most_files=MAX_FILES,
         notebook=notebook,
         **{**nothing, **answer},
     )
 
 
 def frames_of(
-    form: FormData, given: dict[str, str], database: Database, service: Service
+    form: FormData, given: dict[str, str], database: ListedDatabase, service: Service
 ) -> list[FrameUpload]:
     """Return the files of frames that a form brings."""
     if given["seed"]:
@@ -315,7 +315,9 @@ def frames_of(
     return [FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))]
 
 
-def options_of(given: dict[str, str], service: Service, database: Database) -> IdentifyOptions:
+def options_of(
+    given: dict[str, str], service: Service, database: ListedDatabase
+) -> IdentifyOptions:
     """Return how a frame is to be identified."""
     percent = _number(given["field_error"], "field_error")
     ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
@@ -347,7 +349,7 @@ def options_of(given: dict[str, str], service: Service, database: Database) -> I
     )
 
 
-def camera_text(given: Mapping[str, str], database: Database) -> str | None:
+def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | None:
     """Return the text of the camera that a form describes; None for that of the database.
 
     The size of a picture is the size of its camera if the form states none; for centroids it is
@@ -379,7 +381,7 @@ def _toml_number(value: float) -> str:
     return str(int(value)) if value.is_integer() else repr(value)
 
 
-def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
+def _simulated(service: Service, database: ListedDatabase, name: str, seed: int) -> bytes:
     stars = open_database(database.folder, ())
     frame = next(
         simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
@@ -428,7 +430,7 @@ def _number(text: str, name: str) -> float | None:
         ) from None
 
 
-def frame_suffix(database: Database) -> str:
+def frame_suffix(database: ListedDatabase) -> str:
     """Return the suffix of the file of a simulated frame: a picture unless it were too large."""
     camera = database.camera
     return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"

@@ -85,7 +85,7 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
         log=[event for event in events if event.kind == "log"][-LINES:],
         last=events[-1].number if events else 0,
         spec=None if spec is None else draft_of_content(without_defaults(spec)).text,
-        facts=facts_of(job),
+        facts=job_facts(job),
         took=took_s(job),
         progress=progress_text(job),
         may_change=may_change(job, who),
@@ -128,7 +128,7 @@ def progress_text(job: Job) -> str:
     return f"{job.stage}: {shown(job.done)} of {shown(job.total)}"
 
 
-def facts_of(job: Job) -> list[tuple[str, str]]:
+def job_facts(job: Job) -> list[tuple[str, str]]:
     """Return what else is known of a job, besides the spec of a build."""
     facts = {**job.request, **(job.result or {})}
     return [

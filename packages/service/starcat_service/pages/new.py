@@ -23,20 +23,20 @@ from starcat_service.jobs.submission import check_title, submit_build
 from starcat_service.pages.design import (
     PINNED,
     PRESET,
+    design_query,
     differences,
     draft_of_query,
     pinned_draft,
-    query_of,
 )
 from starcat_service.pages.draft import (
     TEXT,
-    Draft,
+    SpecForm,
     draft_of_content,
     draft_of_form,
     draft_with,
     without_defaults,
 )
-from starcat_service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_of
+from starcat_service.pages.preview import MAX_MAPPED, Preview, preview_of, tiling_of
 from starcat_service.pages.rendering import (
     ENVIRONMENT,
     count_text,
@@ -45,14 +45,14 @@ from starcat_service.pages.rendering import (
     render,
     size_text,
 )
-from starcat_service.pages.response import FILE, MOST_BYTES, PER, keys_of_file
+from starcat_service.pages.response import FILE, MAX_BYTES, PER, keys_of_file
 from starcat_service.pages.wording import page_problem
 from starcat_service.problems import Problem, ProblemDetails
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
 
-MOST_FIELDS = 100  # fields of a form; this one has 41
-MOST_KEYS = 200  # of an address
+MAX_FIELDS = 100  # fields of a form; this one has 41
+MAX_KEYS = 200  # of an address
 
 router = page_router()
 
@@ -67,12 +67,12 @@ class Sent:
 
 async def sent_form(request: Request) -> Sent:
     """Return what a request brings; of a file no more is read than may be taken."""
-    async with request.form(max_files=1, max_fields=MOST_FIELDS) as form:
+    async with request.form(max_files=1, max_fields=MAX_FIELDS) as form:
         fields = {name: value for name, value in form.items() if isinstance(value, str)}
         file = form.get(FILE)
         if not isinstance(file, UploadFile) or not file.filename:
             return Sent(fields, None)
-        return Sent(fields, (file.filename, await file.read(MOST_BYTES + 1)))
+        return Sent(fields, (file.filename, await file.read(MAX_BYTES + 1)))
 
 
 Form = Annotated[Sent, Depends(sent_form)]
@@ -90,7 +90,7 @@ def new_page(
 ) -> Response:
     """Show the form with the design of the address, or with that of a job or of a database."""
     if job is None and database is None:
-        draft = draft_of_query(dict(request.query_params.multi_items()[:MOST_KEYS]))
+        draft = draft_of_query(dict(request.query_params.multi_items()[:MAX_KEYS]))
     else:
         draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
     # A page that waits for no catalog is there at once; its script asks for the estimate.
@@ -147,14 +147,14 @@ def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Res
 
 
 @router.get("/new/tiling")
-def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Response:
+def tiling(count: Annotated[int, Query(ge=1, le=MAX_MAPPED)], _: Reader) -> Response:
     """Tell a script where the fields of a tiling are."""
     ra_deg, dec_deg = tiling_of(count)
     content = {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
     return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _asked(service: Service, sent: Sent) -> tuple[Draft, list[str]]:
+def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
     """Return the design that a form asks for, and what is to be said of it."""
     form = sent.fields
     draft = draft_of_form(form)
@@ -164,7 +164,7 @@ def _asked(service: Service, sent: Sent) -> tuple[Draft, list[str]]:
         except ConfigError as error:
             return replace(draft, wrong=(*draft.wrong, error)), []
     if form.get("do") == "pin":
-        query = query_of(draft, form.get(PRESET, ""))
+        query = design_query(draft, form.get(PRESET, ""))
         if query is None:
             return draft, ["This design is too long to be pinned: keep its text instead."]
         form[PINNED] = query.removeprefix("?") or f"{PRESET}="
@@ -178,7 +178,7 @@ def _asked(service: Service, sent: Sent) -> tuple[Draft, list[str]]:
     return draft, []
 
 
-def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
+def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:
     """Return a design with the limits that its camera needs, and what is to be said of them."""
     try:
         camera = CameraSpec.model_validate(draft.content.get("camera"))
@@ -210,7 +210,7 @@ def suggested(service: Service, draft: Draft) -> tuple[Draft, list[str]]:
 
 
 def _shown(
-    service: Service, draft: Draft, form: dict[str, str], told: list[str] | None = None
+    service: Service, draft: SpecForm, form: dict[str, str], told: list[str] | None = None
 ) -> dict[str, Any]:
     """Return what page and script are told of a design and of what it would give."""
     errors, problem = dict(draft.errors), None
@@ -247,7 +247,7 @@ def _shown(
     }
 
 
-def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+def _first(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str, Any]:
     """Return what a page is told of a design of which no estimate was made yet."""
     errors = draft.errors | (_taken(service, draft) if draft.spec else {})
     return {
@@ -262,13 +262,13 @@ def _first(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, An
     }
 
 
-def _address(draft: Draft, form: dict[str, str]) -> str:
+def _address(draft: SpecForm, form: dict[str, str]) -> str:
     """Return the address of a design; empty where it is too long for one."""
-    query = query_of(draft, form.get(PRESET, ""), form.get(PINNED, ""))
+    query = design_query(draft, form.get(PRESET, ""), form.get(PINNED, ""))
     return "" if query is None else f"/new{query}"
 
 
-def _taken(service: Service, draft: Draft) -> dict[str, str]:
+def _taken(service: Service, draft: SpecForm) -> dict[str, str]:
     """Return the error where a database of this name and version is there already."""
     try:
         if draft.spec is not None:
@@ -280,7 +280,7 @@ def _taken(service: Service, draft: Draft) -> dict[str, str]:
     return {}
 
 
-def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
+def _preview(service: Service, draft: SpecForm) -> tuple[Preview | None, ProblemDetails | None]:
     if draft.spec is None:
         return None, None
     try:
@@ -291,7 +291,7 @@ def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDet
         return None, page_problem(error)
 
 
-def _pinned(service: Service, draft: Draft, form: dict[str, str]) -> dict[str, Any]:
+def _pinned(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str, Any]:
     """Return what is told of the design that is pinned, to compare this one with it."""
     query = form.get(PINNED, "")
     if not query:
@@ -310,7 +310,7 @@ def _counts(seen: Preview | None) -> list[int]:
 def _page(
     request: Request,
     service: Service,
-    draft: Draft,
+    draft: SpecForm,
     form: dict[str, str],
     told: list[str] | None = None,
     refused: ProblemDetails | None = None,
@@ -363,11 +363,11 @@ def _presets() -> list[tuple[str, str, str]]:
     for name in preset_names():
         spec = preset(name)
         missing = [source for source in spec.sources if not is_here(source)]
-        found.append((name, spec.description, lacking(missing) if missing else ""))
+        found.append((name, spec.description, missing_sources(missing) if missing else ""))
     return found
 
 
-def lacking(sources: list[str]) -> str:
+def missing_sources(sources: list[str]) -> str:
     """Return what to say where the files of catalogs are not on the server."""
     known = [(one, data_source(one).identifier.partition(";")[0]) for one in sources]
     names = " and ".join(f"{one} ({identifier})" for one, identifier in known)

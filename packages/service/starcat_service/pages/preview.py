@@ -28,8 +28,8 @@ from starcat_service.catalogs import Catalogs
 from starcat_service.pages.rendering import count_text
 
 MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
-MOST_BARS = 48
-MOST_MAPPED = 50_000
+MAX_BARS = 48
+MAX_MAPPED = 50_000
 """Of more boresights than these no map is drawn: their fields would be finer than its dots."""
 
 
@@ -71,7 +71,7 @@ def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
     ra_deg, dec_deg = tiling_of(len(counts))
     none = np.zeros_like(counts)
     fields = Fields(ra_deg, dec_deg, counts, none, none)
-    is_mapped = len(counts) <= MOST_MAPPED
+    is_mapped = len(counts) <= MAX_MAPPED
     return Preview(
         estimate,
         verdict_of(estimate, catalogs),
@@ -146,7 +146,7 @@ def tiling_of(count: int) -> tuple[Array, Array]:
 
 def _bars(counts: Counts) -> list[Bar]:
     least, most = int(counts.min()), int(counts.max())
-    step = -(-(most - least + 1) // MOST_BARS)
+    step = -(-(most - least + 1) // MAX_BARS)
     fields = np.bincount((counts - least) // step)
     bars = []
     for low, count in zip(range(least, most + 1, step), fields.tolist(), strict=True):

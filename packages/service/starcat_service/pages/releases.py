@@ -10,9 +10,9 @@ from fastapi.responses import RedirectResponse, Response
 from starcat.errors import StarcatError
 from starcat_service.access import Publisher, Reader
 from starcat_service.api import releases as api
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.facts import database_rows
-from starcat_service.pages.rendering import address_of, page_router, render
+from starcat_service.pages.rendering import page_router, page_url, render
 from starcat_service.problems import Problem, ProblemDetails, problem_of
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
@@ -33,7 +33,7 @@ def releases_page(
 
 
 @router.post("/releases")
-def publish(
+def publish_page(
     request: Request,
     service: TheService,
     publisher: Publisher,
@@ -63,7 +63,7 @@ def _page(
     note: str = "",
     published: str = "",
     problem: ProblemDetails | None = None,
-    asked: Database | None = None,
+    asked: ListedDatabase | None = None,
 ) -> Response:
     listed = api.all_releases(service, principal).releases
     newest_first = sorted(listed, key=lambda one: one.published_s or 0.0, reverse=True)
@@ -73,7 +73,7 @@ def _page(
         "releases.html",
         status=problem.status if problem else 200,
         releases=newest_first,
-        address=address_of(request, service),
+        address=page_url(request, service),
         unreleased=[
             (row.database.id, f"{row.database.name} {row.database.version}")
             for row in rows

@@ -155,7 +155,7 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
 
 
-def address_of(request: Request, service: Service) -> str:
+def page_url(request: Request, service: Service) -> str:
     """Return the address of the service as whoever asks reaches it."""
     return (service.settings.public_url or str(request.base_url)).rstrip("/")
 

@@ -9,14 +9,14 @@ from typing import Any
 
 from starcat.bands.response import response_from_text, shipped, shipped_names
 from starcat.errors import ConfigError
-from starcat.specs.camera_response import MOST_ROWS
+from starcat.specs.camera_response import MAX_ROWS
 from starcat.specs.reading import value_at
 
 NAME = "camera.response.name"
 FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside
 PER = "response_per"  # what the file is relative to, where it does not say so itself
 
-MOST_BYTES = 500_000
+MAX_BYTES = 500_000
 
 _OWN = ("per", "wavelength_nm", "value")
 """Keys of a response that stands in the spec."""
@@ -45,8 +45,8 @@ def keys_of_file(filename: str, content: bytes, per: str) -> dict[str, Any]:
     """Return the keys of a spec that a CSV file gives, with the numbers that are in it."""
     try:
         name = _name(filename)
-        if len(content) > MOST_BYTES:
-            raise ConfigError(f"it has more than {MOST_BYTES:,} bytes")
+        if len(content) > MAX_BYTES:
+            raise ConfigError(f"it has more than {MAX_BYTES:,} bytes")
         text = content.decode("utf-8-sig")
         try:
             made = response_from_text(name, text, None)
@@ -54,8 +54,8 @@ def keys_of_file(filename: str, content: bytes, per: str) -> dict[str, Any]:
             if error.key != "per" or per not in ("photon", "energy"):
                 raise
             made = response_from_text(name, text, "photon" if per == "photon" else "energy")
-        if len(made.value) > MOST_ROWS:
-            raise ConfigError(f"it has {len(made.value):,} rows, and a spec {MOST_ROWS:,} at most")
+        if len(made.value) > MAX_ROWS:
+            raise ConfigError(f"it has {len(made.value):,} rows, and a spec {MAX_ROWS:,} at most")
     except (ConfigError, UnicodeDecodeError) as error:
         told = str(error)
         if isinstance(error, UnicodeDecodeError):

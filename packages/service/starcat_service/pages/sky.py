@@ -17,7 +17,7 @@ from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.sky.names import common_names
 from starcat_service.access import Reader
 from starcat_service.api.sql import SqlQuery, result_table
-from starcat_service.library import Database
+from starcat_service.library import ListedDatabase
 from starcat_service.pages.rendering import page_router
 from starcat_service.service import Service, TheService
 
@@ -61,7 +61,7 @@ async def stars_of_view(
 
 
 def _stars(
-    service: Service, database: Database, where: tuple[float, float, float], faint: bool
+    service: Service, database: ListedDatabase, where: tuple[float, float, float], faint: bool
 ) -> list[dict[str, Any]]:
     is_all = where[2] >= 90.0
     parts = [
@@ -118,13 +118,13 @@ NAMED_TO_MAG = 8.5  # stars fainter than this have no name of their own
 
 def _named(stars: list[dict[str, Any]], epoch_jyear: float) -> list[dict[str, Any]]:
     bright = [one for one in stars if one["mag"] <= NAMED_TO_MAG]
-    for one, name in zip(bright, names_of(bright, epoch_jyear), strict=True):
+    for one, name in zip(bright, star_names_of(bright, epoch_jyear), strict=True):
         if name:
             one["name"] = name
     return stars
 
 
-def names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
+def star_names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
     """Return the names that people know stars by; None for those that have only a designation."""
     if not stars:
         return []
@@ -146,7 +146,7 @@ def outline_of(camera: Camera) -> list[list[float]]:
     return [[round(value, 8) for value in row] for row in edge.tolist()]
 
 
-def view_of(database: Database, camera: Camera | None = None, **more: Any) -> dict[str, Any]:
+def sky_view(database: ListedDatabase, camera: Camera | None = None, **more: Any) -> dict[str, Any]:
     """Return what the script of the view is told: addresses, and the field of a camera."""
     own, address = camera or database.camera, f"/databases/{database.id}"
     return {

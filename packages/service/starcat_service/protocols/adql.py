@@ -19,7 +19,7 @@ from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat_service.protocols.adql_columns import Columns, Names
 from starcat_service.protocols.adql_geometry import within
-from starcat_service.protocols.adql_grammar import Refusal, parse_adql, refusals_of
+from starcat_service.protocols.adql_grammar import AdqlRefusal, parse_adql, refusals_of
 from starcat_service.protocols.adql_shapes import (
     GEOMETRY,
     GeometryCalls,
@@ -32,7 +32,7 @@ from starcat_service.protocols.adql_shapes import (
     shape_of,
     sql_text,
 )
-from starcat_service.protocols.tables import Column, Tables, cast
+from starcat_service.protocols.tables import Tables, TapColumn, cast
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -140,7 +140,7 @@ def translate(text: str, tables: Tables) -> Translation:
         return _Translator(tables, tree).translation()
 
 
-def ask(
+def translate_adql(
     session: Session,
     asked: Translation,
     max_rows: int | None = None,
@@ -166,11 +166,11 @@ def ask(
     return begun(batches)
 
 
-def _known(columns: tuple[Column, ...] | None, names: list[str]) -> list[Column]:
+def _known(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapColumn]:
     """Return the columns of an answer, each with a name of its own."""
     if columns is None or len(columns) != len(names):
-        columns = tuple(map(Column.unknown, names))
-    given: list[Column] = []
+        columns = tuple(map(TapColumn.unknown, names))
+    given: list[TapColumn] = []
     taken: set[str] = set()
     for column in columns:
         name, number = column.name, 1
@@ -264,24 +264,24 @@ class _Translator:
             return
         if name not in FUNCTIONS:
             known = sorted({*FUNCTIONS, *GEOMETRY, "IN_UNIT", "CAST"})
-            raise Refusal(
+            raise AdqlRefusal(
                 f"no function {quoted(part.name)}; {suggest(name, known)}there are "
                 f"{', '.join(known)}",
                 part,
             )
         function = FUNCTIONS[name]
         if function.is_windowed and not isinstance(part.parent, exp.Window):
-            raise Refusal(f"{name} needs a window, as OVER (ORDER BY mag) behind it", part)
+            raise AdqlRefusal(f"{name} needs a window, as OVER (ORDER BY mag) behind it", part)
         check_count(part, function.least, function.most)
         arguments = part.expressions
         inner = arguments[0] if arguments else None
         if isinstance(inner, exp.Distinct) and not function.is_set:
-            raise Refusal(f"{name} takes no DISTINCT", part)
+            raise AdqlRefusal(f"{name} takes no DISTINCT", part)
         if isinstance(inner, exp.Star) and name != "COUNT":
-            raise Refusal(f"{name} takes no *", part)
+            raise AdqlRefusal(f"{name} takes no *", part)
         for argument in arguments:
             if shape_of(argument) is not None:
-                raise Refusal(f"{name} takes numbers or texts, and no geometry", part)
+                raise AdqlRefusal(f"{name} takes numbers or texts, and no geometry", part)
         part.replace(raw(function.sql([sql_text(argument) for argument in arguments])))
 
     def _in_unit(self, part: exp.Anonymous) -> None:
@@ -289,16 +289,16 @@ class _Translator:
         check_count(part, 2, 2)
         value, wanted = part.expressions
         if not isinstance(value, exp.Column) or not is_text(wanted):
-            raise Refusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
+            raise AdqlRefusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
         found = self._names.column(value)
         if found is None or not found.unit:
-            raise Refusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
+            raise AdqlRefusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
         from astropy import units
 
         try:
             factor = units.Unit(found.unit).to(units.Unit(wanted.name))
         except (ValueError, TypeError) as error:
-            raise Refusal(
+            raise AdqlRefusal(
                 f"IN_UNIT: {quoted(found.unit)} of {value.name} is not to be had in "
                 f"{quoted(wanted.name)}",
                 part,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from sqlglot import exp
 
 from starcat.errors import quoted, suggest
-from starcat_service.protocols.adql_grammar import Refusal
-from starcat_service.protocols.tables import Column, Tables
+from starcat_service.protocols.adql_grammar import AdqlRefusal
+from starcat_service.protocols.tables import Tables, TapColumn
 
-Columns = tuple[Column, ...]
+Columns = tuple[TapColumn, ...]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Names:
         if found is None:
             given = f"{table.db}.{table.name}" if table.db else table.name
             known = self._tables.names()
-            raise Refusal(
+            raise AdqlRefusal(
                 f"no table {quoted(given)}; {suggest(given, known)}TAP_SCHEMA.tables lists the "
                 f"{len(known)} that there are, each with its schema",
                 table,
@@ -65,7 +65,7 @@ class Names:
             query = query.this
         if not isinstance(query, exp.Select):
             return None
-        found: list[Column] = []
+        found: list[TapColumn] = []
         for number, part in enumerate(query.expressions, start=1):
             more = self._projected(query, part, number)
             if more is None:
@@ -73,7 +73,7 @@ class Names:
             found += more
         return tuple(found)
 
-    def column(self, column: exp.Column) -> Column | None:
+    def column(self, column: exp.Column) -> TapColumn | None:
         """Return what is known of a column that is named in a query."""
         for select in self._around(column):
             found = self._in(select, column)
@@ -99,7 +99,7 @@ class Names:
         if column.name.lower() in known:
             return
         where = f" in {quoted(column.table)}" if column.table else ""
-        raise Refusal(
+        raise AdqlRefusal(
             f"no column {quoted(column.name)}{where}; {suggest(column.name.lower(), known)}"
             f"{'there are ' + ', '.join(sorted(known)[:12]) if known else 'no table has the name'}",
             column,
@@ -170,14 +170,14 @@ class Names:
             child, parent = parent, parent.parent
         return None
 
-    def _projected(self, query: exp.Select, part: exp.Expr, number: int) -> list[Column] | None:
+    def _projected(self, query: exp.Select, part: exp.Expr, number: int) -> list[TapColumn] | None:
         if isinstance(part, exp.Star) or (isinstance(part, exp.Column) and part.name == "*"):
             joins = query.args.get("joins", ())
             if any(join.args.get("using") or join.args.get("method") for join in joins):
                 return None
             table = part.table.lower() if isinstance(part, exp.Column) else ""
             chosen = [s for s in self.sources(query) if not table or s.name == table]
-            found: list[Column] = []
+            found: list[TapColumn] = []
             for source in chosen:
                 if source.columns is None:
                     return None
@@ -186,9 +186,9 @@ class Names:
         value = part.this if isinstance(part, exp.Alias) else part
         name = part.alias or _default_name(value, number)
         known = self._in(query, value) if isinstance(value, exp.Column) else None
-        return [known.named(name) if known else Column.unknown(name)]
+        return [known.named(name) if known else TapColumn.unknown(name)]
 
-    def _in(self, select: exp.Select, column: exp.Column) -> Column | None:
+    def _in(self, select: exp.Select, column: exp.Column) -> TapColumn | None:
         table = column.table.lower()
         for source in self.sources(select):
             if table and table != source.name:

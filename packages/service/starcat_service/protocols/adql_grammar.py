@@ -136,7 +136,7 @@ class _Parser(parser.Parser):
 
 
 @dataclass(eq=False, repr=False)
-class Refusal(QueryError):  # noqa: N818 - the name reads as the fact
+class AdqlRefusal(QueryError):  # noqa: N818 - the name reads as the fact
     """What is wrong with a part of a query."""
 
     part: exp.Expr
@@ -190,7 +190,7 @@ def refusals_of(text: str) -> Iterator[None]:
     """Raise what is wrong with a query as QueryError, with its line and a mark at the place."""
     try:
         yield
-    except Refusal as error:
+    except AdqlRefusal as error:
         raise error.shown_in(text) from error
     except ParseError as error:
         raise _refusal(error, text) from error
@@ -224,32 +224,32 @@ def _check_part(part: exp.Expr) -> None:
     allowed = _ARGUMENTS.get(type(part))
     if allowed is None:
         told = _ADVICE.get(part.key, f"{part.key.upper()} is not ADQL 2.1")
-        raise Refusal(f"no ADQL: {told}", part)
+        raise AdqlRefusal(f"no ADQL: {told}", part)
     for name, value in part.args.items():
         if value and name not in allowed:
             name = name.rstrip("_")
             told = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
-            raise Refusal(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part)
+            raise AdqlRefusal(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part)
     if isinstance(part, (exp.Limit, exp.Offset)):
         _check_rows(part)
     if isinstance(part, exp.Table) and not isinstance(part.this, exp.Identifier):
-        raise Refusal("no ADQL: FROM takes tables and queries in parentheses", part)
+        raise AdqlRefusal("no ADQL: FROM takes tables and queries in parentheses", part)
     if isinstance(part, exp.Distinct) and len(part.expressions) > 1:
-        raise Refusal("no ADQL: DISTINCT takes one value here", part)
+        raise AdqlRefusal("no ADQL: DISTINCT takes one value here", part)
     if isinstance(part, exp.Identifier) and not part.args.get("quoted"):
         _check_name(part)
     if isinstance(part, exp.Join) and str(part.args.get("kind") or "").upper() not in (
         "", "INNER", "OUTER", "CROSS",
     ):  # fmt: skip
-        raise Refusal(f"no ADQL: {part.args['kind']} JOIN", part)
+        raise AdqlRefusal(f"no ADQL: {part.args['kind']} JOIN", part)
 
 
 def _check_rows(part: exp.Limit | exp.Offset) -> None:
     name = "TOP" if part.meta.get("top") else part.key.upper()
     if not _is_whole(part.expression):
-        raise Refusal(f"{name} needs a whole number", part)
+        raise AdqlRefusal(f"{name} needs a whole number", part)
     if len(part.expression.name) > MAX_DIGITS:
-        raise Refusal(
+        raise AdqlRefusal(
             f"{name} has {len(part.expression.name)} digits; no table has so many rows, and at "
             f"most {MAX_DIGITS} are read",
             part,
@@ -270,7 +270,7 @@ def _is_whole(node: exp.Expr) -> bool:
 
 def _check_name(part: exp.Identifier) -> None:
     if not _NAME.fullmatch(part.name):
-        raise Refusal(
+        raise AdqlRefusal(
             f"no ADQL: {quoted(part.name)} is no name: it has letters, digits and underscores "
             'and begins with a letter; write others in double quotes, as "2mass"',
             part,

@@ -12,7 +12,7 @@ from sqlglot import exp
 from starcat.errors import quoted
 from starcat_service.protocols import adql_geometry as geometry
 from starcat_service.protocols.adql_geometry import Circle, Point, Polygon, Shape, Zone
-from starcat_service.protocols.adql_grammar import Refusal
+from starcat_service.protocols.adql_grammar import AdqlRefusal
 
 MAX_CORNERS = 400  # corners of a polygon at most
 MAX_CHARACTERS = 1_000_000
@@ -71,7 +71,7 @@ def check_count(part: exp.Anonymous, least: int, most: int) -> None:
     found = len(part.expressions)
     if not least <= found <= most:
         many = str(least) if least == most else f"{least} to {most}"
-        raise Refusal(f"{part.name.upper()} takes {many} arguments; found {found}", part)
+        raise AdqlRefusal(f"{part.name.upper()} takes {many} arguments; found {found}", part)
 
 
 class GeometryCalls:
@@ -91,7 +91,7 @@ class GeometryCalls:
             try:
                 asked = _CONDITIONS[name](*self._shapes_of(part, 2))
             except ValueError as error:
-                raise Refusal(f"{name}: {error}", part) from None
+                raise AdqlRefusal(f"{name}: {error}", part) from None
             number = raw(f"CAST({asked} AS INTEGER)")
             number.meta[_CONDITION] = asked
             part.replace(number)
@@ -101,7 +101,7 @@ class GeometryCalls:
         elif name in _MEASURES:
             shapes = self._shapes_of(part, 2 if name == "DISTANCE" else 1)
             if name in _OF_POINTS and not all(isinstance(shape, Point) for shape in shapes):
-                raise Refusal(f"{name} takes a POINT", part)
+                raise AdqlRefusal(f"{name} takes a POINT", part)
             if name == "DISTANCE":
                 _replace_distance(part, *shapes)
             else:
@@ -114,14 +114,14 @@ class GeometryCalls:
         found = [shape_of(argument) for argument in part.expressions]
         shapes = [shape for shape in found if shape is not None]
         if len(shapes) < count:
-            raise Refusal(
+            raise AdqlRefusal(
                 f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, CENTROID, written "
                 "out as its arguments",
                 part,
             )
         self._characters += geometry.characters(shapes)
         if self._characters > MAX_CHARACTERS:
-            raise Refusal(
+            raise AdqlRefusal(
                 f"{name} takes too much arithmetic; give polygons fewer corners, or numbers "
                 "instead of columns, and work middles out in a query in parentheses",
                 part,
@@ -145,7 +145,9 @@ def _in_icrs(part: exp.Anonymous, shape: Shape) -> Shape:
     if not is_text(first) or first.name.upper().split(" ")[0] != "GALACTIC":
         return shape
     if isinstance(shape, Zone):
-        raise Refusal("a galactic BOX is less than half a turn wide, and not beyond a pole", part)
+        raise AdqlRefusal(
+            "a galactic BOX is less than half a turn wide, and not beyond a pole", part
+        )
     return geometry.from_galactic(shape)
 
 
@@ -156,7 +158,7 @@ def _centred(part: exp.Anonymous) -> Shape:
     made = _made(name, [*_place_or_number(first), *map(_operand, others)])
     if made is None or not isinstance(shape_of(first), (Point, type(None))):
         many = "1 more number" if name == "CIRCLE" else "2 more numbers"
-        raise Refusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
+        raise AdqlRefusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
     # A place that is given as POINT is in ICRS already.
     return made if shape_of(first) is not None else _in_icrs(part, made)
 
@@ -165,18 +167,20 @@ def _polygon(part: exp.Anonymous) -> Shape:
     arguments = _without_frame(part)
     shapes = [shape_of(argument) for argument in arguments]
     if any(shapes) and not all(isinstance(shape, Point) for shape in shapes):
-        raise Refusal("POLYGON takes places or numbers, and not both", part)
+        raise AdqlRefusal("POLYGON takes places or numbers, and not both", part)
     numbers = [number for argument in arguments for number in _place_or_number(argument)]
     if len(numbers) % 2:
-        raise Refusal("POLYGON takes pairs of numbers", part)
+        raise AdqlRefusal("POLYGON takes pairs of numbers", part)
     made = _made("POLYGON", numbers)
     if made is None:
-        raise Refusal(f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part)
+        raise AdqlRefusal(
+            f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part
+        )
     return made if any(shapes) else _in_icrs(part, made)
 
 
 def _region(part: exp.Anonymous) -> Shape:
-    raise Refusal("REGION is not supported; write CIRCLE, BOX or POLYGON with numbers", part)
+    raise AdqlRefusal("REGION is not supported; write CIRCLE, BOX or POLYGON with numbers", part)
 
 
 def _made(name: str, numbers: list[str]) -> Shape | None:
@@ -197,7 +201,7 @@ def _made(name: str, numbers: list[str]) -> Shape | None:
 def _numbers(part: exp.Anonymous, count: int) -> list[str]:
     arguments = _without_frame(part)
     if len(arguments) != count or any(map(shape_of, arguments)):
-        raise Refusal(f"{part.name.upper()} takes {count} numbers, degrees", part)
+        raise AdqlRefusal(f"{part.name.upper()} takes {count} numbers, degrees", part)
     return [_operand(argument) for argument in arguments]
 
 
@@ -207,11 +211,11 @@ def _without_frame(part: exp.Anonymous) -> list[exp.Expr]:
     if arguments and is_text(arguments[0]):
         frame = arguments.pop(0).name.upper()
         if frame.split(" ")[0] not in FRAMES:
-            raise Refusal(
+            raise AdqlRefusal(
                 f"the frame {quoted(frame)} is not known here; use ICRS or GALACTIC", part
             )
     if any(is_text(argument) for argument in arguments):
-        raise Refusal(f"{part.name.upper()} takes numbers, degrees", part)
+        raise AdqlRefusal(f"{part.name.upper()} takes numbers, degrees", part)
     return arguments
 
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from starcat.errors import ConfigError, TargetMissing
 from starcat.exchange.columns import described, field_facts
 from starcat.exchange.formats import Format, response_format
-from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
+from starcat.query.names import sql_quoted as sql_text
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat_service.protocols.parameters import parameter_error

@@ -42,10 +42,10 @@ from starcat_service.protocols.adql import EXTENSIONS, USER_FUNCTIONS
 from starcat_service.protocols.adql_shapes import GEOMETRY
 from starcat_service.protocols.tables import (
     NAME,
-    Column,
     Schema,
-    Table,
     Tables,
+    TapColumn,
+    TapTable,
     adql_name,
     full_name,
 )
@@ -207,7 +207,7 @@ def for_tap_plus(tables: bytes) -> bytes:
     return named.replace(b"<column>", b'<column esatapplus:flags="0">')
 
 
-def table_document(table: Table) -> bytes:
+def table_document(table: TapTable) -> bytes:
     """Return a table with its columns."""
     made = _described(VOSITable(**_about(table, True)), table.description)
     return document(made, skip_empty=True)
@@ -228,7 +228,7 @@ def _described(element: Element, text: str) -> Element:
     return element
 
 
-def _about(table: Table, with_columns: bool) -> dict[str, Any]:
+def _about(table: TapTable, with_columns: bool) -> dict[str, Any]:
     about: dict[str, Any] = {"table_type": "table", "table_name": full_name(table)}
     if not with_columns:
         return about
@@ -256,7 +256,7 @@ def _about(table: Table, with_columns: bool) -> dict[str, Any]:
     return {**about, "column": columns, "foreign_key": keys}
 
 
-def _flags(column: Column) -> list[str]:
+def _flags(column: TapColumn) -> list[str]:
     flags = {"principal": column.is_principal, "indexed": column.is_indexed}
     return [name for name, is_so in {**flags, "std": column.is_standard}.items() if is_so]
 
@@ -300,5 +300,5 @@ def examples_page(tables: Tables) -> str:
     )
 
 
-def _has(table: Table, *names: str) -> bool:
+def _has(table: TapTable, *names: str) -> bool:
     return set(names) <= {column.name for column in table.columns}

@@ -35,7 +35,7 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class Question:
+class TapQuestion:
     """What a request asks."""
 
     query: str
@@ -77,7 +77,7 @@ def parameter_error(key: str, value: str | None, told: str) -> ConfigError:
     return ConfigError(f"{key} is {quoted(value or '')}; {told}", key=key, value=value)
 
 
-def question(given: Parameters, most_rows: int) -> Question:
+def question(given: Parameters, most_rows: int) -> TapQuestion:
     """Return what a request asks."""
     request = given.one("REQUEST")
     if request not in (None, "doQuery"):
@@ -93,7 +93,7 @@ def question(given: Parameters, most_rows: int) -> Question:
             "QUERY is missing; it has the query in ADQL, such as SELECT * FROM tap_schema.tables",
             key="QUERY",
         )
-    return Question(
+    return TapQuestion(
         query,
         response_format(given.one("RESPONSEFORMAT") or given.one("FORMAT")),
         max_rows(given.one("MAXREC"), most_rows),

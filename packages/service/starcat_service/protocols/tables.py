@@ -44,7 +44,7 @@ _TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
 
 
 @dataclass(frozen=True)
-class Column:
+class TapColumn:
     """A column as TAP_SCHEMA and VOTable describe it."""
 
     name: str  # as the table has it, without quotes
@@ -73,12 +73,12 @@ class Column:
         }
         return {key: text for key, text in known.items() if text}
 
-    def named(self, name: str) -> Column:
+    def named(self, name: str) -> TapColumn:
         """Return the same under another name."""
         return replace(self, name=name)
 
     @classmethod
-    def unknown(cls, name: str) -> Column:
+    def unknown(cls, name: str) -> TapColumn:
         """Return a column of which its name is known: the unit is that which it ends with."""
         return cls(name, unit=column_facts(name, {}).get("unit", ""))
 
@@ -95,13 +95,13 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Table:
+class TapTable:
     """A table."""
 
     # As the session has them, without quotes.
     schema: str
     name: str
-    columns: tuple[Column, ...]
+    columns: tuple[TapColumn, ...]
     description: str = ""
     keys: tuple[Key, ...] = ()  # references to other tables
     view: str = ""  # name of its view in a session, where it has another; else empty
@@ -113,7 +113,7 @@ class Schema:
 
     name: str
     description: str
-    tables: tuple[Table, ...]
+    tables: tuple[TapTable, ...]
     is_alias: bool = False  # whether its tables are those of another schema as well
 
 
@@ -124,7 +124,7 @@ class Tables:
         self.schemas = schemas
         self._found = {(t.schema.lower(), t.name.lower()): t for t in self}
 
-    def __iter__(self) -> Iterator[Table]:
+    def __iter__(self) -> Iterator[TapTable]:
         """Go through all tables."""
         for schema in self.schemas:
             yield from schema.tables
@@ -143,7 +143,7 @@ class Tables:
                 schemas.append(replace(schema, tables=kept))
         return Tables(tuple(schemas))
 
-    def find(self, schema: str, name: str) -> Table | None:
+    def find(self, schema: str, name: str) -> TapTable | None:
         """Return a table."""
         if schema:
             return self._found.get((schema.lower(), name.lower()))
@@ -160,7 +160,7 @@ class Tables:
         return [full_name(table) for table in self]
 
 
-def full_name(table: Table) -> str:
+def full_name(table: TapTable) -> str:
     """Return the name of a table as ADQL writes it."""
     return f"{adql_name(table.schema)}.{adql_name(table.name)}"
 
@@ -278,11 +278,11 @@ _KEYS = {
 def own_schema() -> Schema:
     """Return TAP_SCHEMA itself, as it says of itself."""
     tables = tuple(
-        Table(
+        TapTable(
             NAME,
             name,
             tuple(
-                Column(column, *kind, description=told, is_standard=True)
+                TapColumn(column, *kind, description=told, is_standard=True)
                 for column, (kind, told) in columns.items()
             ),
             _ABOUT[name],
@@ -308,7 +308,7 @@ def session_schemas(session: Session, about: Mapping[str, str]) -> tuple[Schema,
     return tuple(sorted(found, key=lambda schema: schema.name))
 
 
-def _table(session: Session, schema: str, view: View) -> Table:
+def _table(session: Session, schema: str, view: View) -> TapTable:
     with session.ask(f'SELECT * FROM "{schema}"."{view.name}"') as asked:
         found = asked.columns
     known = facts_by_name([view])
@@ -317,7 +317,7 @@ def _table(session: Session, schema: str, view: View) -> Table:
     for name, kind in found:
         facts = column_facts(name, known)
         columns.append(
-            Column(
+            TapColumn(
                 name,
                 *votable_type(kind),
                 unit=_unit(name, facts.get("unit", "")),
@@ -327,7 +327,9 @@ def _table(session: Session, schema: str, view: View) -> Table:
                 is_principal=name in (*first, *view.position, "mag", "designation"),
             )
         )
-    return Table(schema, view.name, tuple(columns), view.schema.description if view.schema else "")
+    return TapTable(
+        schema, view.name, tuple(columns), view.schema.description if view.schema else ""
+    )
 
 
 def _unit(column: str, text: str) -> str:
@@ -373,7 +375,7 @@ def _rows(tables: Tables) -> dict[str, list[dict[str, object]]]:
     return rows
 
 
-def _column_rows(table: Table) -> list[dict[str, object]]:
+def _column_rows(table: TapTable) -> list[dict[str, object]]:
     return [
         _row(
             column,
@@ -388,6 +390,6 @@ def _column_rows(table: Table) -> list[dict[str, object]]:
     ]
 
 
-def _row(about: Schema | Table | Column | Key, **more: object) -> dict[str, object]:
+def _row(about: Schema | TapTable | TapColumn | Key, **more: object) -> dict[str, object]:
     """Return a row; of its values those are written that the table has a column for."""
     return {**{key: value or None for key, value in vars(about).items()}, **more}

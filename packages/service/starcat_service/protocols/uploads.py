@@ -19,12 +19,12 @@ import pyarrow.parquet as pq
 from starcat.errors import ConfigError, quoted
 from starcat.query.names import identifier
 from starcat.storage.parquet import ARROW_DATATYPES
-from starcat_service.protocols.tables import UPLOADS, Column, Table
+from starcat_service.protocols.tables import UPLOADS, TapColumn, TapTable
 
 MAX_COLUMNS = 1000
 
 MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
-LEAST_UNPACKED_BYTES = 64 << 20
+MIN_UNPACKED_BYTES = 64 << 20
 
 _BYTES = {
     "boolean": 1, "bit": 1, "unsignedByte": 1, "short": 2, "int": 4, "long": 8, "char": 1,
@@ -49,19 +49,19 @@ def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
         told = " ".join(str(field.description or "").split())
         unit = str(field.unit) if field.unit is not None else ""
         columns.append(
-            Column(field.name, datatype, size, field.xtype or "", unit, field.ucd or "", told)
+            TapColumn(field.name, datatype, size, field.xtype or "", unit, field.ucd or "", told)
         )
     names = [column.name for column in columns]
     _check_names(names, name)
     pq.write_table(pa.table(arrays, names=names), Path(folder) / f"{name}.parquet")
     told = f"The uploaded table {name}"
-    return asdict(Table(UPLOADS, name, tuple(columns), told, view=identifier(name)))
+    return asdict(TapTable(UPLOADS, name, tuple(columns), told, view=identifier(name)))
 
 
-def table_of_facts(facts: dict[str, Any]) -> Table:
+def table_of_facts(facts: dict[str, Any]) -> TapTable:
     """Return the table that `upload_facts` described."""
-    columns = tuple(Column(**column) for column in facts["columns"])
-    return Table(**{**facts, "columns": columns, "keys": ()})
+    columns = tuple(TapColumn(**column) for column in facts["columns"])
+    return TapTable(**{**facts, "columns": columns, "keys": ()})
 
 
 def _parsed(path: Path, name: str) -> Any:
@@ -161,7 +161,7 @@ class _Inspection:
                 raise
             raise _refusal(self.name, f"is no XML that can be read ({error})") from error
         rows = max(self.rows, self.stated_rows)
-        most = max(LEAST_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
+        most = max(MIN_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
         if rows * self.width > most:
             raise _refusal(
                 self.name,

@@ -19,7 +19,7 @@ from starcat.query.session import Limits, Session, open_session
 from starcat.storage.atomic import make_folder
 from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.limiter import Limiter
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 SHORT_PLACES = 6
 """Queries that run at the same time beside `Settings.queries` that take long."""
@@ -200,7 +200,7 @@ class QueryPool:
     in a thread, when there is a place for it.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: ServiceSettings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         rows_bytes = round(settings.rows_mib * 2**20)
         self._limits = Limits(

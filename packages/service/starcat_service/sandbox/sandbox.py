@@ -24,7 +24,7 @@ from starcat.workers.process import WorkerProcess
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
 from starcat_service.sandbox.pool import Pool
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 GIB = 2**30
 
@@ -39,7 +39,7 @@ class _OutOfMemory(Problem):
 class Sandbox:
     """Processes that do one task after the other; `run` calls what uses `call` in a thread."""
 
-    def __init__(self, settings: Settings, scratch: Path) -> None:
+    def __init__(self, settings: ServiceSettings, scratch: Path) -> None:
         self._time_s = settings.query_time_s
         self._scratch = scratch
         self._memory_bytes = int(settings.query_memory_gib * GIB)

@@ -27,7 +27,7 @@ MATCHERS = 4
 """Databases that are kept open with the options that they were opened with."""
 
 
-def identify(
+def identify_confined(
     folder: str,
     file: str,
     artifact: str,
@@ -101,7 +101,7 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
         return write_batches(stream, Path(target), form, named)
 
 
-def flight_image(artifact: str, target: str, method: str, endian: str) -> int:
+def make_flight_image(artifact: str, target: str, method: str, endian: str) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
     from starcat.exchange.onboard import export_image
 
@@ -110,9 +110,9 @@ def flight_image(artifact: str, target: str, method: str, endian: str) -> int:
 
 
 TASKS: dict[str, Callable[..., Any]] = {
-    "identify": identify,
+    "identify": identify_confined,
     "convert": convert,
-    "flight_image": flight_image,
+    "flight_image": make_flight_image,
     "upload": upload_facts,
 }
 

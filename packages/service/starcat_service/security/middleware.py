@@ -33,8 +33,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starcat_service.problems import Problem, as_json, outage_of, problem_response
 from starcat_service.sandbox.limiter import asker
 from starcat_service.security.metrics import Metrics
-from starcat_service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, address_of
-from starcat_service.settings import Settings
+from starcat_service.security.request_limits import OWN_CONNECTIONS, BodyLimits, Shares, client_ip
+from starcat_service.settings import ServiceSettings
 
 ID_HEADER = "X-Request-ID"
 GIVEN_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -163,7 +163,7 @@ def _log_request(scope: Scope, status: int, sent: int, taken_s: float) -> None:
         "status": status,
         "bytes": sent,
         "seconds": round(taken_s, 4),
-        "address": address_of(scope),
+        "address": client_ip(scope),
         "who": getattr(principal, "name", None),
     }
     level = logging.ERROR if status >= 500 else logging.INFO
@@ -173,7 +173,7 @@ def _log_request(scope: Scope, status: int, sent: int, taken_s: float) -> None:
 class SafeHeaders(_HttpMiddleware):
     """Adds what browsers keep to. A handler's own policy stays as it is."""
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         super().__init__(app)
         self._headers = dict(ALWAYS)
         if settings.is_secure:

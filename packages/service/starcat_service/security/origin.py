@@ -16,7 +16,7 @@ from starlette.types import Scope
 
 from starcat_service.access import session_in
 from starcat_service.problems import Problem
-from starcat_service.settings import Settings
+from starcat_service.settings import ServiceSettings
 
 SAFE = ("GET", "HEAD", "OPTIONS")
 HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P<port>\d{1,5}))?")
@@ -25,7 +25,7 @@ HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P
 class Origins:
     """Refuses requests to other names, and those that other sites have made a browser send."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
         self._names = _known_names(settings)
 
@@ -70,7 +70,7 @@ class Origins:
         return None
 
 
-def _known_names(settings: Settings) -> frozenset[str] | None:
+def _known_names(settings: ServiceSettings) -> frozenset[str] | None:
     if not settings.is_loopback and settings.public_url is None:
         return None
     names = {"localhost", settings.host.lower()}

@@ -20,9 +20,9 @@ from starlette.requests import HTTPConnection
 from starlette.types import Message, Receive, Scope
 
 from starcat_service.problems import Problem
-from starcat_service.settings import Role, Settings
+from starcat_service.settings import Role, ServiceSettings
 
-MOST_HEADERS, MOST_HEADER_BYTES, MOST_TARGET_BYTES = 100, 32_768, 16_384
+MAX_HEADERS, MAX_HEADER_BYTES, MAX_TARGET_BYTES = 100, 32_768, 16_384
 
 CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 UPWARDS = re.compile(r"(^|[/\\])\.{1,2}($|[/\\])")
@@ -38,7 +38,7 @@ CHECKED = ("/api/upload",)
 """Paths that take files of somebody without a token in a header: the body has a session, and the
 handler checks it before it reads the file. Elsewhere such a body is at most `TEXT_MIB`."""
 
-LEAST_FREE_GIB = 0.01
+MIN_FREE_GIB = 0.01
 """Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
 
 FILLING = ("/tap/async",)
@@ -50,7 +50,7 @@ CONNECTIONS = 1_000
 OWN_CONNECTIONS = CONNECTIONS // 5
 """Connections of one address, and requests of one user, at the same time."""
 
-MOST_BUCKETS = 10_000
+MAX_BUCKETS = 10_000
 """Keys that are remembered; of more, those that were quiet for longest are forgotten."""
 
 
@@ -72,7 +72,7 @@ class Buckets:
             left = min(self._size, left + (now_s - then_s) * self._per_s)
             wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
             self._left[key] = (left if wait_s else left - 1.0), now_s
-            if len(self._left) > MOST_BUCKETS:
+            if len(self._left) > MAX_BUCKETS:
                 self._left.popitem(last=False)
             return wait_s
 
@@ -107,7 +107,7 @@ def later(wait_s: float) -> Mapping[str, str]:
     return {"Retry-After": str(max(1, math.ceil(wait_s)))}
 
 
-def address_of(scope: Scope) -> str:
+def client_ip(scope: Scope) -> str:
     """Return the address that a request came from, as far as the server knows it."""
     client = HTTPConnection(scope).client
     return client.host if client is not None else "unknown"
@@ -122,16 +122,16 @@ def check_shape(scope: Scope) -> None:
         raise Problem(
             405, f"the method is none of {allowed}; use one of them", headers={"Allow": allowed}
         )
-    if len(scope.get("raw_path") or b"") + len(query) > MOST_TARGET_BYTES:
+    if len(scope.get("raw_path") or b"") + len(query) > MAX_TARGET_BYTES:
         raise Problem(
-            414, f"the address has more than {MOST_TARGET_BYTES:,} bytes; send a long query by POST"
+            414, f"the address has more than {MAX_TARGET_BYTES:,} bytes; send a long query by POST"
         )
     size = sum(len(name) + len(value) for name, value in headers)
-    if len(headers) > MOST_HEADERS or size > MOST_HEADER_BYTES:
+    if len(headers) > MAX_HEADERS or size > MAX_HEADER_BYTES:
         raise Problem(
             431,
-            f"the request has {len(headers)} headers of {size:,} bytes; at most {MOST_HEADERS} of "
-            f"{MOST_HEADER_BYTES:,} bytes together are taken",
+            f"the request has {len(headers)} headers of {size:,} bytes; at most {MAX_HEADERS} of "
+            f"{MAX_HEADER_BYTES:,} bytes together are taken",
         )
     if CONTROL.search(path) or UPWARDS.search(path) or "\\" in path:
         raise Problem(
@@ -150,7 +150,7 @@ def _is_doubtful(values: Iterable[bytes]) -> bool:
 class BodyLimits:
     """How large a body may be, in what time it has to come, and that the disk has room for it."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
 
     def limited(self, scope: Scope, receive: Receive) -> Receive:
@@ -168,23 +168,23 @@ class BodyLimits:
         if length is not None and not (length.isascii() and length.isdigit()):
             raise Problem(400, "the header Content-Length is no number")
         if length is not None and int(length) > most:
-            raise Problem(413, too_large(most))
+            raise Problem(413, request_too_large(most))
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
         if fills and scope["method"] != "DELETE":
             check_disk(self.settings)
         return _limited(receive, most, self.settings.upload_time_s)
 
 
-def check_disk(settings: Settings) -> None:
+def check_disk(settings: ServiceSettings) -> None:
     """Refuse what would add to a disk that is nearly full."""
     short = disk_shortage(settings)
     if short is not None:
         raise Problem(507, short)
 
 
-def disk_shortage(settings: Settings) -> str | None:
+def disk_shortage(settings: ServiceSettings) -> str | None:
     """Return what to say where the disk is nearly full."""
-    free, least = free_gib(settings.root), max(settings.free_gib, LEAST_FREE_GIB)
+    free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
     if free >= least:
         return None
     return (
@@ -198,7 +198,7 @@ def free_gib(folder: Path) -> float:
     return shutil.disk_usage(folder).free / GIB
 
 
-def too_large(most: int) -> str:
+def request_too_large(most: int) -> str:
     """Return what is said of a body with more bytes than it may have."""
     return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
 
@@ -228,7 +228,7 @@ def _limited(receive: Receive, most: int, time_s: float) -> Receive:
         got += len(message.get("body", b""))
         is_whole = not message.get("more_body", False)
         if got > most:
-            raise HTTPException(413, too_large(most), {"Connection": "close"})
+            raise HTTPException(413, request_too_large(most), {"Connection": "close"})
         return message
 
     return receive_limited

@@ -24,7 +24,7 @@ from starcat_service.protocols.cone import (
     with_ucds,
 )
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import chunks_of
+from starcat_service.transfers import file_chunks
 from starcat_service.vo.tap import HELD_BYTES, VOTableRoute, in_address
 
 
@@ -78,7 +78,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     """
     asked = cone_request(request.query_params.multi_items())
     found = await service.query_pool.run(_answer, service, catalog, asked)
-    return StreamingResponse(chunks_of(found), headers={"Content-Type": asked.media_type})
+    return StreamingResponse(file_chunks(found), headers={"Content-Type": asked.media_type})
 
 
 def _target_of(service: Service, name: str) -> tuple[Path, Label]:

@@ -38,7 +38,7 @@ from starcat_service.protocols.documents import (
     table_document,
     tableset,
 )
-from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, Question, question
+from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, TapQuestion, question
 from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service, TheService, service_of
 from starcat_service.transfers import body_type, scratch_folder
@@ -287,7 +287,9 @@ async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
     return answer
 
 
-def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> tuple[bytes, Spool]:
+def _begun(
+    service: Service, asked: TapQuestion, given: TapRequest, owner: str
+) -> tuple[bytes, Spool]:
     """Return the first part of an answer, and what gives the others."""
     gone = threading.Event()
 

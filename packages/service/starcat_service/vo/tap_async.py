@@ -48,7 +48,7 @@ TheJob = Annotated[JobFacts, Depends(own_job)]
 
 
 @router.get("", summary="Jobs of who asks (UWS)")
-def list_jobs(
+def list_tap_jobs(
     request: Request,
     service: TheService,
     who: Reader,

@@ -19,15 +19,15 @@ from starcat.progress import Progress, no_progress
 from starcat.store.layout import is_store
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
-from starcat_service.protocols.adql import ask, translate
+from starcat_service.protocols.adql import translate, translate_adql
 from starcat_service.protocols.documents import ServiceLimits
-from starcat_service.protocols.parameters import Question, Upload
+from starcat_service.protocols.parameters import TapQuestion, Upload
 from starcat_service.protocols.tables import (
     NAME,
     UPLOADS,
     Schema,
-    Table,
     Tables,
+    TapTable,
     own_schema,
     session_schemas,
     write_tap_schema,
@@ -35,8 +35,8 @@ from starcat_service.protocols.tables import (
 from starcat_service.protocols.uploads import table_of_facts
 from starcat_service.sandbox.pool import QueryPool
 from starcat_service.sandbox.sandbox import Sandbox
-from starcat_service.settings import Settings
-from starcat_service.transfers import chunks_of, scratch_folder, write_rows
+from starcat_service.settings import ServiceSettings
+from starcat_service.transfers import file_chunks, scratch_folder, write_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,7 +61,7 @@ class Tap:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: ServiceSettings,
         paths: ServicePaths,
         library: Library,
         query_pool: QueryPool,
@@ -136,7 +136,7 @@ class Tap:
 
     def answer(
         self,
-        asked: Question,
+        asked: TapQuestion,
         files: Mapping[str, Path],
         time_s: float | None = None,
         progress: Progress | Callable[..., None] = no_progress,
@@ -145,7 +145,7 @@ class Tap:
         with self._state_with(asked.uploads, files) as state:
             translated = translate(asked.query, state.tables)
             with self._query_pool.session(state.targets, time_s) as session:
-                batches = ask(session, translated, asked.max_rows, progress)
+                batches = translate_adql(session, translated, asked.max_rows, progress)
                 yield from self.chunks(batches, asked.form, asked.max_rows, _LABEL)
 
     def chunks(
@@ -163,7 +163,7 @@ class Tap:
             rows, result = folder / "rows.arrow", folder / f"result{form.suffix}"
             write_rows(batches, rows, max_rows)
             self._sandbox.convert(rows, result, form.name, label)
-            chunks = chunks_of(result.open("rb"))
+            chunks = file_chunks(result.open("rb"))
         yield from chunks
 
     @contextmanager
@@ -191,7 +191,7 @@ class Tap:
             state = self.state()
             yield TapState((*state.targets, folder), state.tables.with_schema(uploaded))
 
-    def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
+    def _read(self, file: Path, upload: Upload, folder: Path) -> TapTable:
         given = {"path": str(file), "name": upload.table, "folder": str(folder)}
         return table_of_facts(self._sandbox.call("upload", given))
 
