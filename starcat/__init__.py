@@ -36,7 +36,7 @@ if TYPE_CHECKING:
         simulate,
         verify,
     )  # fmt: skip
-    from starcat.api.matcher import PublicMatcher
+    from starcat.api.matcher import Matcher
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
     from starcat.matcher.tracking import Tracker
@@ -87,7 +87,7 @@ _HOMES = {
     "ingest": ("starcat.api.functions", "ingest"),
     "init": ("starcat.api.functions", "init"),
     "learn": ("starcat.api.functions", "learn"),
-    "open": ("starcat.api.artifact", "open_artifact"),
+    "open": ("starcat.api.artifact", "open_for_query"),
     "preset": ("starcat.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),

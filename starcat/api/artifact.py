@@ -12,7 +12,7 @@ from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
-    from starcat.api.matcher import PublicMatcher
+    from starcat.api.matcher import Matcher
     from starcat.artifact.verify import Verification
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
@@ -25,7 +25,7 @@ class Artifact(reader.DatabaseFolder):
     ``folder`` is where it is, ``manifest`` what it is made of: spec, sources, products, digests.
     """
 
-    def matcher(self, method: str | None = None, **limits: Any) -> PublicMatcher:
+    def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
         """Open the database for identifying stars.
 
         Parameters
@@ -40,9 +40,9 @@ class Artifact(reader.DatabaseFolder):
         Matcher
             Ready to identify. Needs numpy and h5py only.
         """
-        from starcat.api.matcher import PublicMatcher
+        from starcat.api.matcher import Matcher
 
-        return PublicMatcher.open(self.folder, method, **limits)
+        return Matcher.open(self.folder, method, **limits)
 
     def sql(self, text: str, **values: Any) -> QueryResult:
         """Run a query over the products.

@@ -11,7 +11,7 @@ from starcat.matcher.result import MatchResult
 from starcat.version import missing_packages
 
 
-class PublicMatcher(matcher.Matcher):
+class Matcher(matcher.Matcher):
     """`starcat.matcher.matcher.Matcher`, whose `identify` also takes the path of a file."""
 
     def _identify_file(self, path: Path, camera: Camera | None) -> MatchResult:

@@ -1,4 +1,4 @@
-"""What a query finds: its first rows as a `ResultTable`, all rows as an `QueryResult` or as they come.
+"""What a query finds: its first rows as a `ResultTable`, or all rows as a `QueryResult`.
 
 A column keeps the unit and the meaning of the product's column whose name it has. Any other column
 gets the unit that its name ends with, as everywhere in starcat: ``x_deg`` is in degrees.

@@ -57,7 +57,7 @@ _PLACE = (
 
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
-    """Read a star catalog from a store or from archive files; what is chosen is as for `ingest_catalog`."""
+    """Read a star catalog from a store or archive files; ``chosen`` goes to `ingest_catalog`."""
     here = brought(source_name, paths, **chosen)
     stores = [open_store(path) for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None

@@ -93,8 +93,8 @@ def _curve(
             experiment = _experiment(f"{group}-{value:g}", method, attitudes, _noise(group, value))
             published, wanted = (percent, goal) if is_last and is_own else (None, None)
             made.append(
-                ExperimentRow(group, f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
-                    PRESET, experiment, "reference", published, None, wanted, x=value)
+                ExperimentRow(group,
+                    f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}", PRESET, experiment, "reference", published, None, wanted, x=value)
             )  # fmt: skip
     return made
 
@@ -112,7 +112,8 @@ def _no_star_vanishes(grid: Attitudes) -> ExperimentRow:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
     experiment = _experiment("seen-magnitude-1", "dynamic_angle", grid, noise)
     note = "the true magnitude decides what is seen, the noise only what is measured"
-    return ExperimentRow("Magnitude noise, no star vanishes", "dynamic angle, 1 mag", PRESET, experiment,
+    return ExperimentRow("Magnitude noise, no star vanishes", "dynamic angle, 1 mag", PRESET,
+            experiment,
                "reference", 98.84, None, 98.9, note=note)  # fmt: skip
 
 
@@ -137,7 +138,8 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[ExperimentRow]:
             undistorted, camera=lens, assumed=told, tolerance_px=BARREL_TOLERANCE_PX
         )
         made.append(
-            ExperimentRow("Barrel distortion (table 4)", label, PRESET, experiment, "reference", percent,
+            ExperimentRow("Barrel distortion (table 4)", label, PRESET,
+            experiment, "reference", percent,
                 None, 99.6 if is_own else None, note=f"k1 = {BARREL.k1:g}, the matcher is not told")
         )  # fmt: skip
     return made

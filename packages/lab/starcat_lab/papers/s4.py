@@ -69,7 +69,8 @@ def _curve(
 def _unhidden(count: int) -> ExperimentRow:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
     experiment = _experiment("seen-magnitude-1", "triangle", count, noise)
-    return ExperimentRow("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag", PRESET,
+    return ExperimentRow("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag",
+        PRESET,
                experiment, "attitude", 98.0, None, 98.0, goal_over="4+",
                note="the true magnitude decides what is seen, the noise only what is measured",
     )  # fmt: skip
@@ -87,7 +88,8 @@ def _mixed(count: int) -> list[ExperimentRow]:
     note = "1 px, 20 % false stars, 0.5 mag"
     group = "Mixed noise"
     return [
-        ExperimentRow(group, METHODS["triangle"], PRESET, _experiment("mixed", "triangle", count, MIXED),
+        ExperimentRow(group, METHODS["triangle"], PRESET, _experiment("mixed", "triangle", count,
+            MIXED),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+", note=note),
         ExperimentRow(group, f"{METHODS['triangle']}, C library", PRESET,
             replace(_experiment("mixed-installed", "triangle", count, MIXED), engine="auto"),

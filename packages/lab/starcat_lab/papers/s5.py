@@ -64,7 +64,8 @@ def _point(
         percent = published[1] if published and here and is_method else None
         goal = published[2] if published and here and label == "starcat" else None
         made.append(
-            ExperimentRow(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment, "two_stars",
+            ExperimentRow(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment,
+                "two_stars",
                 percent, 112.5 if percent and group == "Position noise" else None, goal, x=value)
         )  # fmt: skip
     return made
