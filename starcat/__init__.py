@@ -40,9 +40,8 @@ if TYPE_CHECKING:
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
     from starcat.matcher.tracking import Tracker
-    from starcat.sky.in_time import sky_in_time
+    from starcat.sky.in_time import identify_in_time, sky_in_time
     from starcat.sky.observer import Observer
-    from starcat.sky.spots import identify_in_time
     from starcat.specs.reading import preset, read_spec
 
 __all__ = [
@@ -83,7 +82,7 @@ _HOMES = {
     "connect": ("starcat.api.artifact", "connect"),
     "diff": ("starcat.api.functions", "diff"),
     "export": ("starcat.api.functions", "export"),
-    "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
+    "identify_in_time": ("starcat.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
     "init": ("starcat.api.functions", "init"),
     "learn": ("starcat.api.functions", "learn"),

@@ -25,8 +25,7 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
-from starcat.matcher.result import MatchResult
+from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 

@@ -29,8 +29,7 @@ from starcat.bands.response import (
     shipped,
     shipped_names,
 )
-from starcat.bands.spectra import library, parsed_type
-from starcat.bands.synthetic import checked_zero_point, synthetic_magnitudes
+from starcat.bands.synthetic import checked_zero_point, library, parsed_type, synthetic_magnitudes
 from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.cli.specs import with_sensor
 from starcat.errors import ConfigError, FileMissing

@@ -18,17 +18,19 @@ from starcat.calibration.files import (
 )
 from starcat.calibration.fit import (
     CENTRE,
+    COMPLETE,
     FOCAL,
     PARAMETERS,
     Seen,
     camera_of,
+    choose_model,
+    chosen,
     fit_camera,
     project,
     turn_derivatives,
     value_derivatives,
     values_of,
 )
-from starcat.calibration.models import COMPLETE, choose_model, chosen
 from starcat.errors import CalibrationError, ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera

@@ -20,8 +20,8 @@ from typer.main import get_command
 import starcat as package
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
+from starcat.cli.console import OPTIONS, PANELS
 from starcat.cli.main import app
-from starcat.cli.panels import OPTIONS, PANELS
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS

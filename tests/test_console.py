@@ -10,8 +10,7 @@ from rich.console import Console
 
 from starcat.artifact.verify import Finding, Verification
 from starcat.cli.artifacts import print_rebuilt, print_verification
-from starcat.cli.bars import StageBars
-from starcat.cli.console import print_table
+from starcat.cli.console import StageBars, print_table
 from starcat.cli.exchange import print_exported
 from starcat.exchange.export import Exported
 from starcat.pipeline.rebuild import FileChange, Rebuilt

@@ -10,7 +10,7 @@ from frames import frames_of
 
 from starcat.matcher import c_engine, matcher
 from starcat.matcher.batch import BatchResult
-from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of
+from starcat.matcher.centroids import MAX_CENTROIDS, brightest_of
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import as_frame

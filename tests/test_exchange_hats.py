@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.exchange.export import write_hats
-from starcat.store.pixels import HEALPIX_COLUMN, Pixel, healpix_29
+from starcat.store.layout import HEALPIX_COLUMN, Pixel, healpix_29
 from starcat.version import install_command
 
 pytest.importorskip("cdshealpix")

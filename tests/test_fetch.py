@@ -757,7 +757,7 @@ def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive, tmp_path):
 
 
 def test_where_there_are_no_locks_every_fetch_has_its_own_part(archive, tmp_path, monkeypatch):
-    monkeypatch.setattr("starcat.storage.locks.fcntl", None)
+    monkeypatch.setattr("starcat.storage.atomic.fcntl", None)
     (tmp_path / "tiny.dat.part").write_bytes(OTHER[:HALF])  # of another process, at work
     source = tiny_source(archive.serve("/tiny.dat", BODY))
     assert fetch_one(source, tmp_path).status == "downloaded"
@@ -768,7 +768,7 @@ def test_where_there_are_no_locks_every_fetch_has_its_own_part(archive, tmp_path
 
 def test_another_version_recorded_meanwhile_is_a_mismatch(archive, tmp_path, monkeypatch):
     # Without locks two processes may bring two versions of one file: the first recorded holds.
-    monkeypatch.setattr("starcat.storage.locks.fcntl", None)
+    monkeypatch.setattr("starcat.storage.atomic.fcntl", None)
     end = threading.Event()
     first = tiny_source(archive.serve("/a/tiny.dat", BODY))
     second = tiny_source(archive.serve("/b/tiny.dat", OTHER, says_length=False, stall=end))

@@ -16,7 +16,7 @@ from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
 from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure_picture
-from starcat.images.spot_width import best_widths
+from starcat.images.spots import best_widths
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import preset

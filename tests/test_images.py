@@ -28,8 +28,8 @@ from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.images.background import SMALLEST_PX, SkyLevels, repair_hot_pixels, subtract_background
 from starcat.images.centroiding import Spots, brightest_first, detect, find_spots
-from starcat.images.frame_axes import FrameAxes, draw_compass, mark_radii, place_labels, stretch
 from starcat.images.image_file import read_image, write_image
+from starcat.images.overlay import FrameAxes, draw_compass, mark_radii, place_labels, stretch
 from starcat.images.picture import compass_from_matrix, draw_identified
 from starcat.images.render import Optics, render_image, star_electrons
 from starcat.version import install_command

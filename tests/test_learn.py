@@ -15,8 +15,7 @@ import pytest
 import starcat as starcat_package
 from starcat.artifact.reader import open_artifact
 from starcat.calibration.answers import Sightings, SkyStars, read_answers
-from starcat.calibration.learn import learn_from_frames
-from starcat.calibration.lessons import learn_files, observed_toml, sky_stars
+from starcat.calibration.learn import learn_files, learn_from_frames, observed_toml, sky_stars
 from starcat.errors import BuildError, CalibrationError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.solve_files import FrameAnswer

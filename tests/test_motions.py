@@ -40,7 +40,7 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Quality
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.store.reading import read_catalog
 
 FAINT_LIMIT_MAG = 6.3

@@ -17,7 +17,13 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.onboard import layout
 from starcat.onboard.c_source import c_header, c_source, c_symbol
-from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
+from starcat.onboard.checking import (
+    MIN_SHARE,
+    artifact_problems,
+    capacity_problems,
+    shrink,
+    value_problems,
+)
 from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
 from starcat.onboard.layout import (
@@ -31,7 +37,6 @@ from starcat.onboard.layout import (
     scrub,
 )
 from starcat.onboard.reading import read_onboard_image
-from starcat.onboard.shrink import MIN_SHARE, shrink
 from starcat.products.pairs import find_pairs
 from starcat.products.tiling import tile_sphere
 from starcat.products.triangles import find_triangles

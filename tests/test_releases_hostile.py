@@ -25,7 +25,7 @@ from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import FolderRegistry, open_registry
 from starcat.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
 from starcat.specs.reading import spec_from_dict
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.storage.download import DownloadOptions, download, part_of
 
 ONCE = DownloadOptions(retries=0, timeout_s=5.0, backoff_s=0.0)
@@ -236,8 +236,8 @@ from pathlib import Path
 from starcat.releases.lockfile import pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases import files
-from starcat.storage import locks
-assert locks.fcntl is None and not files._WITHOUT_LINKS
+from starcat.storage import atomic
+assert atomic.fcntl is None and not files._WITHOUT_LINKS
 print(publish_artifact(Path(sys.argv[1]), "registry").outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)

@@ -15,8 +15,8 @@ import pytest
 from starcat.exchange.onboard import export_image, verify_image
 from starcat.matcher.c_engine import is_compiled
 from starcat.onboard.layout import check_blocks
+from starcat.onboard.patching import MAX_ADDED_BYTES
 from starcat.onboard.reading import read_onboard_image
-from starcat.onboard.signature import MAX_ADDED_BYTES
 from starcat.storage.keys import new_key
 
 

@@ -28,7 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.cli.matches import print_sky_in_time
+from starcat.cli.matching import print_sky_in_time
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -46,9 +46,8 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
-from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
+from starcat.sky.in_time import earth_limb_angle_deg, identify_in_time, planets_among, sky_in_time
 from starcat.sky.observer import AU_KM, LIGHT_KM_S, Observer, aberrated, observer_numbers
-from starcat.sky.spots import identify_in_time, planets_among
 
 Array = NDArray[np.float64]
 

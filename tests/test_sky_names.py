@@ -19,8 +19,7 @@ from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import separation
-from starcat.images.frame_axes import FrameAxes
-from starcat.images.overlay import Overlay, draw_overlay, overlay_from_attitude
+from starcat.images.overlay import FrameAxes, Overlay, draw_overlay, overlay_from_attitude
 from starcat.images.picture import draw_identified, picture_name
 from starcat.sky.in_time import BodyInFrame
 from starcat.sky.names import common_names, constellation_lines, named_stars

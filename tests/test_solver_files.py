@@ -29,7 +29,7 @@ from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 
 PROGRAMS = {"astrometry-net": "build-astrometry-index"}
 """What writes the files of a solver, where we do not."""

@@ -22,7 +22,7 @@ from starcat.errors import ProductError, QueryError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.query.partitions import EXTENT, extents
 from starcat.query.session import Session, open_session
-from starcat.store.pixels import MAX_ORDER, Pixel, healpix_29
+from starcat.store.layout import MAX_ORDER, Pixel, healpix_29
 
 STARS = 6000
 MAX_ROWS = 120

@@ -13,10 +13,9 @@ from genuine_records import SAO
 
 from starcat.catalog.ingest import ingest_catalog
 from starcat.exchange.export import write_hats
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.store.ingest import ingest_to_store
-from starcat.store.layout import open_store
-from starcat.store.pixels import HEALPIX_COLUMN, healpix_29
+from starcat.store.layout import HEALPIX_COLUMN, healpix_29, open_store
 from starcat.store.plan import StoreOptions
 from starcat.store.reading import read_catalog
 

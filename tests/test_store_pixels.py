@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
-from starcat.store.pixels import (
+from starcat.store.layout import (
     MAX_ORDER,
     Pixel,
     border_of,

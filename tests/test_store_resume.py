@@ -16,10 +16,10 @@ from folder_bytes import bytes_of
 from twomass_parts import write_part
 
 from starcat.errors import BuildError, ConfigError, OutputError, ParseError, SourceError
-from starcat.store import split as splitting
+from starcat.store import finish as splitting
 from starcat.store.ingest import ingest_to_store
-from starcat.store.ledger import ResumePlan
 from starcat.store.plan import StoreOptions
+from starcat.store.runs import ResumePlan
 
 ROWS = 4_000
 SMALL = {"max_partition_rows": 3_000}

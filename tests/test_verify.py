@@ -24,7 +24,7 @@ from starcat.errors import ProductError
 from starcat.products.layouts import LAYOUTS
 from starcat.products.table import PRODUCTS
 from starcat.resources import resource_folder
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
 
 SCHEMAS = resource_folder("schemas")

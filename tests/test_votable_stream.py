@@ -26,7 +26,7 @@ from table_formats import column_of
 from starcat.errors import QueryLimitError, SchemaError
 from starcat.exchange import columns as shared_columns
 from starcat.exchange.columns import Label
-from starcat.exchange.votable_stream import Serialization, votable_chunks
+from starcat.exchange.votable import Serialization, votable_chunks
 
 DAY = "2026-01-31"
 SERIALIZATIONS: tuple[Serialization, ...] = get_args(Serialization)

@@ -12,7 +12,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.images.centroiding import find_spots
 from starcat.images.render import Optics, render_image
-from starcat.images.spot_noise import weighed
+from starcat.images.spots import weighed
 from starcat.matcher import c_engine
 from starcat.matcher.matcher import Matcher
 from starcat.simulation.simulate import Noise, simulate_frames

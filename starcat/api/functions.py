@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
-    from starcat.calibration.lessons import Learnt
+    from starcat.calibration.learn import Learnt
     from starcat.catalog.ingest import Ingested
     from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
@@ -253,7 +253,7 @@ def learn(
     CalibrationError
         If too few stars were identified.
     """
-    from starcat.calibration.lessons import learn_files
+    from starcat.calibration.learn import learn_files
 
     return learn_files(
         database_path("artifact", artifact),

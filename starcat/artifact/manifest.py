@@ -94,7 +94,7 @@ def software_versions() -> dict[str, str]:
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
     """Return the digest that a manifest carries of itself."""
-    from starcat.storage.digests import json_bytes  # with pyarrow, which reading does without
+    from starcat.storage.atomic import json_bytes  # with pyarrow, which reading does without
 
     others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
     return hashlib.sha256(json_bytes(others)).hexdigest()

@@ -12,8 +12,7 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.bands.response import Response
-from starcat.bands.spectra import library
-from starcat.bands.synthetic import row_weights, zero_mag
+from starcat.bands.synthetic import library, row_weights, zero_mag
 
 PHOTONS_S_MM2 = 38_200.0
 """Photons/s and mm2 of a star of magnitude 0 where the response is not stated: Liebe's 19,100

@@ -14,7 +14,7 @@ import numpy as np
 from starcat.arrays import Array, Mask
 from starcat.bands.photometry import variability_error
 from starcat.bands.response import Response, shipped
-from starcat.bands.spectra import data_table
+from starcat.bands.synthetic import data_table
 
 NEAR_IN_WAVELENGTH = 0.15
 """Measured bands whose mean wavelengths differ from a sensor's by this ratio (one standard

@@ -17,8 +17,7 @@ import numpy as np
 from starcat.arrays import Array, Mask
 from starcat.bands.measured import error_factors
 from starcat.bands.response import Response, shipped
-from starcat.bands.spectra import library, parsed_type
-from starcat.bands.synthetic import row_weights, synthetic_magnitudes
+from starcat.bands.synthetic import library, parsed_type, row_weights, synthetic_magnitudes
 
 GRID_MAG = 0.02
 """Step of the colours that a relation is worked out at."""

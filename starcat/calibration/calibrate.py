@@ -12,8 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.calibration.fit import AXES, PARAMETERS, Fit, camera_of, fit_camera, values_of
-from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
+from starcat.calibration.fit import (
+    AXES,
+    COMPLETE,
+    PARAMETERS,
+    Fit,
+    Trial,
+    camera_of,
+    choose_model,
+    chosen,
+    fit_camera,
+    is_enough,
+    start_of,
+    values_of,
+)
 from starcat.calibration.rounds import IdentifiedFrame, first_answer, identify_part, settled
 from starcat.errors import CalibrationError
 from starcat.geometry.attitude import quaternion_from_matrix

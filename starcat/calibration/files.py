@@ -20,8 +20,8 @@ from starcat.calibration.fit import PARAMETERS
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
-from starcat.images.figure_file import check_kind, own_style, write_figure
 from starcat.images.identify_options import IdentifyOptions
+from starcat.images.overlay import check_kind, own_style, write_figure
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher

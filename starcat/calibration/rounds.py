@@ -23,11 +23,14 @@ from starcat.calibration.fit import (
     Fit,
     Seen,
     camera_of,
+    choose_model,
+    chosen,
     cropped,
     fit_camera,
+    is_enough,
+    start_of,
     values_of,
 )
-from starcat.calibration.models import choose_model, chosen, is_enough, start_of
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera

@@ -30,8 +30,8 @@ from starcat.catalog.integrity import (
 from starcat.catalog.source import DataSource
 from starcat.errors import DownloadError, OutputError, SourceError
 from starcat.progress import Progress, no_progress
+from starcat.storage.atomic import locked
 from starcat.storage.download import DownloadOptions, beside, download, forget_part, part_of, rename
-from starcat.storage.locks import locked
 
 Status = Literal["downloaded", "resumed", "present"]
 """Whether a file was fetched in one go, continued from an earlier part, or already there."""

@@ -30,9 +30,7 @@ from starcat.errors import (
     SourceMissing,
 )
 from starcat.failures import validation_message
-from starcat.storage.atomic import placed, sync_to_disk
-from starcat.storage.digests import json_bytes
-from starcat.storage.locks import locked
+from starcat.storage.atomic import json_bytes, locked, placed, sync_to_disk
 
 LOCK_NAME = "starcat-sources.lock"
 """File beside the data with the digest of every file that has arrived."""

@@ -35,10 +35,8 @@ from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import TableMap
 from starcat.errors import ConfigError, DownloadError, OutputError, ParseError
 from starcat.progress import Progress, no_progress
-from starcat.storage.atomic import whole_file, writing
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import file_sha256, json_bytes, locked, whole_file, writing
 from starcat.storage.download import DownloadOptions, download, forget_part, part_of
-from starcat.storage.locks import locked
 from starcat.storage.parquet import write_table
 
 ACCOUNT_NAME = "fetched.json"

@@ -1,4 +1,4 @@
-"""What the command line shows: tables that fit 100 columns, progress bars, JSON."""
+"""What the command line prints: tables, messages, progress bars, and panels of options."""
 
 from __future__ import annotations
 
@@ -9,12 +9,134 @@ from contextlib import ExitStack, contextmanager
 from string import Formatter
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+from rich.filesize import decimal
+from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
+from rich.text import Text
+from typer.core import TyperCommand, TyperGroup
+
 from starcat.cli import interrupts
 from starcat.failures import AT_STAGE
-from starcat.progress import Progress
+from starcat.progress import BYTE_STAGES, ROW_STAGE, Progress
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+class StageBars(Bars):
+    """A bar a stage, one below the other."""
+
+    def __init__(self, console: Console) -> None:
+        columns = (
+            TextColumn("{task.description:<22}", markup=False),
+            BarColumn(),
+            AmountColumn(),
+            TimeElapsedColumn(),
+            RateColumn(),
+        )
+        super().__init__(*columns, console=console, transient=True)
+        self.stages: dict[str, TaskID] = {}
+
+    def show(self, stage: str, done: int, total: int | None) -> None:
+        """Draw an event."""
+        if stage not in self.stages:
+            self.end_open()
+            self.stages[stage] = self.add_task(stage, total=total)
+        self.update(self.stages[stage], completed=done, total=total)
+
+    def end_open(self) -> None:
+        """Fill the bars, and stop the clocks, of the stages that do not know their total."""
+        for task in self.tasks:
+            if task.total is None:
+                end = max(1, int(task.completed))
+                self.update(task.id, completed=end, total=end, is_uncounted=True)
+
+
+class AmountColumn(ProgressColumn):
+    """How much of a stage is done: bytes with units, other things with separators."""
+
+    def render(self, task: Task) -> Text:
+        """Return the amount."""
+        done, total = int(task.completed), task.total
+        if task.fields.get("is_uncounted"):
+            return Text("done" if done == 1 else f"{done:,}")
+        if total is None:
+            return Text(f"{done:,}" if done else "")
+        if task.description.split(" ")[0] in BYTE_STAGES:
+            return Text(f"{decimal(done)} / {decimal(int(total))}")
+        return Text(f"{done:,} / {int(total):,}")
+
+
+class RateColumn(ProgressColumn):
+    """How fast rows go, and the time that is left; empty for other stages."""
+
+    def render(self, task: Task) -> Text:
+        """Return rate and time."""
+        elapsed, total = task.finished_time or task.elapsed, task.total
+        if task.description.split(" ")[0] != ROW_STAGE or not elapsed or not task.completed:
+            return Text("")
+        rate = task.completed / elapsed
+        left = 0 if total is None else round(max(0.0, total - task.completed) / rate)
+        ending = f", {left // 60}:{left % 60:02} left" if left else ""
+        return Text(f"{rate:,.0f}/s{ending}")
+
+
+PANELS = {
+    "Design a database": ("sources", "bands", "presets", "init", "estimate"),
+    "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
+    "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
+    "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),
+    "Ship it": ("export", "publish", "pull", "releases", "keys"),
+    "Serve it": ("serve", "token"),
+}
+"""The commands in the order of --help."""
+
+
+class WholeSummaries(TyperGroup):
+    """The commands in the help, each with its first sentence and no dots for the rest."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the commands in the order of the panels."""
+        return [name for names in PANELS.values() for name in names]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a panel for each step of the work, and a line or more a command."""
+        for panel, names in PANELS.items():
+            with formatter.section(panel):
+                formatter.write_dl(
+                    [(name, self.commands[name].get_short_help_str(limit=1000)) for name in names]
+                )
+
+
+OPTIONS = {
+    "Search": (
+        *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
+        *("min_share", "max_steps", "time_limit_s", "prior_q", "prior_error_deg", "track"),
+    ),
+    "Camera": ("camera", "fov_error", "fov", "size", "flip"),
+    "Pictures": (*("psf_sigma_px", "threshold", "most_spots", "plane", "bayer", "dark", "mask"),),
+    "Time and place": ("time", "velocity", "orbit"),
+    "Output": ("picture", "contact_sheet", "wcs", "fail_on_no_match", "ndjson", "json", "help"),
+}
+"""The options of 'starcat identify' by what they are about."""
+
+
+class OptionsInPanels(TyperCommand):
+    """A command with so many options that its help has them by `OPTIONS`."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write a panel for the arguments, and one for each group of options."""
+        panel_of = {name: panel for panel, names in OPTIONS.items() for name in names}
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is not None:
+                panels.setdefault(panel_of.get(param.name or "", "Arguments"), []).append(record)
+        for panel in ("Arguments", *OPTIONS):
+            with formatter.section(panel):
+                formatter.write_dl(panels[panel])
+
 
 MAX_WIDTH = 100
 
@@ -115,8 +237,6 @@ def progress_bars() -> Iterator[Progress]:
     with ExitStack() as stack:
         bars = None
         if console.is_terminal:
-            from starcat.cli.bars import StageBars
-
             bars = stack.enter_context(StageBars(console))
 
         def draw(stage: str, done: int, total: int | None) -> None:

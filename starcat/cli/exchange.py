@@ -230,7 +230,7 @@ def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
 def print_image(image: OnboardImage) -> None:
     """Print what an image holds."""
     from starcat.onboard.layout import DIRECTION_SCALE
-    from starcat.onboard.signature import image_signatures
+    from starcat.onboard.patching import image_signatures
 
     header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
     facts = {

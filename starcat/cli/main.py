@@ -34,8 +34,8 @@ from starcat.cli import (
     specs,
     sql,
 )
+from starcat.cli.console import WholeSummaries
 from starcat.cli.packages import add_commands
-from starcat.cli.panels import WholeSummaries
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__

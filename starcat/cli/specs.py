@@ -155,8 +155,7 @@ def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -
     if response is None and sensor is None:
         return camera
     from starcat.bands.response import shipped
-    from starcat.specs.camera_exposure import NEEDED, CameraExposure
-    from starcat.specs.camera_response import CameraResponse
+    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse
     from starcat.specs.star_sensor import read_sensor
 
     content = camera.model_dump()

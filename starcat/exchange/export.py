@@ -29,8 +29,8 @@ from starcat.exchange.writers import write_batches
 from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import whole_folder
 from starcat.storage.parquet import read_parquet
+from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
 from starcat.store.metadata import Described, describe_catalog, write_slices
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
 from starcat.store.plan import partition_pixels
 
 COLUMNS_NAME = "columns.csv"

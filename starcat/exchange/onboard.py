@@ -18,18 +18,24 @@ from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
-from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
+from starcat.onboard.checking import (
+    Shrunk,
+    artifact_problems,
+    capacity_problems,
+    shrink,
+    value_problems,
+)
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
 from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder, crc_of
-from starcat.onboard.patching import apply_patch, make_patch
-from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
-from starcat.onboard.shrink import Shrunk, shrink
-from starcat.onboard.signature import (
+from starcat.onboard.patching import (
     MAX_ADDED_BYTES,
+    apply_patch,
     image_signatures,
+    make_patch,
     sign_image,
     signature_problems,
 )
+from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
 from starcat.specs.reading import spec_from_dict

@@ -29,7 +29,7 @@ from starcat.exchange.columns import (
 )
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, TEXT_FORMATS, Format
 from starcat.exchange.text import csv_chunks, json_chunks, tsv_chunks
-from starcat.exchange.votable_stream import Serialization, votable_chunks, write_votable
+from starcat.exchange.votable import Serialization, votable_chunks, write_votable
 from starcat.storage.atomic import whole_file
 from starcat.storage.parquet import (
     ARROW_DATATYPES,

@@ -27,8 +27,14 @@ from starcat.images.background import (
     subtract_background,
     unmasked,
 )
-from starcat.images.spot_noise import centroid_sigma_px, electrons_per_step, noise_at
-from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
+from starcat.images.spots import (
+    SIGMA_RANGE_PX,
+    centroid_sigma_px,
+    electrons_per_step,
+    is_sharp,
+    noise_at,
+    sigma_of_stars,
+)
 from starcat.images.streaks import Streak, measured_streaks, refined, streak_of
 from starcat.products.blends import APERTURE_SIGMA, widths_px
 

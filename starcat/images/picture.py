@@ -15,17 +15,21 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
-from starcat.images.figure_file import check_kind, own_style, write_figure
-from starcat.images.frame_axes import (
+from starcat.images.overlay import (
     SKY,
     FrameAxes,
+    Overlay,
+    check_kind,
     draw_compass,
     draw_marks,
     draw_names,
+    draw_overlay,
     draw_sky,
     mark_radii,
+    overlay_from_attitude,
+    own_style,
+    write_figure,
 )
-from starcat.images.overlay import Overlay, draw_overlay, overlay_from_attitude
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult

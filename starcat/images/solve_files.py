@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
-from starcat.images.second_look import FOV_ERROR, Search, look_again
-from starcat.images.spot_noise import weighed
+from starcat.images.spots import FOV_ERROR, Search, look_again, weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_centroid_files,
@@ -279,7 +278,7 @@ class FileAnswers:
             identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
             if observer is None:
                 return identify(frame.centroids_px, magnitudes=frame.mag)
-            from starcat.sky.spots import identify_in_time
+            from starcat.sky.in_time import identify_in_time
 
             return identify_in_time(
                 identify,

@@ -20,7 +20,7 @@ from scipy.special import erf
 
 from starcat.arrays import Array
 from starcat.images.background import SkyLevels
-from starcat.images.spot_noise import noise_at
+from starcat.images.spots import noise_at
 from starcat.products.blends import PIXEL_VARIANCE
 
 _FEWEST, _MOST = 5, 30

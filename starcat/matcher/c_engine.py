@@ -25,8 +25,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.refusal import Reason, Refusal
-from starcat.matcher.result import MatchResult, Status, no_match
+from starcat.matcher.result import MatchResult, Reason, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image

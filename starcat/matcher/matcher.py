@@ -24,8 +24,8 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
-from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
+from starcat.matcher.centroids import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve

@@ -10,8 +10,7 @@ from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import fit_by_weights, focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
-from starcat.matcher.refusal import Refusal
-from starcat.matcher.result import MatchResult, Origin, no_match
+from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import software_versions
-from starcat.storage.atomic import whole_file
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes, whole_file
 
 
 class Stopwatch:

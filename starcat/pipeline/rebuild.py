@@ -17,7 +17,7 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.progress import Progress, no_progress
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.store.wire import url_of_input
 
 

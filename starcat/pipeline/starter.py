@@ -32,7 +32,7 @@ from starcat.products.tiling import tile_sphere
 from starcat.progress import Progress, no_progress
 from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.camera_exposure import USUAL_SIGNAL_TO_NOISE
+from starcat.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of

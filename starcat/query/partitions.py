@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import separation
-from starcat.store.pixels import Pixel
+from starcat.store.layout import Pixel
 
 MARGIN_DEG = 1e-6
 """By how much circles and boxes are wider than the corners need, for what rounding takes."""

@@ -33,7 +33,7 @@ from starcat.query.spatial_macros import (
     reading,
 )
 from starcat.query.targets import Target, View, open_targets
-from starcat.storage.locks import locked
+from starcat.storage.atomic import locked
 
 SCRATCH_PREFIX = "starcat-sql-"
 ABANDONED_S = 60.0

@@ -17,8 +17,7 @@ from starcat.sections import version_numbers
 from starcat.storage.schema import ProductSchema, SchemaColumn, product_schema
 
 if TYPE_CHECKING:
-    from starcat.store.layout import Store
-    from starcat.store.pixels import Pixel
+    from starcat.store.layout import Pixel, Store
 
 POSITION = ("ra_deg", "dec_deg")
 

@@ -1,6 +1,6 @@
 """Files that several processes may write at once, and that a killed one leaves half done.
 
-A part belongs to who holds its lock (`starcat.storage.locks`), which ends with the process.
+A part belongs to who holds its lock (`starcat.storage.atomic`), which ends with the process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from starcat.errors import ProductError, reason
 from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Blob
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 20

@@ -19,10 +19,8 @@ from starcat.progress import Progress, no_progress
 from starcat.releases.pulling import Pulled, pull_release
 from starcat.releases.registry import Registry, has_signatures, is_trusted, open_registry
 from starcat.releases.tree import Release, check_version, choose, parse, parse_wanted
-from starcat.storage.atomic import make_folder, replace_file, writing
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes, locked, make_folder, replace_file, writing
 from starcat.storage.download import DownloadOptions, is_address
-from starcat.storage.locks import locked
 from starcat.storage.regular_files import read_regular_file
 
 LOCK_NAME = "starcat.lock"

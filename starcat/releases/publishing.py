@@ -31,10 +31,17 @@ from starcat.releases.tree import (
     release_bytes,
     tree_files,
 )
-from starcat.storage.atomic import make_folder, replace_file, sync_to_disk, unique, writing
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import (
+    file_sha256,
+    json_bytes,
+    locked,
+    make_folder,
+    replace_file,
+    sync_to_disk,
+    unique,
+    writing,
+)
 from starcat.storage.download import is_address
-from starcat.storage.locks import locked
 
 if TYPE_CHECKING:  # the libraries behind it are for who signs
     from starcat.releases.metadata import Signing

@@ -21,10 +21,8 @@ from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.registry import Registry
 from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, tree_files
-from starcat.storage.atomic import move_into_place, sync_to_disk, writing
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256, locked, move_into_place, sync_to_disk, writing
 from starcat.storage.download import part_of
-from starcat.storage.locks import locked
 
 
 @dataclass(frozen=True)

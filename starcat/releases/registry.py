@@ -20,7 +20,7 @@ from starcat.releases.tree import (
     Listed,
     read_registry_index,
 )
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256, state_folder
 from starcat.storage.download import (
     DownloadOptions,
     NotFound,
@@ -29,7 +29,6 @@ from starcat.storage.download import (
     is_address,
     part_of,
 )
-from starcat.storage.state import state_folder
 
 
 @dataclass(frozen=True)

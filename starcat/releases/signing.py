@@ -34,9 +34,8 @@ from starcat.releases.metadata import (
 )
 from starcat.releases.registry import FolderRegistry, Registry, open_registry
 from starcat.releases.tree import LOCK, MAX_METADATA_BYTES, METADATA, Listed, release_bytes
-from starcat.storage.atomic import writing
+from starcat.storage.atomic import locked, writing
 from starcat.storage.download import NotFound
-from starcat.storage.locks import locked
 
 PUBLISHING = ROLES[1:]
 """The roles that sign when something is published."""

@@ -19,7 +19,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
 from starcat.failures import validation_message
 from starcat.sections import NAME_PATTERN, VERSION_PATTERN, version_numbers
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 
 INDEX_NAME = "index.json"
 REGISTRY_VERSION = "1.0.0"

@@ -32,10 +32,9 @@ from starcat.releases.tree import (
     choose,
     parse,
 )
-from starcat.storage.atomic import make_folder, replace_file, writing
+from starcat.storage.atomic import locked, make_folder, replace_file, writing
 from starcat.storage.download import NotFound
 from starcat.storage.keys import is_public_key, raw_public, read_public, short_name
-from starcat.storage.locks import locked
 from starcat.storage.regular_files import read_regular_file
 
 _NOT_USED = "nothing of it is used"

@@ -14,7 +14,7 @@ import numpy as np
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions
-from starcat.images.figure_file import figure_bytes, own_style, write_figure
+from starcat.images.overlay import figure_bytes, own_style, write_figure
 from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.products.evenness import Evenness
 from starcat.report.coverage_map import (

@@ -34,7 +34,7 @@ from starcat.report.plots import (
     save_plot,
 )
 from starcat.report.sensor_band import band_section, draw_band
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 
 DECIMALS = 6
 """Decimals of degrees in a report; six are 4 milliarcseconds."""

@@ -10,10 +10,9 @@ import numpy as np
 
 from starcat.bands.relation import Relation
 from starcat.bands.response import shipped
-from starcat.bands.spectra import library
-from starcat.bands.synthetic import synthetic_magnitudes
+from starcat.bands.synthetic import library, synthetic_magnitudes
 from starcat.catalog.sensor_band import InBand
-from starcat.images.figure_file import own_style
+from starcat.images.overlay import own_style
 from starcat.report.page import figure, table
 from starcat.report.plots import STYLE, headline
 from starcat.selection.ruleset import Selection

@@ -23,14 +23,14 @@ from starcat.sections import (
     Section,
 )
 from starcat.selection.ruleset import Selection, check_rules
-from starcat.specs.camera_exposure import (
+from starcat.specs.camera_sensor import (
     CameraExposure,
+    CameraResponse,
     contradiction,
     exposure_notes,
     exposure_proposal,
     with_limits,
 )
-from starcat.specs.camera_response import CameraResponse
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
 
 

@@ -7,8 +7,11 @@ the bright stars of the whole sky takes one part in 64 of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +20,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.stars.star_table import floats_of
-from starcat.storage.atomic import placed
-from starcat.storage.digests import file_sha256
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.parts import merged, parse_block, read_files
+from starcat.catalog.source_files import InputFile
+from starcat.geometry.proximity import nearest_chords, separation_from_chord
+from starcat.geometry.sphere import chord_from_separation
+from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import Reason
+from starcat.storage.atomic import file_sha256, placed
 from starcat.storage.schema import product_schema
-from starcat.store.layout import DATASET
-from starcat.store.neighbours import COLUMNS, add_neighbours
-from starcat.store.pixels import (
+from starcat.store.layout import (
+    DATASET,
     HEALPIX_COLUMN,
     MAX_ORDER,
     Pixel,
@@ -32,15 +39,184 @@ from starcat.store.pixels import (
     pixel_field,
     runs_of,
 )
-from starcat.store.plan import StorePlan
+from starcat.store.plan import StorePlan, rows_of_a_run
 from starcat.store.runs import (
+    HISTOGRAM_ORDER,
+    Run,
     RunIndex,
     arrow_writer,
     read_index,
     read_shares,
     run_positions,
     with_constants,
+    write_run,
 )
+
+
+@dataclass
+class _Written:
+    """What has been written of a file so far."""
+
+    plan: StorePlan
+    name: str  # of its files
+    order: int  # of the coarse pixels of runs
+    kept: int = 0  # stars
+    runs: list[Run] = field(default_factory=list)
+    pixels: list[Any] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    writer: pq.ParquetWriter | None = None
+    closing: ExitStack = field(default_factory=ExitStack)
+
+    def stars(self, stars: pa.Table) -> None:
+        """Write a run, and count its stars by pixel."""
+        name = f"{self.name}-{len(self.runs):04}"
+        run, pixels = write_run(stars, self.order, self.plan.runs, name)
+        self.runs.append(run)
+        self.kept += len(stars)
+        fine, _, counts = runs_of(pixels, HISTOGRAM_ORDER)
+        self.pixels.append((fine, counts))
+        self.files += [run.stars, run.places]
+
+    def rejected(self, rejected: pa.Table) -> None:
+        """Append to the file's rejected records, in the order of their lines."""
+        path = self.plan.rejected / f"{self.name}.parquet"
+        if self.writer is None:
+            schema = product_schema("rejected").arrow_schema
+            partial = self.closing.enter_context(placed(path))
+            writer = pq.ParquetWriter(partial, schema, compression="zstd", compression_level=1)
+            self.writer = self.closing.enter_context(writer)
+            self.files.append(path)
+        self.writer.write_table(rejected.sort_by("source_line"))
+
+    def index(self) -> None:
+        """Write what the runs hold: batches, buckets and counts by pixel."""
+        path = self.plan.runs / f"{self.name}.npz"
+        pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
+        counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
+        fine, place = np.unique(pixels, return_inverse=True)
+        arrays = {"pixels": fine, "counts": np.bincount(place, counts, len(fine)).astype(np.int64)}
+        for k, run in enumerate(self.runs):
+            arrays |= {f"batches{k}": run.pixels, f"buckets{k}": run.buckets}
+        with placed(path) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        self.files.append(path)
+
+
+def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any], list[Path]]:
+    """Split an input into runs, which have batches by pixels of an order."""
+    written = _Written(plan, split_name(file.number), order)
+    (plan.rejected / f"{written.name}.parquet").unlink(missing_ok=True)
+    parse = partial(parse_block, options=plan.ingest)
+    counts: Counter[str] = Counter()
+    with written.closing:
+        reading, parts = next(read_files([file], parse))
+        for part in merged(parts, rows_of_a_run(plan.options)):
+            counts.update(count_by_reason(part.rejected, part.counted))
+            if len(part.stars):
+                written.stars(part.stars)
+            if len(part.rejected):
+                written.rejected(part.rejected)
+    result = {
+        "file": asdict(reading.facts),
+        "kept": written.kept,
+        "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
+        "problems": list(reading.named_problems),
+        "runs": len(written.runs),
+    }
+    written.index()
+    return result, written.files
+
+
+def split_name(number: int) -> str:
+    """Return what the files of an input are called."""
+    return f"file-{number:05}"
+
+
+def is_unchanged(result: dict[str, Any], _: StorePlan, file: InputFile, __: int) -> bool:
+    """Return whether a file is still what it was when it was split."""
+    return bool(file_sha256(file.path) == result["file"]["sha256"])
+
+
+COLUMNS = ("star_id", "x", "y", "z", "mag", "source_file", "source_line")
+"""What has to be known of the stars around."""
+
+_SPACINGS = 3.0
+"""Reach of the first look in mean distances of the stars: one in 10^12 of a uniform sky needs
+another."""
+
+Around = Callable[[float], Iterator[pa.Table]]
+"""Gives the stars within so many radians of the partition, but not in it, in pieces."""
+
+
+@dataclass
+class _Nearest:
+    """The nearest neighbours found so far."""
+
+    chord: NDArray[np.float64]
+    mag: NDArray[np.float64]
+    star_id: NDArray[np.int64]
+
+
+def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool) -> pa.Table:
+    """Return the stars of a partition with the columns of the nearest neighbour filled in."""
+    if is_alone or not len(stars):
+        return stars
+    reach = _first_reach(pixel, len(stars))
+    directions = directions_of(stars)
+    found = _among(stars, directions, list(around(reach)))
+    while len(rows := np.flatnonzero(found.chord > chord_from_separation(reach) * (1.0 - 1e-9))):
+        if reach >= np.pi:
+            break
+        reach = _farther(reach, float(found.chord[rows].max()))
+        for piece in around(reach):
+            _look(found, rows, directions, piece)
+    mag = floats_of(stars, "mag")
+    apart = np.degrees(separation_from_chord(found.chord)) * 3600.0
+    stars = stars.append_column("nearest_separation_arcsec", pa.array(apart))
+    delta = found.mag - mag
+    return stars.append_column("nearest_delta_mag", pa.array(delta, mask=np.isnan(delta)))
+
+
+def _first_reach(pixel: Pixel, count: int) -> float:
+    area = 4.0 * np.pi / (12 * 4**pixel.order)
+    return float(min(_SPACINGS * np.sqrt(area / count), np.pi))
+
+
+def _farther(reach: float, chord: float) -> float:
+    if not np.isfinite(chord):
+        return min(8.0 * reach, np.pi)
+    separation = float(separation_from_chord(np.array(chord)))
+    return separation * (1.0 + 1e-6) if separation < 1.0 else np.pi
+
+
+def _among(stars: pa.Table, directions: NDArray[np.float64], pieces: list[pa.Table]) -> _Nearest:
+    """Return the nearest neighbours among the stars themselves and those in some pieces."""
+    parts = [stars.select(["star_id", "mag"]), *(p.select(["star_id", "mag"]) for p in pieces)]
+    number = np.concatenate([part["star_id"].to_numpy() for part in parts])
+    mag = np.concatenate([floats_of(part, "mag") for part in parts])
+    both = np.concatenate([directions, *(directions_of(piece) for piece in pieces)])
+    rows = np.arange(len(stars))
+    chord, index = nearest_chords(directions, both, rows, number)
+    return _Nearest(chord, np.append(mag, np.nan)[index], np.append(number, 0)[index])
+
+
+def _look(
+    found: _Nearest, rows: NDArray[np.int64], directions: NDArray[np.float64], piece: pa.Table
+) -> None:
+    """Take the stars of a piece for neighbours of some rows where they are nearer."""
+    if not len(piece):
+        return
+    number = piece["star_id"].to_numpy()
+    nobody = np.full(len(rows), -1)
+    chord, index = nearest_chords(directions[rows], directions_of(piece), nobody, number)
+    mag, number = floats_of(piece, "mag")[index], number[index]
+    is_nearer = chord < found.chord[rows]
+    # Of two that are as near the one of the lower number counts.
+    is_nearer |= (chord == found.chord[rows]) & (number < found.star_id[rows])
+    rows = rows[is_nearer]
+    found.chord[rows], found.mag[rows] = chord[is_nearer], mag[is_nearer]
+    found.star_id[rows] = number[is_nearer]
+
 
 SKYMAP_ORDER = 6
 """Order of the map of star counts (55 arcmin)."""

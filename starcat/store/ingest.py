@@ -25,16 +25,21 @@ from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
-from starcat.storage.atomic import Outcome, move_into_place, remove_partial, writing
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import Outcome, file_sha256, move_into_place, remove_partial, writing
 from starcat.store.cluster import cluster, run_tasks, versions
-from starcat.store.finish import border_path, finish, write_margin
-from starcat.store.ledger import RESUME_ADVICE, Task
+from starcat.store.finish import border_path, finish, is_unchanged, split, split_name, write_margin
+from starcat.store.layout import MAX_ORDER, Pixel, border_of
 from starcat.store.metadata import Written, describe_store, make_manifest
-from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import StoreOptions, StorePlan, partition_pixels, rows_of_a_run, spill_order
-from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER, find_repeated, read_runs, write_index
-from starcat.store.split import is_unchanged, split, split_name
+from starcat.store.runs import (
+    BUCKETS,
+    HISTOGRAM_ORDER,
+    RESUME_ADVICE,
+    Task,
+    find_repeated,
+    read_runs,
+    write_index,
+)
 
 if TYPE_CHECKING:
     from distributed import Client

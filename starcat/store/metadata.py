@@ -20,19 +20,21 @@ from starcat.catalog.parts import IngestOptions
 from starcat.catalog.source import map_of
 from starcat.errors import BuildError
 from starcat.stars.verdict import Reason
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 from starcat.storage.parquet import votable_metadata
 from starcat.store.cluster import versions
 from starcat.store.finish import SKYMAP_ORDER, store_schema
 from starcat.store.layout import (
     COLLECTION_NAME,
     DATASET,
+    HEALPIX_COLUMN,
     MANIFEST_NAME,
+    MAX_ORDER,
     PARTITIONS_NAME,
     SKYMAP_NAME,
+    Pixel,
     write_properties,
 )
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel
 from starcat.store.plan import StoreOptions
 from starcat.version import __version__
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.parts import IngestOptions
 from starcat.errors import ConfigError
-from starcat.store.layout import REJECTED, REPEATED
-from starcat.store.ledger import ResumePlan
-from starcat.store.pixels import Pixel, Pixels
+from starcat.store.layout import REJECTED, REPEATED, Pixel, Pixels
+from starcat.store.runs import ResumePlan
 
 MAX_ROWS = 500_000
 """Stars of a partition at most: a worker finishes one in some 400 MB."""

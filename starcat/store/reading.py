@@ -28,7 +28,7 @@ from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.progress import Progress, no_progress
 from starcat.stars.star_table import Columns, floats_of, move_to_epoch, table_from_columns
 from starcat.stars.verdict import Reason
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.storage.schema import product_schema
 from starcat.store.layout import (
     MANIFEST_NAME,

@@ -11,7 +11,9 @@ as one value in the run's metadata: half of the bytes of 2MASS.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,12 +23,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from isal import isal_zlib
 from numpy.typing import NDArray
 
+from starcat.errors import ConfigError, OutputError
 from starcat.stars.star_table import floats_of, nulls
-from starcat.storage.atomic import placed
+from starcat.storage.atomic import json_bytes, placed, writing
 from starcat.storage.schema import product_schema
-from starcat.store.pixels import (
+from starcat.store.layout import (
     HEALPIX_COLUMN,
     Pixel,
     Pixels,
@@ -35,6 +39,120 @@ from starcat.store.pixels import (
     pixel_field,
     runs_of,
 )
+
+OPTIONS_NAME = "options.json"
+RESUME_ADVICE = "what is done is kept: make room, then go on with resume=True"
+_DONE = "done"
+
+
+def _checksum(path: Path) -> str:
+    """Return the CRC-32 of a file: it tells what was left half-written or damaged, not changed."""
+    checksum = 0
+    with path.open("rb") as file:
+        while data := file.read(1 << 20):
+            checksum = isal_zlib.crc32(data, checksum)
+    return f"{checksum:08x}"
+
+
+@dataclass(frozen=True)
+class ResumePlan:
+    """The hidden folder of a run."""
+
+    folder: Path  # ``.<name>.work`` beside the final name
+
+    @classmethod
+    def of(cls, final: Path) -> ResumePlan:
+        """Return the folder for a store."""
+        return cls(final.absolute().parent / f".{final.name}.work")
+
+    def __truediv__(self, name: str) -> Path:
+        """Return a path in the folder."""
+        return self.folder / name
+
+    def begin(self, options: Mapping[str, Any], *, resume: bool) -> None:
+        """Make the folder, or take up the run that was begun in it."""
+        path = self / OPTIONS_NAME
+        if path.is_file() and not resume:
+            raise OutputError(
+                f"{self.folder}: an unfinished run is there; go on with it by resume=True, or "
+                "remove the folder to start anew",
+                path=self.folder,
+                fields=("resume=True",),
+            )
+        if path.is_file():
+            self._check_options(json.loads(path.read_text(encoding="utf-8")), options)
+            return
+        with writing(self.folder.parent, "choose another output", ("output",)):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            (self / _DONE).mkdir(parents=True)
+            path.write_bytes(json_bytes(dict(options)))
+
+    def _check_options(self, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+        for key, value in now.items():
+            if before.get(key) != value:
+                raise ConfigError(
+                    f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
+                    f"one {_short(value)}; resume it with the same, or remove the folder to start "
+                    "anew",
+                    key=key,
+                    value=value,
+                )
+
+    def done(self, name: str) -> dict[str, Any] | None:
+        """Return the result of a task that is done."""
+        path = self._record(name)
+        try:
+            record = json.loads(path.read_bytes())
+            files: dict[str, str] = record["files"]
+            if all(_checksum(self / file) == checksum for file, checksum in files.items()):
+                result: dict[str, Any] = record["result"]
+                return result
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+        return None
+
+    def record(self, name: str, result: Mapping[str, Any], written: Iterable[Path]) -> None:
+        """Record that a task is done."""
+        files = {file.relative_to(self.folder).as_posix(): _checksum(file) for file in written}
+        path = self._record(name)
+        # Two workers may do the same task when one of them was thought dead: both write the same.
+        partial = path.with_name(f".{path.name}.{os.getpid()}")
+        partial.write_bytes(json_bytes({"files": files, "result": dict(result)}))
+        partial.replace(path)
+
+    def _record(self, name: str) -> Path:
+        return self.folder / _DONE / f"{name}.json"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A call of a function that is made once: what the ledger has is not done again.
+
+    The function returns its result as plain values, and the files that it wrote.
+    """
+
+    plan: ResumePlan
+    name: str  # unique in the run
+    function: Callable[..., tuple[dict[str, Any], list[Path]]]
+    arguments: tuple[Any, ...]
+    # whether an earlier result holds for the arguments; None where it always does
+    is_valid: Callable[..., bool] | None = None
+
+    def run(self) -> dict[str, Any]:
+        """Do the task and record it, if it is not done."""
+        before = self.plan.done(self.name)
+        if before is not None and (self.is_valid is None or self.is_valid(before, *self.arguments)):
+            return before
+        with writing(self.plan.folder.parent, RESUME_ADVICE):
+            result, written = self.function(*self.arguments)
+            self.plan.record(self.name, result, written)
+        return result
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:60]}…"
+
 
 BUCKETS = 64
 HISTOGRAM_ORDER = 9

@@ -31,18 +31,18 @@ from starcat.catalog.source_files import InputFile, cache_folder
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError
 from starcat.progress import Progress
 from starcat.stars.verdict import Reason
-from starcat.storage.atomic import placed, writing
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import file_sha256, json_bytes, locked, placed, writing
 from starcat.storage.download import (
     DownloadOptions,
+    RemoteVersion,
     download,
+    fetch_range,
     forget_part,
     is_address,
     part_of,
     rename,
 )
-from starcat.storage.locks import locked
-from starcat.storage.ranges import RemoteVersion, fetch_range
+from starcat.store.finish import split_name
 from starcat.store.layout import (
     COLLECTION_NAME,
     DATASET,
@@ -51,6 +51,7 @@ from starcat.store.layout import (
     PROPERTIES_NAMES,
     REJECTED,
     REPEATED,
+    Pixel,
     groups_within,
     parquet_file,
     pixels_of,
@@ -58,8 +59,6 @@ from starcat.store.layout import (
     read_properties,
     star_columns,
 )
-from starcat.store.pixels import Pixel
-from starcat.store.split import split_name
 from starcat.threads import map_in_order
 
 NOTE_NAME = "address.json"

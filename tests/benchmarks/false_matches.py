@@ -39,7 +39,7 @@ from false_frames import KINDS, Scene, Trial
 from judging import Notable, judge_answer, search
 from rows import Options, Rows, ended
 
-from starcat.images.figure_file import own_style, write_figure
+from starcat.images.overlay import own_style, write_figure
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
 from starcat.pipeline.build import build_database

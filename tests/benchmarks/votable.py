@@ -23,7 +23,7 @@ from rows import Options, Rows, ended
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
-from starcat.exchange.votable_stream import Serialization, votable_chunks
+from starcat.exchange.votable import Serialization, votable_chunks
 from starcat.query.session import open_session
 from starcat.storage.parquet import write_parquet
 

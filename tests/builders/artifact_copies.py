@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import file_sha256, json_bytes
 
 
 def copied(artifact: Path, folder: Path) -> Path:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.reader import open_artifact
 from starcat.calibration.answers import SkyStars
-from starcat.calibration.lessons import sky_stars
+from starcat.calibration.learn import sky_stars
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions

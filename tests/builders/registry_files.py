@@ -20,7 +20,7 @@ from served import in_background
 
 from starcat.artifact.manifest import manifest_digest
 from starcat.releases.tree import Blob, read_registry_index
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 
 
 def sha256(data: bytes) -> str:

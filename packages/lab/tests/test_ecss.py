@@ -34,9 +34,18 @@ from starcat_lab.ecss.bench import (
     random_day,
     turned,
 )
-from starcat_lab.ecss.errors import _centroids, attitude_variance, centroid_noise_px, contributions
-from starcat_lab.ecss.figures import expected_bias, spread, temporal_noise
-from starcat_lab.ecss.trials import SensorTrial, guide_stars, point, star_noise, trials_of
+from starcat_lab.ecss.report import expected_bias, spread, temporal_noise
+from starcat_lab.ecss.trials import (
+    SensorTrial,
+    _centroids,
+    attitude_variance,
+    centroid_noise_px,
+    contributions,
+    guide_stars,
+    point,
+    star_noise,
+    trials_of,
+)
 
 PERFECT = {
     "zero_point_e_s": 6e6, "exposure_s": 0.1, "psf_sigma_px": 0.8, "pixel_um": 12.0,

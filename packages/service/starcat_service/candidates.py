@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from starcat.errors import StarcatError
-from starcat.images.second_look import FOV_ERROR
+from starcat.images.spots import FOV_ERROR
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 from starcat_service.library import ListedDatabase

@@ -35,7 +35,7 @@ from starcat.pipeline.guide_stars import MAX_FIELD_STARS
 from starcat.pipeline.starter import Starter, enough_limit, starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset, preset_names
-from starcat.storage.digests import json_bytes
+from starcat.storage.atomic import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files
 from starcat_service.problems import Problem

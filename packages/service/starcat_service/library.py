@@ -15,7 +15,7 @@ from starcat.geometry.camera import Camera
 from starcat.releases.tree import Blob, tree_files
 from starcat.sections import version_numbers
 from starcat.specs.build_spec import CameraSpec
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat_service.paths import DATABASE_ID, ServicePaths
 from starcat_service.problems import Problem
 

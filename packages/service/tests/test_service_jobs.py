@@ -25,7 +25,7 @@ from starcat.errors import ConfigError, SourceMissing, TargetMissing
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.storage.locks import locked
+from starcat.storage.atomic import locked
 from starcat_lab.curves import QUANTITIES
 from starcat_service.access import Principal
 from starcat_service.jobs import job as job_module

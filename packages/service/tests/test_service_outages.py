@@ -26,7 +26,7 @@ from services import DATABASE, add_database, client_of
 
 from starcat.errors import OutputError, ProductError
 from starcat.images.background import subtract_background
-from starcat.images.spot_width import sigma_of_stars
+from starcat.images.spots import sigma_of_stars
 from starcat_service.problems import outage_of
 from starcat_service.records import Records
 

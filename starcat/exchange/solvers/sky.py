@@ -15,7 +15,7 @@ from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.storage.digests import file_sha256
+from starcat.storage.atomic import file_sha256
 from starcat.version import __version__
 
 

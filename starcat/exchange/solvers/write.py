@@ -18,8 +18,7 @@ from starcat.exchange.solvers.lost import write_lost
 from starcat.exchange.solvers.programs import write_astrometry_net, write_tetra3rs
 from starcat.exchange.solvers.sky import SolverSky, sky_of
 from starcat.exchange.solvers.tetra import write_tetra
-from starcat.storage.atomic import move_into_place, whole_folder
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import file_sha256, json_bytes, move_into_place, whole_folder
 
 PROVENANCE_NAME = "provenance.json"
 STARS_NAME = "stars.csv"

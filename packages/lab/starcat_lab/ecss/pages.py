@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from starcat.images.figure_file import own_style
+from starcat.images.overlay import own_style
 from starcat.report.page import figure, html_page
 from starcat.report.plots import STYLE, headline
 from starcat_lab.ecss.trials import NOMINAL, WORST

@@ -94,7 +94,9 @@ def _curve(
             published, wanted = (percent, goal) if is_last and is_own else (None, None)
             made.append(
                 ExperimentRow(group,
-                    f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}", PRESET, experiment, "reference", published, None, wanted, x=value)
+                    f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
+                    PRESET, experiment, "reference",
+                    published, None, wanted, x=value)
             )  # fmt: skip
     return made
 

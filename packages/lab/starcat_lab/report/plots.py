@@ -9,7 +9,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.images.figure_file import own_style, write_figure
+from starcat.images.overlay import own_style, write_figure
 from starcat.report.plots import STYLE, headline
 from starcat_lab.report.tables import Line, groups_of, method_of
 

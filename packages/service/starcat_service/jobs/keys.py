@@ -15,7 +15,7 @@ from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import SourceMissing, reason
 from starcat.specs.build_spec import BuildSpec
-from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.atomic import file_sha256, json_bytes
 from starcat.store.layout import is_store
 from starcat.version import __version__
 from starcat_service.jobs.job import Kind

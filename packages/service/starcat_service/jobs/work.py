@@ -28,8 +28,7 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.storage.atomic import sync_to_disk
-from starcat.storage.locks import locked
+from starcat.storage.atomic import locked, sync_to_disk
 from starcat.workers.channel import Channel
 from starcat.workers.confinement import limit_memory
 from starcat.workers.messages import DONE, ERROR, PROGRESS

@@ -9,7 +9,7 @@ from typing import Any
 
 from starcat.bands.response import response_from_text, shipped, shipped_names
 from starcat.errors import ConfigError
-from starcat.specs.camera_response import MAX_ROWS
+from starcat.specs.camera_sensor import MAX_ROWS
 from starcat.specs.reading import value_at
 
 NAME = "camera.response.name"

@@ -11,7 +11,7 @@ from fastapi.responses import Response, StreamingResponse
 
 from starcat.errors import QueryLimitError, TargetMissing
 from starcat.exchange.columns import Label
-from starcat.exchange.votable_fields import error_document
+from starcat.exchange.votable import error_document
 from starcat.store.layout import is_store
 from starcat_service.access import Reader
 from starcat_service.problems import ProblemDetails

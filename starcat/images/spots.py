@@ -1,17 +1,87 @@
-"""How wide the stars of an image are: from many spots, most of which may be something else.
-
-Input are an image above its background and places of light in it, output is one number, the
-standard deviation of a star's spot before the pixels sample it.
-"""
+"""Spots of an image: their noise, their width, and a second look for what was missed."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from starcat.arrays import Array, Mask
-from starcat.images.background import SkyLevels, pixels_around
+from starcat.arrays import Array, Mask, Pixels
+from starcat.geometry.camera import Camera
+from starcat.images.background import SkyLevels, pixels_around, unmasked
+from starcat.matcher.centroids import MeasuredFrame, upside_down
+from starcat.matcher.result import MatchResult, Reason, Refusal
+
+CREDIBLE_CHI_SQUARE = (0.5, 2.0)
+"""Reduced chi-squares of an answer between which the noise of its spots is taken as its weights."""
+
+MIN_DEPTH = 2.0
+"""Standard deviations from a sky that was not clipped down to its darkest pixel, at least."""
+
+
+def centroid_sigma_px(
+    flux: Array, noise: Array, sigma_px: float, gain_e_per_adu: float, window_px: float
+) -> Array:
+    """Return the standard errors of windowed centroids on each axis; infinite where not known.
+
+    That is without light, or with a gain that is NaN.
+
+    ``flux`` is the light of each spot and ``noise`` the standard deviation of a pixel of its
+    background, both in steps of the image; the spot as the pixels show it and the window are
+    Gaussians of ``sigma_px`` and ``window_px``. With a window as wide as the spot the errors are
+    sqrt(8 pi) s^2 noise / flux for the background, the least that there can be, and
+    4/3 s / sqrt(electrons) for the photons, added in squares.
+    """
+    spot, window = sigma_px**2, window_px**2
+    # A centroid is where the windowed first moment is zero. That moment falls by `slope` times
+    # the light a pixel; its variance is the noise through the squared window.
+    slope = (window / (window + spot)) ** 2
+    bright = np.where(flux > 0.0, flux, np.nan)
+    of_sky = 0.5 * np.pi * window**2 * (noise / bright) ** 2
+    of_photons = (window / (window + 2.0 * spot)) ** 2 * spot / (bright * gain_e_per_adu)
+    return np.asarray(np.nan_to_num(np.sqrt(of_sky + of_photons) / slope, nan=np.inf))
+
+
+def noise_at(levels: SkyLevels, centroids_px: Pixels) -> Array:
+    """Return the noise of a pixel around each spot; larger where noise is not white."""
+    height, width = levels.noise.shape
+    x, y = np.clip(np.nan_to_num(centroids_px).astype(np.int64), 0, (width - 1, height - 1)).T
+    return np.asarray(levels.noise[y, x] * levels.excess, dtype=np.float64)
+
+
+def electrons_per_step(levels: SkyLevels) -> float:
+    """Judge the gain of a camera from the noise of the sky, as if its photons were all noise.
+
+    The black point is taken to be the darkest pixel. Read noise makes the gain seem smaller than
+    it is, and the errors of bright stars larger. NaN where the sky was clipped, so that no pixel
+    is darker than it by `MIN_DEPTH` of its noise.
+    """
+    background = unmasked(levels.raw - levels.above, levels.mask)
+    sky = float(np.median(background, overwrite_input=True))
+    del background
+    depth = sky - float(unmasked(levels.raw, levels.mask).min())
+    noise = float(np.median(levels.noise))
+    if not noise:
+        return 1.0
+    return depth / noise**2 if depth >= MIN_DEPTH * noise else math.nan
+
+
+def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
+    """Return the answer to an image, weighted by the noise of its spots where that is their error.
+
+    In a lens that is not calibrated it is not all of it, and in a picture whose sky was clipped it
+    is not known: there all spots weigh the same.
+    """
+    if not result.ok:
+        return result
+    weighted = result.with_noise(sigma_px)
+    low, high = CREDIBLE_CHI_SQUARE
+    return weighted if low <= weighted.reduced_chi_square <= high else result
+
 
 SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
 _STEP = 1.15
@@ -146,3 +216,52 @@ def _densest(values: Array) -> float:
         first = int(spans.argmin())
         values = values[first : first + half]
     return float(np.median(values))
+
+
+FOV_ERROR = 0.05
+"""Error of the focal length that is allowed where none is stated. Data sheets are off by so much:
+an IMX219 with 48.8 deg on paper has 50.5."""
+
+WIDE_FOV_ERROR = 0.15
+"""Error that a second look allows."""
+
+Search = Callable[[MeasuredFrame, float], MatchResult]
+"""The answer to a frame with an error of the focal length."""
+
+
+def look_again(
+    search: Search,
+    frame: MeasuredFrame,
+    camera: Camera,
+    refused: MatchResult,
+    fov_error: float,
+    *,
+    is_scale_free: bool,
+    flip: bool | None = None,
+) -> MatchResult:
+    """Return a refused answer with a refusal that says what was found in a second look, if any."""
+    mirrored = search(upside_down(frame, camera.height_px), fov_error)
+    if mirrored.ok:
+        return _refused(refused, mirrored, "mirrored", None, flip)
+    if is_scale_free:
+        scaled = search(frame, WIDE_FOV_ERROR)
+        if scaled.ok and scaled.camera is not None:
+            factor = scaled.camera.focal_length_px / camera.focal_length_px
+            return _refused(refused, scaled, "scale", factor - 1.0)
+    return refused
+
+
+def _refused(
+    refused: MatchResult,
+    found: MatchResult,
+    reason: Reason,
+    focal_error: float | None,
+    flip: bool | None = None,
+) -> MatchResult:
+    usable = len(found.star_index) - len(found.dropped)
+    chance = found.false_match_probability
+    why = Refusal(
+        reason, found.n_matched, chance, n_centroids=usable, camera=found.camera,
+        focal_error=focal_error, flip=flip,
+    )  # fmt: skip
+    return replace(refused, refusal=why)
