@@ -2,3 +2,7 @@
 
 The room needs numpy and h5py only, so that it can run on a small machine.
 """
+
+from starcat.rooms import lazy_names
+
+__getattr__ = lazy_names(__name__, __file__)

@@ -1,1 +1,5 @@
 """Specs: what a build is asked for, checked key by key."""
+
+from starcat.rooms import lazy_names
+
+__getattr__ = lazy_names(__name__, __file__)

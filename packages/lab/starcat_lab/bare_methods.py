@@ -9,20 +9,22 @@ from dataclasses import replace
 import numpy as np
 
 from starcat.arrays import Array, Rows
-from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database
-from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.consensus import references
-from starcat.matcher.methods.hausdorff import (
+from starcat.geometry import Camera, separation
+from starcat.matcher import (
+    Database,
+    Matcher,
+    MatchResult,
+    Observation,
+    as_frame,
     distances_around,
     lowest,
     means_of_minima,
+    no_match,
+    observe,
     rank_by_points,
     rank_by_separations,
+    references,
 )
-from starcat.matcher.observation import Observation, as_frame, observe
-from starcat.matcher.result import MatchResult, no_match
 
 LIMIT_PX = 12.0
 """Mean L1 distance up to which the baseline of S1 accepts its best star."""

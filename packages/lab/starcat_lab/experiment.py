@@ -23,18 +23,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import starcat
-from starcat.artifact.reader import open_artifact
-from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
-from starcat.geometry.camera import Camera
-from starcat.geometry.proximity import pairs_within
-from starcat.geometry.sphere import directions_from_radec
-from starcat.matcher.c_engine import library_version
-from starcat.matcher.database import open_database
-from starcat.matcher.matcher import Matcher
-from starcat.matcher.settings import REACH, TriangleOrder
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
-from starcat.stars.star_table import floats_of
-from starcat.storage.atomic import whole_file
+from starcat.artifact import open_artifact
+from starcat.geometry import (
+    Camera,
+    directions_from_radec,
+    matrix_from_quaternion,
+    matrix_from_radec_roll,
+    pairs_within,
+)
+from starcat.matcher import REACH, Matcher, TriangleOrder, library_version, open_database
+from starcat.simulation import Noise, Sky, simulate_frame
+from starcat.stars import floats_of
+from starcat.storage import whole_file
 from starcat_lab.bare_methods import ANSWERS
 from starcat_lab.score import Score, score
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import duckdb
 
-from starcat.matcher.settings import CERTAIN
-from starcat.simulation.selftest import wilson_interval
+from starcat.matcher import CERTAIN
+from starcat.simulation import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
 _HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"

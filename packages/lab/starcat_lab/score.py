@@ -13,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix, turn_between
-from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
-from starcat.matcher.result import MatchResult
-from starcat.matcher.stars import ARCSEC
-from starcat.simulation.simulate import SimulatedFrame
+from starcat.geometry import Camera, matrix_from_quaternion, quaternion_from_matrix, turn_between
+from starcat.matcher import ARCSEC, Database, MatchResult
+from starcat.simulation import SimulatedFrame
 
 
 @dataclass(frozen=True)

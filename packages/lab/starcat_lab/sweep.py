@@ -11,12 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.reader import open_artifact
+from starcat.artifact import open_artifact
 from starcat.errors import ConfigError
-from starcat.geometry.camera import Camera
-from starcat.matcher.database import open_database, products_in
-from starcat.matcher.methods.table import METHODS, best_method, method_named
-from starcat.simulation.simulate import Noise
+from starcat.geometry import Camera
+from starcat.matcher import METHODS, best_method, method_named, open_database, products_in
+from starcat.simulation import Noise
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, tolerance_for
 
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from starcat.errors import StarcatError
-from starcat.images.spots import FOV_ERROR
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
+from starcat.images import FOV_ERROR
+from starcat.specs import BuildSpec, spec_from_dict
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem, problem_of
 

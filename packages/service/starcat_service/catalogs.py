@@ -18,24 +18,24 @@ import numpy as np
 from cachetools import LRUCache
 from pydantic import BaseModel, Field
 
-from starcat.catalog.source import data_source, star_sources
-from starcat.catalog.source_files import locate
+from starcat.catalog import data_source, locate, star_sources
 from starcat.errors import SourceMissing
-from starcat.pipeline.draft import Draft
-from starcat.pipeline.estimate import (
+from starcat.pipeline import (
+    MAX_FIELD_STARS,
+    Draft,
     Estimate,
+    Starter,
     choose_stars,
     chosen_bytes,
+    enough_limit,
     estimate_draft,
     magnitude_range,
     read_draft,
     reading_keys,
+    starter_spec,
 )
-from starcat.pipeline.guide_stars import MAX_FIELD_STARS
-from starcat.pipeline.starter import Starter, enough_limit, starter_spec
-from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.reading import preset, preset_names
-from starcat.storage.atomic import json_bytes
+from starcat.specs import BuildSpec, CameraSpec, preset, preset_names
+from starcat.storage import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files
 from starcat_service.problems import Problem

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from starcat.cli.console import print_json, print_json_line, print_table, say, show
-from starcat.cli.options import Json
+from starcat.cli import Json, print_json, print_json_line, print_table, say, show
 from starcat.errors import ConfigError, TargetMissing
 from starcat.version import install_command
 

@@ -18,24 +18,21 @@ from typing import Any, TypeVar
 import numpy as np
 
 from starcat.errors import BuildError
-from starcat.geometry.sphere import saff_kuijlaars
-from starcat.pipeline.cost import Cost
-from starcat.pipeline.estimate import Estimate
-from starcat.pipeline.starter import LimitRow, Starter
-from starcat.products.coverage import CoverageSummary, Spread
-from starcat.products.tiling import FieldStars
-from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.reading import spec_from_dict
-from starcat.workers.channel import Channel, return_free_memory
-from starcat.workers.messages import (
+from starcat.geometry import saff_kuijlaars
+from starcat.pipeline import Cost, Estimate, LimitRow, Starter
+from starcat.products import CoverageSummary, FieldStars, Spread
+from starcat.specs import BuildSpec, CameraSpec, spec_from_dict
+from starcat.workers import (
     DONE,
     ERROR,
+    Channel,
     MalformedMessage,
+    WorkerProcess,
     error_content,
     error_of,
     from_json,
+    return_free_memory,
 )
-from starcat.workers.process import WorkerProcess
 from starcat_service.catalogs import RETRY_S, WAIT_S, CatalogRead, Catalogs
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import asker

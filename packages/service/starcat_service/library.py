@@ -9,13 +9,13 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.artifact import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
-from starcat.geometry.camera import Camera
-from starcat.releases.tree import Blob, tree_files
+from starcat.geometry import Camera
+from starcat.releases import Blob, tree_files
 from starcat.sections import version_numbers
-from starcat.specs.build_spec import CameraSpec
-from starcat.storage.atomic import file_sha256
+from starcat.specs import CameraSpec
+from starcat.storage import file_sha256
 from starcat_service.paths import DATABASE_ID, ServicePaths
 from starcat_service.problems import Problem
 

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from starcat.errors import TargetMissing
-from starcat.storage.atomic import make_folder
+from starcat.storage import make_folder
 
 DATABASE_ID = re.compile(r"[0-9a-f]{16}")
 JOB_ID = re.compile(r"[0-9a-f]{32}")

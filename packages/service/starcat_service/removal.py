@@ -15,7 +15,7 @@ import shutil
 import time
 from pathlib import Path
 
-from starcat.query.session import SCRATCH_PREFIX
+from starcat.query import SCRATCH_PREFIX
 from starcat_service.jobs.job import ENDED, QUERY, State
 from starcat_service.paths import DATABASE_ID, checked
 from starcat_service.problems import Problem
@@ -81,8 +81,7 @@ def _renew_signatures(service: Service) -> None:
     """Renew what the registry is signed with, in good time."""
     key = service.settings.signing_key
     if key is not None:
-        from starcat.releases.metadata import signing_with
-        from starcat.releases.signing import renew_if_old
+        from starcat.releases import renew_if_old, signing_with
 
         if renew_if_old(service.paths.registry, signing_with([key])):
             _logger.info("renewed the signatures of the registry")

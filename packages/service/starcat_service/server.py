@@ -21,7 +21,7 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
-from starcat.storage.atomic import locked, make_folder
+from starcat.storage import locked, make_folder
 from starcat_service.access import network_of
 from starcat_service.app import make_app
 from starcat_service.jobs.slots import JobSlots

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from starcat.errors import ConfigError, SourceError, suggest
 from starcat.failures import validation_message
-from starcat.storage.regular_files import read_regular_file
+from starcat.storage import read_regular_file
 
 FILE_NAME = "service.toml"
 MAX_FILE_BYTES = 1 << 20
@@ -164,7 +164,7 @@ def _check_signing_key(settings: ServiceSettings, path: Path) -> None:
     """Refuse a key that lies among what the service writes, or is none."""
     if settings.signing_key is None:
         return
-    from starcat.storage.keys import read_private
+    from starcat.storage import read_private
 
     if settings.signing_key.resolve().is_relative_to(settings.root):
         raise ConfigError(

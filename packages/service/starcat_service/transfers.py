@@ -20,9 +20,8 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.datastructures import MutableHeaders
 
 from starcat.errors import QueryLimitError, TargetMissing
-from starcat.exchange.columns import FirstRows
-from starcat.exchange.formats import FILE_FORMATS, FORMATS
-from starcat.releases.tree import Blob
+from starcat.exchange import FILE_FORMATS, FORMATS, FirstRows
+from starcat.releases import Blob
 from starcat_service.paths import ServicePaths
 from starcat_service.problems import Problem, refusals
 

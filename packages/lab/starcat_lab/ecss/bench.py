@@ -19,25 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix, Pixels, Rows
-from starcat.artifact.reader import open_artifact
+from starcat.artifact import open_artifact
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import (
+from starcat.geometry import (
+    Camera,
     after_turn,
     matrix_from_quaternion,
     quaternion_from_matrix,
     random_attitudes,
     turn_between,
 )
-from starcat.geometry.camera import Camera
-from starcat.images.centroiding import Spots, centres_of_mass, find_spots
-from starcat.images.render import Optics, star_electrons
-from starcat.matcher.matcher import Matcher
-from starcat.matcher.settings import REACH
-from starcat.matcher.stars import ARCSEC
-from starcat.simulation.simulate import Sky
-from starcat.sky.bodies import bodies_seen
-from starcat.sky.observer import Observer
-from starcat.specs.star_sensor import Sensor
+from starcat.images import Optics, Spots, centres_of_mass, find_spots, star_electrons
+from starcat.matcher import ARCSEC, REACH, Matcher
+from starcat.simulation import Sky
+from starcat.sky import Observer, bodies_seen
+from starcat.specs import Sensor
 from starcat_lab.experiment import catalog_of_artifact
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")

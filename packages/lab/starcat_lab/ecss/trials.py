@@ -14,22 +14,21 @@ from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import (
+from starcat.geometry import (
     information,
     matrix_from_radec_roll,
     quaternion_from_matrix,
+    radec_from_directions,
     random_attitudes,
+    saff_kuijlaars,
     solve_wahba_svd,
 )
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
-from starcat.images.background import load_sep
-from starcat.images.centroiding import centres_of_mass
-from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.stars import ARCSEC
-from starcat.products.blends import widths_px
+from starcat.images import centres_of_mass, load_sep
+from starcat.matcher import ARCSEC, MIN_STARS
+from starcat.products import widths_px
 from starcat.progress import Progress
-from starcat.sky.observer import aberrated
-from starcat.specs.star_sensor import Sensor
+from starcat.sky import aberrated
+from starcat.specs import Sensor
 from starcat_lab.campaign import side_by_side
 from starcat_lab.ecss.bench import (
     Bench,

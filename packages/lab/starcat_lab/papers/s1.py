@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.geometry.camera import Camera
-from starcat.simulation.simulate import Noise
+from starcat.geometry import Camera
+from starcat.simulation import Noise
 from starcat_lab.experiment import (
     Attitudes,
     Experiment,

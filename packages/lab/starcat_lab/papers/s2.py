@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from starcat.geometry.camera import Camera
-from starcat.geometry.distortion import Distortion
-from starcat.simulation.simulate import Noise
+from starcat.geometry import Camera, Distortion
+from starcat.simulation import Noise
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, paper_experiment
 
 PRESET = "sao-12deg"

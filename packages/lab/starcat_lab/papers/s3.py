@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import matrix_from_radec_roll
-from starcat.geometry.camera import Camera
-from starcat.matcher.methods.triangle import is_well_shaped
+from starcat.geometry import Camera, matrix_from_radec_roll
+from starcat.matcher import is_well_shaped
 from starcat_lab.experiment import Paper, Statistic, catalog_of_artifact
 
 PRESET = "sao-12deg-512"

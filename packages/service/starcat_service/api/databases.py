@@ -13,12 +13,10 @@ from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
-from starcat.artifact.diff import Difference, diff_artifacts
-from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.artifact.reader import DatabaseFolder
+from starcat.artifact import MANIFEST_NAME, DatabaseFolder, Difference, diff_artifacts
 from starcat.errors import ProductError, TargetMissing
-from starcat.releases.tree import Blob
-from starcat.report.coverage_map import Fields
+from starcat.releases import Blob
+from starcat.report import Fields
 from starcat_service.access import Publisher, Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem

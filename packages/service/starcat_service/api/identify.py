@@ -16,8 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 from starlette.datastructures import UploadFile
 
 from starcat.failures import validation_message
-from starcat.images.identify_options import IdentifyOptions
-from starcat.images.solve_files import IMAGE_SUFFIXES
+from starcat.images import IMAGE_SUFFIXES, IdentifyOptions
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, refusals
 from starcat_service.service import Service, TheService

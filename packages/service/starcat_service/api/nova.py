@@ -25,7 +25,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from starcat.errors import StarcatError, TargetMissing
-from starcat.images.identify_options import IdentifyOptions
+from starcat.images import IdentifyOptions
 from starcat_service.access import Identities, network_of, principal_of
 from starcat_service.api.identify import FrameUpload, identify_upload
 from starcat_service.candidates import (

@@ -13,8 +13,16 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import ConfigError, TargetMissing
-from starcat.releases.publishing import Published, publish_artifact, recorded
-from starcat.releases.tree import INDEX_NAME, METADATA, METADATA_PATH, RELEASE_PATH, Listed
+from starcat.releases import (
+    INDEX_NAME,
+    METADATA,
+    METADATA_PATH,
+    RELEASE_PATH,
+    Listed,
+    Published,
+    publish_artifact,
+    recorded,
+)
 from starcat_service.access import Publisher, Reader
 from starcat_service.problems import REFUSALS
 from starcat_service.records import Records
@@ -158,7 +166,7 @@ def _signed(service: Service, folder: pathlib.Path) -> Published:
                 "sets signing_key in service.toml"
             )
         return publish_artifact(folder, str(registry))
-    from starcat.releases.metadata import signing_with
+    from starcat.releases import signing_with
 
     return publish_artifact(folder, str(registry), signing=signing_with([key]))
 

@@ -7,13 +7,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.estimate import Estimate
-from starcat.pipeline.starter import LimitRow, Starter, advice
-from starcat.products.coverage import Spread
-from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.keys import spec_toml
-from starcat.specs.reading import preset
+from starcat.geometry import radec_from_directions
+from starcat.pipeline import Estimate, LimitRow, Starter, advice
+from starcat.products import Spread
+from starcat.specs import BuildSpec, CameraSpec, preset, spec_toml
 
 MAX_FIELDS = 50_000  # fields that are listed one by one at the most
 

@@ -12,9 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from starcat.errors import ConfigError
 from starcat.failures import validation_message
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import (
+from starcat.specs import (
     MAX_CHARACTERS,
+    BuildSpec,
     changed,
     content_of_toml,
     preset,

@@ -11,10 +11,8 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import AnswerTooLarge, QueryError
-from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import Macro, NamedQuery, gallery, macros, named_query
-from starcat.query.result import ResultTable
-from starcat.query.targets import View
+from starcat.exchange import FILE_FORMATS, FORMATS, FileFormat
+from starcat.query import Macro, NamedQuery, ResultTable, View, macros, named_queries, named_query
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
@@ -156,7 +154,7 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
 @router.get("/queries", summary="Queries by name")
 def queries(reader: Reader) -> list[NamedQuery]:
     """Return the queries that people ask often, with their values."""
-    return list(gallery().values())
+    return list(named_queries().values())
 
 
 @router.get("/macros", summary="Functions of queries")

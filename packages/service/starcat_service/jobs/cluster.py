@@ -23,11 +23,11 @@ from tarfile import open as open_tar
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from starcat.artifact.verify import check_artifact
+from starcat.artifact import check_artifact
 from starcat.errors import ProductError, SourceError
-from starcat.specs.reading import spec_from_dict
-from starcat.storage.atomic import READ_ONLY, sync_to_disk
-from starcat.store.cluster import cluster
+from starcat.specs import spec_from_dict
+from starcat.storage import READ_ONLY, sync_to_disk
+from starcat.store import dask_cluster
 from starcat_service.jobs.job import Attempt, Job, Outcome, failed, interrupt
 from starcat_service.jobs.keys import build_key, ingest_key
 from starcat_service.jobs.runner import (
@@ -93,7 +93,7 @@ class ClusterJobs:
             try:
                 if self._client is None or self._client.status != "running":
                     self._closing.close()
-                    self._client = self._closing.enter_context(cluster(scheduler=scheduler))
+                    self._client = self._closing.enter_context(dask_cluster(scheduler=scheduler))
                     self._client.subscribe_topic(TOPIC, self._receive)
                 self.problem = None if self._client.nthreads() else "it has no workers"
             except Exception as error:  # whatever the workers and the library raise

@@ -11,12 +11,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.source import data_source, map_of
-from starcat.catalog.source_files import SourceFiles, locate
+from starcat.catalog import SourceFiles, data_source, locate, map_of
 from starcat.errors import SourceMissing, reason
-from starcat.specs.build_spec import BuildSpec
-from starcat.storage.atomic import file_sha256, json_bytes
-from starcat.store.layout import is_store
+from starcat.specs import BuildSpec
+from starcat.storage import file_sha256, json_bytes
+from starcat.store import is_store
 from starcat.version import __version__
 from starcat_service.jobs.job import Kind
 from starcat_service.records import Records

@@ -15,9 +15,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from starcat.storage.atomic import make_folder
-from starcat.workers.messages import DONE, ERROR, MalformedMessage, from_json
-from starcat.workers.process import WorkerProcess
+from starcat.storage import make_folder
+from starcat.workers import DONE, ERROR, MalformedMessage, WorkerProcess, from_json
 from starcat_service.jobs.job import Outcome, failed
 from starcat_service.jobs.work import Order, out_of_memory
 

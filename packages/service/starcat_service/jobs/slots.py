@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from starcat.storage.atomic import locked
+from starcat.storage import locked
 from starcat_service.jobs.cluster import ClusterJobs
 from starcat_service.jobs.job import (
     QUERY,

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.catalog.ingest import ingest_options
+from starcat.catalog import ingest_options
 from starcat.errors import ProductError, TargetMissing
 from starcat.sections import version_numbers
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
+from starcat.specs import BuildSpec, spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, finish_job, job_in, job_of
 from starcat_service.jobs.keys import build_key, ingest_key, key_of

@@ -28,10 +28,8 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.storage.atomic import locked, sync_to_disk
-from starcat.workers.channel import Channel
-from starcat.workers.confinement import limit_memory
-from starcat.workers.messages import DONE, ERROR, PROGRESS
+from starcat.storage import locked, sync_to_disk
+from starcat.workers import DONE, ERROR, PROGRESS, Channel, limit_memory
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
@@ -104,8 +102,8 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     else:
         log("info", f"database {database_id} is there already")
         return result
-    from starcat.pipeline.build import build_database
-    from starcat.specs.reading import spec_from_dict
+    from starcat.pipeline import build_database
+    from starcat.specs import spec_from_dict
 
     spec = spec_from_dict(dict(order.request["spec"]), "spec")
     made = order.work / database_id
@@ -143,7 +141,7 @@ def place_database(made: Path, final: Path) -> None:
 
 
 def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
-    from starcat.catalog.source_files import locate
+    from starcat.catalog import locate
 
     asked = order.request
     source, to = str(asked["source"]), asked["to"]
@@ -154,8 +152,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     final = order.paths.catalogs / name
     made = order.work / name
     if to == "hats":
-        from starcat.store.ingest import ingest_to_store
-        from starcat.store.plan import StoreOptions
+        from starcat.store import StoreOptions, ingest_to_store
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
@@ -163,9 +160,9 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
-        from starcat.catalog.ingest import write_star_tables
-        from starcat.stars.verdict import rejected_path
-        from starcat.store.reading import read_catalog
+        from starcat.catalog import write_star_tables
+        from starcat.stars import rejected_path
+        from starcat.store import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
         write_star_tables(read, made)
@@ -183,8 +180,8 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 
 def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
-    from starcat.matcher.matcher import Matcher
-    from starcat.simulation.selftest import self_test
+    from starcat.matcher import Matcher
+    from starcat.simulation import self_test
     from starcat_lab.curves import measure_curves
 
     asked = order.request

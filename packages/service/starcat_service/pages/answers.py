@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlencode
 
-from starcat.images.picture import picture_name
-from starcat.images.spots import WIDE_FOV_ERROR
+from starcat.images import WIDE_FOV_ERROR, picture_name
 from starcat_service.pages.sky import star_names_of
 
 MAX_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more

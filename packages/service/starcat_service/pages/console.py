@@ -12,9 +12,8 @@ from fastapi.responses import Response
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
-from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
-from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
-from starcat.query.result import ResultTable
+from starcat.exchange import FORMATS, PAGE_FORMATS, PageFormat
+from starcat.query import NamedQuery, ResultTable, guessed, macros, named_queries, named_query
 from starcat_service.access import Reader
 from starcat_service.api.sql import Form, SqlQuery, SqlQuestion, query_of, result_file, result_table
 from starcat_service.library import ListedDatabase
@@ -156,7 +155,7 @@ def _page(
         chosen=chosen,
         values=_values_in(text, chosen, form.values),
         others=[(one.id, one.title) for one in others],
-        queries=list(gallery().values()),
+        queries=list(named_queries().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),
         row_choices=ROWS,

@@ -11,18 +11,11 @@ from fastapi import Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from starcat.artifact.diff import Difference
+from starcat.artifact import Difference
 from starcat.errors import TargetMissing
-from starcat.geometry.sphere import directions_from_radec
-from starcat.matcher.methods.table import METHODS
-from starcat.report.coverage_map import (
-    Fields,
-    colour_bins,
-    field_at,
-    nearest_raster,
-    raster_png,
-    sky_map,
-)
+from starcat.geometry import directions_from_radec
+from starcat.matcher import METHODS
+from starcat.report import Fields, colour_bins, field_at, nearest_raster, raster_png, sky_map
 from starcat.sections import version_numbers
 from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of

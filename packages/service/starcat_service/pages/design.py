@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl, urlencode
 import tomlkit
 
 from starcat.errors import ConfigError
-from starcat.specs.reading import changed, preset, preset_names
+from starcat.specs import changed, preset, preset_names
 from starcat_service.pages.draft import (
     TEXT,
     SpecForm,

@@ -17,16 +17,18 @@ import tomlkit
 from pydantic import ValidationError
 from tomlkit.exceptions import TOMLKitError
 
-from starcat.catalog.source import data_source, source_names
+from starcat.catalog import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import (
+from starcat.products import USUAL_PRODUCTS
+from starcat.specs import (
+    REQUIRED,
+    BuildSpec,
+    SpecKey,
     all_that_is_wrong,
     content_of_toml,
     put_key,
     spec_from_dict,
+    spec_sections,
     value_at,
 )
 from starcat_service.pages.response import FILE, NAME, keys_of_another, responses_of

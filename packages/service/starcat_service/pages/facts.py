@@ -10,13 +10,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact import MANIFEST_NAME
 from starcat.errors import ProductError, reason
-from starcat.releases.publishing import recorded
-from starcat.selection.ruleset import ALL_REASONS
-from starcat.simulation.selftest import rates_of
-from starcat.stars.verdict import Reason
-from starcat.storage.schema import product_schema
+from starcat.releases import recorded
+from starcat.selection import ALL_REASONS
+from starcat.simulation import rates_of
+from starcat.stars import Reason
+from starcat.storage import product_schema
 from starcat_service.api.databases import REPORT
 from starcat_service.library import ListedDatabase
 from starcat_service.service import Service

@@ -18,14 +18,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
-from starcat.geometry.camera import Camera
-from starcat.images.identify_options import IdentifyOptions
-from starcat.images.render import write_simulated
-from starcat.matcher.centroids import is_number
-from starcat.matcher.database import open_database
-from starcat.matcher.methods.table import METHODS
-from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.camera_file import camera_toml, parse_camera
+from starcat.geometry import Camera
+from starcat.images import IdentifyOptions, write_simulated
+from starcat.matcher import METHODS, is_number, open_database
+from starcat.simulation import Noise, simulate_frames
+from starcat.specs import camera_toml, parse_camera
 from starcat_service.access import Reader
 from starcat_service.api.identify import (
     MIB,

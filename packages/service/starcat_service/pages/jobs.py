@@ -12,7 +12,7 @@ from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from starcat.progress import BYTE_STAGES
-from starcat.simulation.selftest import rates_of
+from starcat.simulation import rates_of
 from starcat_service.access import Builder, Reader
 from starcat_service.jobs.job import Event, Job, State
 from starcat_service.jobs.submission import cancel_job, may_change, retry_job

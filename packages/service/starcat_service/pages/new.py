@@ -11,12 +11,11 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 
-from starcat.catalog.source import data_source
+from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
-from starcat.pipeline.starter import advice
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.specs.build_spec import CameraSpec
-from starcat.specs.reading import preset, preset_names
+from starcat.pipeline import advice
+from starcat.products import USUAL_PRODUCTS
+from starcat.specs import CameraSpec, preset, preset_names
 from starcat_service.access import Reader, principal_of
 from starcat_service.catalogs import is_here
 from starcat_service.jobs.submission import check_title, submit_build

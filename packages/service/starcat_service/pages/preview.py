@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
-from starcat.pipeline.estimate import Estimate
-from starcat.pipeline.starter import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD
-from starcat.report.coverage_map import (
+from starcat.geometry import radec_from_directions, saff_kuijlaars
+from starcat.pipeline import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD, Estimate
+from starcat.report import (
+    BLIND_SHARE,
     FIXED_BINS,
     Counts,
     Fields,
@@ -21,9 +21,8 @@ from starcat.report.coverage_map import (
     raster_png,
     sky_map,
 )
-from starcat.report.report import BLIND_SHARE
-from starcat.simulation.selftest import wilson_interval
-from starcat.specs.build_spec import BuildSpec
+from starcat.simulation import wilson_interval
+from starcat.specs import BuildSpec
 from starcat_service.catalogs import Catalogs
 from starcat_service.pages.rendering import count_text
 

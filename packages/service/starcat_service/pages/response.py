@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from starcat.bands.response import response_from_text, shipped, shipped_names
+from starcat.bands import response_from_text, shipped, shipped_names
 from starcat.errors import ConfigError
-from starcat.specs.camera_sensor import MAX_ROWS
-from starcat.specs.reading import value_at
+from starcat.specs import MAX_ROWS, value_at
 
 NAME = "camera.response.name"
 FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside

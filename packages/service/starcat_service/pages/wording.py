@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from starcat.errors import words_of
-from starcat.matcher.result import bracketed
+from starcat.matcher import bracketed
 from starcat_service.problems import ProblemDetails, problem_of
 
 LABELS = {

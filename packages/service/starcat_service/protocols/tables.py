@@ -16,12 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
-from starcat.exchange.columns import unit_text
-from starcat.query.names import identifier
-from starcat.query.result import column_facts, facts_by_name
-from starcat.query.session import Session
-from starcat.query.targets import View
-from starcat.storage.parquet import DUCKDB_DATATYPES, write_parquet
+from starcat.exchange import unit_text
+from starcat.query import Session, View, column_facts, facts_by_name, identifier
+from starcat.storage import DUCKDB_DATATYPES, write_parquet
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from starcat.errors import ConfigError, quoted
-from starcat.query.names import identifier
-from starcat.storage.parquet import ARROW_DATATYPES
+from starcat.query import identifier
+from starcat.storage import ARROW_DATATYPES
 from starcat_service.protocols.tables import UPLOADS, TapColumn, TapTable
 
 MAX_COLUMNS = 1000

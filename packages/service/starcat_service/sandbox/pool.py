@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
 from starcat.errors import QueryError
-from starcat.query.engine import Allowance, warm_up
-from starcat.query.session import Limits, Session, open_session
-from starcat.storage.atomic import make_folder
+from starcat.query import Allowance, Limits, Session, open_session, warm_up
+from starcat.storage import make_folder
 from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.limiter import Limiter
 from starcat_service.settings import ServiceSettings

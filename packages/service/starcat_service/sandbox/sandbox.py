@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from starcat.errors import QueryLimitError
-from starcat.exchange.columns import Label
-from starcat.exchange.formats import FILE_FORMATS, FORMATS, WHOLE_FORMATS
-from starcat.workers.messages import DONE, MalformedMessage, error_of, from_json
-from starcat.workers.process import WorkerProcess
+from starcat.exchange import FILE_FORMATS, FORMATS, WHOLE_FORMATS, Label
+from starcat.workers import DONE, MalformedMessage, WorkerProcess, error_of, from_json
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
 from starcat_service.sandbox.pool import Pool

@@ -13,15 +13,21 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.workers.channel import Channel, return_free_memory
-from starcat.workers.confinement import forbid_writing, limit_memory, limit_time
-from starcat.workers.messages import DONE, ERROR, error_content
+from starcat.workers import (
+    DONE,
+    ERROR,
+    Channel,
+    error_content,
+    forbid_writing,
+    limit_memory,
+    limit_time,
+    return_free_memory,
+)
 from starcat_service.protocols.uploads import upload_facts
 
 if TYPE_CHECKING:
-    from starcat.images.identify_options import IdentifyOptions
-    from starcat.images.solve_files import FileAnswers, FrameAnswer
-    from starcat.matcher.matcher import Matcher
+    from starcat.images import FileAnswers, FrameAnswer, IdentifyOptions
+    from starcat.matcher import Matcher
 
 MATCHERS = 4
 """Databases that are kept open with the options that they were opened with."""
@@ -42,8 +48,7 @@ def identify_confined(
     A page is told more of each frame: the brightness of its centroids, and its WCS. Either way, the
     rows of a picture that matches mirrored are turned over.
     """
-    from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
-    from starcat.images.solve_files import identify_either_way, identify_file
+    from starcat.images import MATCHER_OPTIONS, IdentifyOptions, identify_either_way, identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
@@ -70,7 +75,7 @@ def identify_confined(
 
 def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
     """Return what a page keeps of a frame beside its answer, to link to it and to save it."""
-    from starcat.images.image_file import wcs_header
+    from starcat.images import wcs_header
 
     mag, wcs = answer.frame.mag, None
     if answer.result.ok:
@@ -84,7 +89,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
 
 @lru_cache(maxsize=MATCHERS)
 def _matcher(artifact: str, options: IdentifyOptions) -> Matcher:
-    from starcat.images.solve_files import open_matcher
+    from starcat.images import open_matcher
 
     return open_matcher(Path(artifact), options)
 
@@ -93,8 +98,7 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
     """Write a table to a file of another format: some are held in memory as a whole."""
     import pyarrow as pa
 
-    from starcat.exchange.columns import UNLABELLED, Label
-    from starcat.exchange.writers import write_batches
+    from starcat.exchange import UNLABELLED, Label, write_batches
 
     named = UNLABELLED if label is None else Label(**label)
     with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
@@ -103,7 +107,7 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
 
 def make_flight_image(artifact: str, target: str, method: str, endian: str) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
-    from starcat.exchange.onboard import export_image
+    from starcat.exchange import export_image
 
     made = export_image(Path(artifact), "onboard", Path(target), method=method, endian=endian)
     return len(made.made.data)

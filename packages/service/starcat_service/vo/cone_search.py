@@ -10,9 +10,8 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from starcat.errors import QueryLimitError, TargetMissing
-from starcat.exchange.columns import Label
-from starcat.exchange.votable import error_document
-from starcat.store.layout import is_store
+from starcat.exchange import Label, error_document
+from starcat.store import is_store
 from starcat_service.access import Reader
 from starcat_service.problems import ProblemDetails
 from starcat_service.protocols.cone import (

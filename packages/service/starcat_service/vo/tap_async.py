@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from starcat.errors import ConfigError, TargetMissing, quoted
-from starcat.exchange.formats import TAP_FORMATS
+from starcat.exchange import TAP_FORMATS
 from starcat_service.access import Reader
 from starcat_service.protocols.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
 from starcat_service.protocols.uws import (

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing
-from starcat.storage.atomic import make_folder, whole_file
+from starcat.storage import make_folder, whole_file
 from starcat_service.access import ANONYMOUS
 from starcat_service.jobs.job import ASKER, QUERY, Attempt, Outcome
 from starcat_service.paths import JOB_ID, ServicePaths, checked

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, StarcatError
-from starcat.exchange.columns import Label
-from starcat.exchange.formats import WHOLE_FORMATS, Format
-from starcat.exchange.writers import result_chunks
+from starcat.exchange import WHOLE_FORMATS, Format, Label, result_chunks
 from starcat.progress import Progress, no_progress
-from starcat.store.layout import is_store
+from starcat.store import is_store
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
 from starcat_service.protocols.adql import translate, translate_adql

@@ -1,0 +1,15 @@
+from starcat.geometry.attitude import after_turn as after_turn
+from starcat.geometry.attitude import information as information
+from starcat.geometry.attitude import matrix_from_quaternion as matrix_from_quaternion
+from starcat.geometry.attitude import matrix_from_radec_roll as matrix_from_radec_roll
+from starcat.geometry.attitude import quaternion_from_matrix as quaternion_from_matrix
+from starcat.geometry.attitude import random_attitudes as random_attitudes
+from starcat.geometry.attitude import solve_wahba_svd as solve_wahba_svd
+from starcat.geometry.attitude import turn_between as turn_between
+from starcat.geometry.camera import Camera as Camera
+from starcat.geometry.distortion import Distortion as Distortion
+from starcat.geometry.proximity import pairs_within as pairs_within
+from starcat.geometry.sphere import directions_from_radec as directions_from_radec
+from starcat.geometry.sphere import radec_from_directions as radec_from_directions
+from starcat.geometry.sphere import saff_kuijlaars as saff_kuijlaars
+from starcat.geometry.sphere import separation as separation

@@ -1,0 +1,2 @@
+from starcat.onboard.layout import BYTE_ORDERS as BYTE_ORDERS
+from starcat.onboard.layout import FEATURES as FEATURES

@@ -1,0 +1,12 @@
+from starcat.releases.metadata import signing_with as signing_with
+from starcat.releases.publishing import Published as Published
+from starcat.releases.publishing import publish_artifact as publish_artifact
+from starcat.releases.publishing import recorded as recorded
+from starcat.releases.signing import renew_if_old as renew_if_old
+from starcat.releases.tree import INDEX_NAME as INDEX_NAME
+from starcat.releases.tree import METADATA as METADATA
+from starcat.releases.tree import METADATA_PATH as METADATA_PATH
+from starcat.releases.tree import RELEASE_PATH as RELEASE_PATH
+from starcat.releases.tree import Blob as Blob
+from starcat.releases.tree import Listed as Listed
+from starcat.releases.tree import tree_files as tree_files

@@ -1,0 +1,16 @@
+from starcat.report.coverage_map import FIXED_BINS as FIXED_BINS
+from starcat.report.coverage_map import Counts as Counts
+from starcat.report.coverage_map import Fields as Fields
+from starcat.report.coverage_map import SkyMap as SkyMap
+from starcat.report.coverage_map import colour_bins as colour_bins
+from starcat.report.coverage_map import field_at as field_at
+from starcat.report.coverage_map import nearest_raster as nearest_raster
+from starcat.report.coverage_map import raster_png as raster_png
+from starcat.report.coverage_map import sky_map as sky_map
+from starcat.report.page import figure as figure
+from starcat.report.page import html_page as html_page
+from starcat.report.page import table as table
+from starcat.report.plots import STYLE as STYLE
+from starcat.report.plots import headline as headline
+from starcat.report.plots import save_plot as save_plot
+from starcat.report.report import BLIND_SHARE as BLIND_SHARE

@@ -1,0 +1,1 @@
+from starcat.selection.ruleset import ALL_REASONS as ALL_REASONS

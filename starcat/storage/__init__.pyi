@@ -1,0 +1,14 @@
+from starcat.storage.atomic import READ_ONLY as READ_ONLY
+from starcat.storage.atomic import file_sha256 as file_sha256
+from starcat.storage.atomic import json_bytes as json_bytes
+from starcat.storage.atomic import locked as locked
+from starcat.storage.atomic import make_folder as make_folder
+from starcat.storage.atomic import sync_to_disk as sync_to_disk
+from starcat.storage.atomic import whole_file as whole_file
+from starcat.storage.atomic import write_file as write_file
+from starcat.storage.keys import read_private as read_private
+from starcat.storage.parquet import ARROW_DATATYPES as ARROW_DATATYPES
+from starcat.storage.parquet import DUCKDB_DATATYPES as DUCKDB_DATATYPES
+from starcat.storage.parquet import write_parquet as write_parquet
+from starcat.storage.regular_files import read_regular_file as read_regular_file
+from starcat.storage.schema import product_schema as product_schema

@@ -1,0 +1,13 @@
+from starcat.workers.channel import Channel as Channel
+from starcat.workers.channel import return_free_memory as return_free_memory
+from starcat.workers.confinement import forbid_writing as forbid_writing
+from starcat.workers.confinement import limit_memory as limit_memory
+from starcat.workers.confinement import limit_time as limit_time
+from starcat.workers.messages import DONE as DONE
+from starcat.workers.messages import ERROR as ERROR
+from starcat.workers.messages import PROGRESS as PROGRESS
+from starcat.workers.messages import MalformedMessage as MalformedMessage
+from starcat.workers.messages import error_content as error_content
+from starcat.workers.messages import error_of as error_of
+from starcat.workers.messages import from_json as from_json
+from starcat.workers.process import WorkerProcess as WorkerProcess
