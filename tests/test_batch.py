@@ -14,7 +14,7 @@ from starcat.api.functions import calibrate, read_frames
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
-from starcat.images.overlay import write_contact_sheet
+from starcat.images.contact_sheet import write_contact_sheet
 from starcat.images.render import write_simulated
 from starcat.images.solve_files import LocalInputs
 from starcat.matcher.database import open_database

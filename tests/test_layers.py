@@ -304,7 +304,7 @@ import numpy as np
 calls = [
     lambda: sky_objects.wcs(Camera(9, 9, 9.0), np.eye(3)),
     lambda: sky_objects.skycoord(0.0, 0.0),
-    lambda: sky_objects.table(NO_STARS, {{}}),
+    lambda: sky_objects.sky_object_table(NO_STARS, {{}}),
 ]
 for call in calls:
     try:

@@ -28,7 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.cli.matching import print_sky_in_time
+from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import (
     matrix_from_quaternion,

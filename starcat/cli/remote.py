@@ -80,7 +80,7 @@ def sql_remotely(
 
 def identify_remotely(context: typer.Context, database: str, file: Path) -> None:
     """Have a service identify frames, and print the answers."""
-    from starcat.cli.matching import print_contents
+    from starcat.cli.matches import print_contents
 
     client, given = client_of(context), context.params
     picture: Path | None = given["picture"]

@@ -12,8 +12,8 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import RecordFile, data_source
+from starcat.query.names import CATALOGS
 
 BLANKS = [" " * width for width in range(14)]
 

@@ -1,0 +1,291 @@
+"""What ``starcat identify`` prints."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
+from starcat.errors import ConfigError, NotIdentifiedError, words_of
+from starcat.failures import option_of
+from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.images.batch import BatchItem
+from starcat.images.solve_files import FrameAnswer
+from starcat.matcher.centroids import MAX_CENTROIDS
+from starcat.matcher.database import Database
+from starcat.matcher.result import bracketed
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
+from starcat.simulation.simulate import SimulatedFrame
+
+NAMED = 3  # frames that are named where some were not identified
+
+CORRECTED = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg", "q_body_from_icrs")
+"""What the main table has without and with the correction for aberration."""
+
+
+@dataclass
+class Tally:
+    """How many frames of a file there were and how many were identified, and the first answer."""
+
+    frames: int = 0
+    identified: int = 0
+    first: FrameAnswer | None = None
+    unidentified: list[str] = field(default_factory=list)
+    files: int = 0
+    unusable: list[str] = field(default_factory=list)
+
+    def add(self, name: str, status: str) -> None:
+        """Count a frame."""
+        self.frames += 1
+        if status == "identified":
+            self.identified += 1
+        elif len(self.unidentified) < NAMED:
+            self.unidentified.append(f"{name}: {status}")
+
+    def expect_all_identified(self) -> None:
+        """Raise `NotIdentifiedError` unless every frame was identified."""
+        missing = self.frames - self.identified
+        if missing:
+            more = ", ..." if missing > len(self.unidentified) else ""
+            raise NotIdentifiedError(
+                f"{missing:,} of {self.frames:,} frames not identified "
+                f"({', '.join(self.unidentified)}{more}); 'refusal' of each says why, and what to "
+                "try"
+            )
+
+    def expect_all_usable(self) -> None:
+        """Raise `ConfigError` unless every file of a batch could be used."""
+        if self.unusable:
+            more = "; ..." if len(self.unusable) > NAMED else ""
+            raise ConfigError(
+                f"{len(self.unusable):,} of {self.files:,} files cannot be used: "
+                f"{'; '.join(self.unusable[:NAMED])}{more}"
+            )
+
+
+def print_answers(
+    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool
+) -> Tally:
+    """Print the answers to the frames of a file."""
+    tally, kept = Tally(), []
+    for answer in answers:
+        tally.first = tally.first or answer
+        tally.add(answer.frame.name, answer.result.status)
+        if as_lines:
+            print_json_line(answer.content())
+        else:
+            kept.append(answer)
+    if as_lines:
+        return tally
+    if as_json:
+        print_json([answer.content() for answer in kept])
+        return tally
+    if len(kept) == 1:
+        _print_one(kept[0].content(), database.name)
+    elif kept:
+        _print_many(kept, database)
+    return tally
+
+
+def print_batch(
+    items: Iterable[BatchItem], database: Database, *, as_lines: bool
+) -> tuple[Tally, list[BatchItem]]:
+    """Print the answers to many files: a line of JSON each as soon as it is there, or a table."""
+    tally, done, notes = Tally(), list[BatchItem](), Counter[str]()
+    for item in items:
+        done.append(item)
+        tally.files += 1
+        notes.update(item.notes)
+        if item.error is not None:
+            tally.unusable.append(str(item.error))
+            if as_lines:
+                said = {"status": "unusable", "message": str(item.error)}
+                print_json_line({"file": str(item.path), "frame": item.path.stem, **said})
+        for answer in item.answers:
+            tally.add(answer.frame.name, answer.result.status)
+            if as_lines:
+                print_json_line({"file": str(item.path), **answer.content()})
+    kept = [] if as_lines else [answer for item in done for answer in item.answers]
+    if kept:
+        _print_many(kept, database)
+    for note, count in notes.items():
+        say(f"{note} ({count} of {tally.files} files)")
+    return tally, done
+
+
+def print_contents(
+    contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool
+) -> Tally:
+    """Print the answers that a service gives to the frames of a file."""
+    tally = Tally()
+    for one in contents:
+        tally.add(one["frame"], one["status"])
+        if as_lines:
+            print_json_line(one)
+        elif not as_json:
+            _print_one(one, database)
+    if as_json and not as_lines:
+        print_json(list(contents))
+    return tally
+
+
+def _print_one(content: dict[str, Any], database: str) -> None:
+    facts = {name: content[name] for name in content if name not in ("frame", "database")}
+    rows = [row for name, value in facts.items() for row in _rows_of_fact(name, value)]
+    reasons = Counter(star["dropped"] for star in content["stars"] if "dropped" in star)
+    rows += [(f"dropped, {why.replace('_', ' ')}", count) for why, count in sorted(reasons.items())]
+    print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
+    if content["status"] == "identified":
+        _print_stars(content["stars"])
+    if content.get("in_time"):
+        print_sky_in_time([(content["frame"], content["in_time"])])
+
+
+def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
+    if name == "refusal":
+        return [("because", value["words"]), ("try", as_options(value["advice"]))]
+    if name == "remarks":
+        return [("remark", remark) for remark in value]
+    if name == "covariance_arcsec2":
+        sigma = np.sqrt([_number(value[axis][axis]) for axis in range(3)])
+        return [("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma))]
+    if name == "q_body_from_icrs":
+        return [(name, ", ".join(f"{one:+.7f}" for one in value))]
+    if name == "in_time":
+        given = {key: value[key] for key in CORRECTED} if value else {}
+        return [
+            (f"corrected {key}", told)
+            for key in given
+            for _, told in _rows_of_fact(key, given[key])
+        ]
+    if name.endswith("_deg"):
+        return [(name, f"{value:.4f}")]
+    if value is None or isinstance(value, list | dict):
+        return []
+    return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
+
+
+def as_options(text: str) -> str:
+    """Return a text with the names of options as the command line has them.
+
+    >>> as_options("turn the frame over (flip), or allow a larger error (fov_error)")
+    'turn the frame over (--flip), or allow a larger error (--fov-error)'
+    """
+    return words_of(text, bracketed(text), option_of)
+
+
+def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
+    heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+    if len(stars) > MAX_CENTROIDS:  # a terminal takes minutes to lay out tens of thousands
+        stars = [star for star in stars if star["star"]]
+    lines = [
+        (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
+         f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
+         f"{s['dx_px']:+.3f}", f"{s['dy_px']:+.3f}")
+        if s["star"] else
+        (f"{_shown(s['x_px'])}", f"{_shown(s['y_px'])}", "-", *5 * ("",))
+        for s in stars
+    ]  # fmt: skip
+    print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _shown(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
+    rows = []
+    is_tracked = any(answer.result.origin == "tracking" for answer in answers)
+    for answer in answers:
+        frame, result = answer.frame, answer.result
+        origin = (result.origin.replace("_", " "),) if is_tracked else ()
+        attitude = result if answer.sky is None else answer.sky
+        angles = (attitude.boresight_ra_deg, attitude.boresight_dec_deg, attitude.roll_deg)
+        why = result.refusal
+        rows.append(
+            (
+                frame.name,
+                result.status if why is None or why.reason == result.status else why.reason,
+                f"{result.n_matched}/{len(frame.centroids_px)}",
+                *(f"{angle:.5f}" if result.ok else "" for angle in angles),
+                f"{result.residual_arcsec:.2f}" if result.ok else "",
+                f"{result.false_match_probability:.1e}" if result.ok else "",
+                *origin,
+            )
+        )
+    known = [(answer.frame.name, sky.content()) for answer in answers if (sky := answer.sky)]
+    ra = "corrected RA deg" if known else "RA deg"
+    names = ("frame", "status", "stars", ra, "Dec deg", "roll deg", "rms arcsec", "chance")
+    heads = (*names, "origin") if is_tracked else names
+    counted = f"{len(answers)} frames" if len(answers) > 1 else "1 frame"
+    print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    if database.image is not None:
+        _say_crowded(answers)
+    print_sky_in_time(known)
+
+
+def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
+    """Say how many frames the library in flight refuses; of a single frame a remark says it."""
+    counts = [len(answer.frame.centroids_px) for answer in answers]
+    crowded = sum(count > FLIGHT_CENTROIDS for count in counts)
+    for sentence in centroids_in_flight(max(counts)):
+        say(
+            f"{crowded:,} of {len(counts):,} frames have more than {FLIGHT_CENTROIDS} centroids: "
+            f"{sentence}"
+        )
+
+
+def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Print what a time adds to the answers to frames, by their names: `SkyInTime.content`."""
+    if not known:
+        return
+    columns = {
+        "frame": "{0[0]}",
+        "corrected arcsec": "{0[1][correction_arcsec]:.2f}",
+        "rms arcsec": "{0[1][residual_arcsec]:.2f}",
+        "Sun deg": "{0[1][sun_angle_deg]:.2f}",
+        "Moon deg": "{0[1][moon_angle_deg]:.2f}",
+        "Earth limb deg": "{0[1][earth_limb_angle_deg]:.2f}",
+    }
+    title = f"With aberration, at {known[0][1]['time']}"
+    print_things(title, known, columns, numbers=range(1, 6))
+    bodies = [
+        (name, body, "no" if body["row"] is None else "yes")
+        for name, sky in known
+        for body in sky["bodies"]
+    ]
+    if bodies:
+        columns = {
+            "frame": "{0[0]}",
+            "body": "{0[1][name]}",
+            "x px": "{0[1][x_px]:.1f}",
+            "y px": "{0[1][y_px]:.1f}",
+            "mag": "{0[1][mag]:.1f}",
+            "from boresight deg": "{0[1][from_boresight_deg]:.2f}",
+            "centroid": "{0[2]}",
+        }
+        print_things("Planets in the frame", bodies, columns, numbers=(2, 3, 4, 5))
+
+
+def simulated_facts(frame: SimulatedFrame, output: Path) -> dict[str, Any]:
+    """Return the truth about a simulated frame."""
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
+    return {
+        "file": str(output),
+        "centroids": len(frame.centroids_px),
+        "guide_stars": frame.n_stars,
+        "false_stars": int(frame.is_false.sum()),
+        "boresight_ra_deg": float(ra_deg),
+        "boresight_dec_deg": float(dec_deg),
+        "roll_deg": float(roll_deg),
+        "q_body_from_icrs": quaternion_from_matrix(frame.matrix).tolist(),
+    }
