@@ -135,9 +135,9 @@ def expected(catalogs: Path, made_catalogs: Path) -> Callable[..., Any]:
 @pytest.fixture(scope="session")
 def ingested(catalogs: Path) -> Callable[[str, str], Ingested]:
     """Ingest a file of `catalogs` as it is, once for all tests."""
-    from starcat.catalog.ingest import ingest
+    from starcat.catalog.ingest import ingest_catalog
 
-    return cache(lambda source, name: ingest(source, [catalogs / name]))
+    return cache(lambda source, name: ingest_catalog(source, [catalogs / name]))
 
 
 @pytest.fixture(scope="session")
@@ -250,25 +250,25 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The database of `small_spec`; to be copied by who changes it."""
-    from starcat.pipeline.build import build
+    from starcat.pipeline.build import build_database
     from starcat.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = spec_from_dict(tomllib.loads(SMALL_SPEC), "small.toml")
-    return build(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
+    return build_database(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
 
 
 @pytest.fixture(scope="session")
 def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The same without its brightest stars, so that stars are rejected for two reasons."""
-    from starcat.pipeline.build import build
+    from starcat.pipeline.build import build_database
     from starcat.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("picky")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = tomllib.loads(SMALL_SPEC.replace("faint", "bright_limit_mag = 2.2\nselection.faint"))
-    built = build(
+    built = build_database(
         spec_from_dict(spec, "small.toml"), {"sao": [folder / "sao.dat"]}, folder / "dist"
     )
     return built.folder

@@ -29,7 +29,7 @@ def sky_read_once():
         return read[source]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(starter, "ingest", once)
+        patch.setattr(starter, "ingest_catalog", once)
         yield
 
 

@@ -218,7 +218,7 @@ def verdict_section(story: Story) -> str:
     steps = ", ".join(f"{step.stars:,} after {step.step}" for step in story.built.filters)
     return f"""## 4. A verdict
 
-{link("starcat/catalog/selection.py")} tries the reasons to leave a star out, always in this
+{link("starcat/selection/selecting.py")} tries the reasons to leave a star out, always in this
 order, and the first that applies is its verdict. Two flags of the archive speak against Polaris.
 Taken at their word they would cost a tracker one of its best stars; what matters is whether the
 camera sees one steady point of light, and that is a matter of figures:
