@@ -266,7 +266,7 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
         ({"enabled": True}, "no catalogs; name some"),
         ({"enabled": True, "catalogs": ["gaia", "gaia"]}, "named twice"),
         ({"enabled": True, "catalogs": ["sao"]}, "sao is the catalog of the stars themselves"),
-        ({"enabled": True, "catalogs": ["gcvs"]}, "'gcvs'"),
+        ({"enabled": True, "catalogs": ["../gcvs"]}, "'../gcvs'"),
         ({"radius_arcsec": 0.0}, "greater than or equal to 0.001"),
         ({"radius_arcsec": 700.0}, "less than or equal to 600"),
         ({"outlier_share": 1.0}, "less than or equal to 0.99"),
@@ -277,6 +277,16 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
 def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
     with pytest.raises(ConfigError, match=words):
         spec_of(small_spec, **section)
+
+
+@pytest.mark.parametrize(
+    ("catalog", "words"),
+    [("nosuch", "unknown source 'nosuch'"), ("gcvs", "gcvs is not a star catalog")],
+)
+def test_a_catalog_that_has_no_stars_is_refused(catalog, words, files, small_spec, tmp_path):
+    given = {name: [files / "sao.dat"] for name in ("sao", catalog)}
+    with pytest.raises(ConfigError, match=words):
+        build(spec_of(small_spec, enabled=True, catalogs=[catalog]), given, tmp_path / "out")
 
 
 # Of two files --------------------------------------------------------------------------------
