@@ -89,8 +89,8 @@ class Levels(ProductSection):
         if max(found, total) > max_stars:
             raise ValueError(
                 f"the {total:,} fields of all levels may have {found:,.0f} stars, limit "
-                f"{max_stars:,}; use a smaller boresights.count or products.levels.stars_per_field, "
-                "or a larger products.levels.max_ratio"
+                f"{max_stars:,}; use a smaller boresights.count or "
+                "products.levels.stars_per_field, or a larger products.levels.max_ratio"
             )
 
     def fields(self, narrowest: FieldSize) -> tuple[NominalField, ...]:
