@@ -285,6 +285,16 @@ def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
         spec_of(small_spec, **section)
 
 
+@pytest.mark.parametrize(
+    ("catalog", "words"),
+    [("nosuch", "unknown source 'nosuch'"), ("gcvs", "gcvs is not a star catalog")],
+)
+def test_a_catalog_that_has_no_stars_is_refused(catalog, words, files, small_spec, tmp_path):
+    given = {name: [files / "sao.dat"] for name in ("sao", catalog)}
+    with pytest.raises(ConfigError, match=words):
+        build(spec_of(small_spec, enabled=True, catalogs=[catalog]), given, tmp_path / "out")
+
+
 # Of two files --------------------------------------------------------------------------------
 
 

@@ -125,7 +125,7 @@ def _identified(
 
 def _scale(spec: BuildSpec, fov_deg: float) -> dict[str, Any]:
     """Return the options of the scale, for a width that is stated or not (0)."""
-    if not spec.products.levels.enabled:
+    if not spec.is_for_a_range:
         return {"fov_error": _SCALE_ERROR} if fov_deg else {}
     narrow, wide = spec.fields_deg
     if fov_deg:

@@ -39,7 +39,6 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
-from starcat.products.levels import boresights_of_level, level_fields
 from starcat.products.tiling import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
@@ -118,7 +117,7 @@ def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
         draft.stars = read.stars.take(pa.array(bright)).combine_chunks()
     run(draft, (select, thin))
     check_tiling(len(draft.selected.guide_stars), spec, None)
-    _check_levels(len(draft.selected.guide_stars), spec)
+    _check_fields_of_products(len(draft.selected.guide_stars), spec)
     run(draft, (tile,))
     draft.stars, draft.motions = read.stars.schema.empty_table(), None
     return draft
@@ -155,24 +154,15 @@ def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
     return {name: count for name, count in found.items() if count}
 
 
-def _check_levels(stars: int, spec: BuildSpec) -> None:
-    """Check the same of the levels of a range of fields, each with as many stars as it may have."""
-    wanted, own = spec.products.levels, field_size(spec)
-    if not wanted.enabled:
-        return
-    found, boresights, left = 0.0, 0, float(stars)
-    for level in level_fields(own, wanted.widest_fov_x_deg, wanted.max_ratio):
-        count = boresights_of_level(spec.boresights.count, own, level)
-        found += count * left * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
-        left = min(left, float(count * wanted.stars_per_field))
-        boresights += count
-    if max(found, boresights) > MAX_FIELD_STARS:
-        raise BuildError(
-            f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
-            f"{found:,.0f} stars, limit {MAX_FIELD_STARS:,}; use a smaller boresights.count or "
-            "products.levels.stars_per_field, or a larger products.levels.max_ratio",
-            key="boresights.count",
-        )
+def _check_fields_of_products(stars: int, spec: BuildSpec) -> None:
+    """Check the same of the products that tile the sphere themselves."""
+    for section in spec.products.wanted.values():
+        try:
+            section.check_fields(stars, spec.boresights.count, field_size(spec), MAX_FIELD_STARS)
+        except ValueError as error:
+            raise BuildError(
+                f"{spec.name}: too dense to estimate: {error}", key="boresights.count"
+            ) from None
 
 
 @dataclass(frozen=True)

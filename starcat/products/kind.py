@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -44,6 +44,9 @@ class SpecFacts:
 class ProductSection(Section):
     """The section of a spec for a product that can be left out."""
 
+    has_own_fields: ClassVar[bool] = False
+    """Whether the product tiles the sphere itself, which `check_fields` may refuse."""
+
     enabled: bool = Field(True, description="whether the database has this product")
 
     @property
@@ -62,6 +65,18 @@ class ProductSection(Section):
         ------
         ValueError
             If the two contradict each other. The message begins with ``products.`` and the name.
+        """
+
+    def check_fields(self, stars: int, boresights: int, size: FieldSize, max_stars: int) -> None:
+        """Check that a tiling of the product's own is not too large to be counted.
+
+        ``boresights`` and ``size`` are the number and the size of the database's own fields, and
+        ``max_stars`` is how many fields, and stars in them, are gone through at the most.
+
+        Raises
+        ------
+        ValueError
+            If it is too large.
         """
 
 

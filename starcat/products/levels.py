@@ -45,6 +45,7 @@ class Levels(ProductSection):
     """Stars and triangles for fields wider than the camera's: one database for a range of them."""
 
     is_later = True
+    has_own_fields = True
 
     enabled: bool = Field(False, description="whether the database has this product")
     widest_fov_x_deg: FieldDeg = Field(
@@ -75,6 +76,21 @@ class Levels(ProductSection):
             raise ValueError(
                 f"products.levels: widest_fov_x_deg {self.widest_fov_x_deg:g} is not above the "
                 f"camera's own field, {own_deg:.4g} deg; the camera is the narrow end of the range"
+            )
+
+    def check_fields(self, stars: int, boresights: int, size: FieldSize, max_stars: int) -> None:
+        """Check the fields of all levels, each with as many stars as it may have."""
+        found, total, left = 0.0, 0, float(stars)
+        for level in self.fields(size):
+            count = boresights_of_level(boresights, size, level)
+            found += count * left * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
+            left = min(left, float(count * self.stars_per_field))
+            total += count
+        if max(found, total) > max_stars:
+            raise ValueError(
+                f"the {total:,} fields of all levels may have {found:,.0f} stars, limit "
+                f"{max_stars:,}; use a smaller boresights.count or "
+                "products.levels.stars_per_field, or a larger products.levels.max_ratio"
             )
 
     def fields(self, narrowest: FieldSize) -> tuple[NominalField, ...]:

@@ -37,6 +37,7 @@ from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.source import data_source
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.pipeline.recipes import tile_guide_stars
+from starcat.products.table import USUAL_PRODUCTS
 from starcat.query.gallery import named_query
 from starcat.query.session import open_session
 from starcat.stars.proper_motion import Motion, propagate
@@ -241,7 +242,7 @@ def tiling_section(story: Story) -> str:
     nearest = int(apart.argmin())
     return f"""## 5. Fields that see it
 
-Where a camera will point is unknown, so {link("starcat/products/boresights.py")} covers the
+Where a camera will point is unknown, so {link("starcat/products/tiling.py")} covers the
 sphere with {len(apart):,} evenly spread boresights (a boresight is where the camera's axis
 points) and looks at the {story.spec.camera.fov_x_deg:g} x {story.spec.camera.fov_x_deg:g} deg
 frame around each.
@@ -299,12 +300,9 @@ def _triangles(story: Story) -> tuple[str, str]:
 
 
 def products_section(story: Story) -> str:
-    modules = {
-        "pairs and triangles": "pairs_and_triangles",
-        "neighbours and reference sets": "neighbours",
-        "grid and radial patterns": "star_patterns",
-    }
-    links = ", ".join(f"[{what}](../starcat/products/{name}.py)" for what, name in modules.items())
+    links = ", ".join(
+        f"[{name.replace('_', ' ')}](../starcat/products/{name}.py)" for name in USUAL_PRODUCTS
+    )
     return f"""## 6. What a matcher looks it up with
 
 A camera that is lost sees dots, not names. What it can measure are angles between dots, which

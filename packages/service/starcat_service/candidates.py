@@ -74,11 +74,11 @@ def databases_to_try(
     """Return the databases that a frame is identified with, in the order in which to try them."""
 
     def order(one: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
-        has_levels = spec_of(one).products.levels.enabled
+        is_for_a_range = spec_of(one).is_for_a_range
         is_fitting = fields_deg is not None and fits(one, fields_deg)
         is_first = first is not None and one.id == first.id
         age = -one.folder.stat().st_mtime_ns
-        return not is_first, not is_fitting, not has_levels, age, one.id
+        return not is_first, not is_fitting, not is_for_a_range, age, one.id
 
     return sorted(databases, key=order)[:MAX_DATABASES]
 

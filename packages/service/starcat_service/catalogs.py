@@ -225,7 +225,11 @@ class Catalogs:
     def _choice(self, read: Draft, key: str, spec: BuildSpec) -> Draft:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
-        own["levels"] = content["products"]["levels"]
+        own["products"] = {
+            name: content["products"][name]
+            for name, section in spec.products.wanted.items()
+            if section.has_own_fields
+        }
         part = (key, json_bytes(own))
         found = self._cached(self._choices, part)
         if found is None:

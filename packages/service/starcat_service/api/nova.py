@@ -337,7 +337,7 @@ def _options_for(
     database: ListedDatabase, scale_deg: FieldsDeg | None, given: dict[str, Any]
 ) -> IdentifyOptions:
     """Return how a picture of some scale is identified with a database."""
-    if spec_of(database).products.levels.enabled:
+    if spec_of(database).is_for_a_range:
         fov_deg = _fields_of(database, scale_deg)
         return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))
     field = field_line(database, scale_deg)

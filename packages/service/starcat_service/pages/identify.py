@@ -327,11 +327,11 @@ def options_of(
     spec = spec_of(database)
     if ends[0] is not None:
         fov_deg = ends
-        if not given["database"] and not spec.products.levels.enabled:
+        if not given["database"] and not spec.is_for_a_range:
             # One of the fields is tried: the database serves no range.
             fov_deg, camera = None, camera or field_line(database, _fields_deg(given)) or None
     elif not given["database"] and not given["seed"] and camera is None:
-        fov_deg = list(spec.fields_deg) if spec.products.levels.enabled else None
+        fov_deg = list(spec.fields_deg) if spec.is_for_a_range else None
     content = {
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
