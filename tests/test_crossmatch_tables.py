@@ -284,8 +284,8 @@ def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
 )
 def test_a_catalog_that_has_no_stars_is_refused(catalog, words, files, small_spec, tmp_path):
     given = {name: [files / "sao.dat"] for name in ("sao", catalog)}
+    spec = spec_of(small_spec, enabled=True, catalogs=[catalog])
     with pytest.raises(ConfigError, match=words):
-        spec = spec_of(small_spec, enabled=True, catalogs=[catalog])
         build_database(spec, given, tmp_path / "out")
 
 
