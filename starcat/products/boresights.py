@@ -9,7 +9,6 @@ import numpy as np
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.index import Index, Ragged
 from starcat.products.kind import Extent, ProductInputs, ProductKind
-from starcat.products.layouts import LAYOUTS
 
 POSITION = 30
 
@@ -36,6 +35,4 @@ def _count(inputs: ProductInputs, _: None) -> Extent:
     return Extent(float(len(inputs.fields.count)), {"brightest": float(listed)})
 
 
-KIND = ProductKind(
-    name="boresights", make=_make, layout=LAYOUTS["boresights"], count=_count, cost=None
-)
+KIND = ProductKind(name="boresights", make=_make, count=_count, cost=None)

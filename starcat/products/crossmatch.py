@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from starcat.arrays import Array
 from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
-from starcat.products.kind import Extent, ProductInputs, ProductKind, ProductSection, SpecFacts
+from starcat.products.kind import Extent, ProductKind, ProductSection, SpecFacts
 from starcat.products.match_figures import MovingStars
 from starcat.products.match_stars import VERDICTS, Matches
 from starcat.sections import CatalogName, Mag
@@ -226,21 +226,13 @@ def _rank_problems(table: pa.Table) -> Iterator[str]:
         yield f"probability of row {row}: the candidates of a star share at most 1"
 
 
-def _count(inputs: ProductInputs, wanted: Crossmatch) -> Extent:
-    return Extent(float(len(inputs.directions) * len(wanted.catalogs)))
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: Crossmatch) -> float:
-    return 75.0 * extent.rows
-
-
 KIND = ProductKind(
     name="crossmatch",
     section=Crossmatch,
     in_database=False,
-    count=_count,
+    count=lambda inputs, wanted: Extent(float(len(inputs.directions) * len(wanted.catalogs))),
     cost=None,
-    file_bytes=_file_bytes,
+    file_bytes=lambda extent, stars, wanted: 75.0 * extent.rows,
     problems=counterpart_problems,
     joined=(counterparts_of, "have a counterpart"),
 )

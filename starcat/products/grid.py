@@ -28,7 +28,6 @@ from starcat.products.kind import (
     RowCost,
     star_row_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.products.neighbours import position_angles
 from starcat.sections import PlanarDeg
 
@@ -105,15 +104,6 @@ def _check(radius_rad: float, buffer_rad: float, cells_per_side: int) -> None:
         raise ValueError(f"cells_per_side is {cells_per_side}; expected 1 to 46340")
 
 
-def _make(inputs: ProductInputs, wanted: Grid) -> GridPatterns:
-    return grid_patterns(
-        inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
-        buffer_rad=float(np.radians(wanted.buffer_deg)),
-        cells_per_side=wanted.cells_per_side,
-    )
-
-
 def _count(inputs: ProductInputs, wanted: Grid) -> Extent:
     near, stars = inputs.neighbourhoods, len(inputs.directions)
     radius, cells = inputs.radius_rad(wanted.radius_deg), wanted.cells_per_side**2
@@ -131,9 +121,13 @@ def _file_bytes(extent: Extent, stars: int, wanted: Grid) -> float:
 
 KIND = ProductKind(
     name="grid",
-    make=_make,
+    make=lambda inputs, wanted: grid_patterns(
+        inputs.directions,
+        inputs.radius_rad(wanted.radius_deg),
+        buffer_rad=float(np.radians(wanted.buffer_deg)),
+        cells_per_side=wanted.cells_per_side,
+    ),
     section=Grid,
-    layout=LAYOUTS["grid"],
     count=_count,
     cost=RowCost(16.0, 60.0, 1.2),
     file_bytes=_file_bytes,

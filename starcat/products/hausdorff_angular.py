@@ -16,7 +16,6 @@ from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, row_offsets, stable_order
 from starcat.products.kind import (
     SEPARATION_OF_STAR,
-    Extent,
     ProductInputs,
     ProductKind,
     ProductSection,
@@ -24,7 +23,6 @@ from starcat.products.kind import (
     neighbour_extent,
     rows_by_star_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.sections import SmallDeg
 
 POSITION = 70
@@ -99,24 +97,11 @@ def _nearest_first(
     return order
 
 
-def _make(inputs: ProductInputs, wanted: HausdorffAngular) -> AngularReferenceSets:
-    return angular_reference_sets(inputs.directions, wanted.reach_rad(inputs))
-
-
-def _count(inputs: ProductInputs, wanted: HausdorffAngular) -> Extent:
-    return neighbour_extent(inputs, wanted.reach_rad(inputs))
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: HausdorffAngular) -> float:
-    return rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR)
-
-
 KIND = ProductKind(
     name="hausdorff_angular",
-    make=_make,
+    make=lambda inputs, wanted: angular_reference_sets(inputs.directions, wanted.reach_rad(inputs)),
     section=HausdorffAngular,
-    layout=LAYOUTS["hausdorff_angular"],
-    count=_count,
+    count=lambda inputs, wanted: neighbour_extent(inputs, wanted.reach_rad(inputs)),
     cost=RowCost(24.0, 40.0, 0.9),
-    file_bytes=_file_bytes,
+    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR),
 )

@@ -17,15 +17,12 @@ from starcat.products.index import Index, row_offsets
 from starcat.products.kind import (
     HALF_FIELD,
     SEPARATION_OF_STAR,
-    Extent,
-    ProductInputs,
     ProductKind,
     ProductSection,
     RowCost,
     neighbour_extent,
     rows_by_star_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.sections import PlanarDeg
 
 POSITION = 80
@@ -83,24 +80,13 @@ def planar_reference_sets(directions: Directions, radius_rad: float) -> PlanarRe
     return PlanarReferenceSets(star, neighbour[order], ratio[order], index)
 
 
-def _make(inputs: ProductInputs, wanted: HausdorffL2) -> PlanarReferenceSets:
-    return planar_reference_sets(inputs.directions, inputs.radius_rad(wanted.radius_deg))
-
-
-def _count(inputs: ProductInputs, wanted: HausdorffL2) -> Extent:
-    return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg))
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: HausdorffL2) -> float:
-    return rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR)
-
-
 KIND = ProductKind(
     name="hausdorff_l2",
-    make=_make,
+    make=lambda inputs, wanted: planar_reference_sets(
+        inputs.directions, inputs.radius_rad(wanted.radius_deg)
+    ),
     section=HausdorffL2,
-    layout=LAYOUTS["hausdorff_l2"],
-    count=_count,
+    count=lambda inputs, wanted: neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg)),
     cost=RowCost(24.0, 60.0, 1.2),
-    file_bytes=_file_bytes,
+    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR),
 )

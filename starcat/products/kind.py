@@ -19,7 +19,7 @@ from pydantic import Field
 from starcat.arrays import Array, Directions
 from starcat.geometry.camera import Camera
 from starcat.products.counting import Neighbourhoods
-from starcat.products.layouts import ProductLayout
+from starcat.products.layouts import LAYOUTS, ProductLayout
 from starcat.products.tiling import FieldSize, FieldStars
 from starcat.sections import Section
 from starcat.storage.schema import ProductSchema, product_schema
@@ -179,8 +179,8 @@ class ProductKind:
     make: Callable[[ProductInputs, Any], Any] | None = None
     section: type[ProductSection] | None = None  # None where every database has the product
     in_database: bool = True  # whether the matcher's HDF5 file has it
-    # Its indices, and its columns where the matcher opens it.
-    layout: ProductLayout = field(default_factory=ProductLayout)
+    # Its indices. That of a product that the matcher opens is in `LAYOUTS`, with its columns.
+    own_layout: ProductLayout = field(default_factory=ProductLayout)
     # Counts it without making it. None where guide stars do not tell.
     count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
     # What a row costs, or a neighbour or triangle that `Extent.reached` counts. None where the
@@ -198,6 +198,11 @@ class ProductKind:
     def schema(self) -> ProductSchema:
         """The newest schema."""
         return product_schema(self.name)
+
+    @property
+    def layout(self) -> ProductLayout:
+        """Its indices, and its columns where the matcher opens it."""
+        return LAYOUTS.get(self.name, self.own_layout)
 
     @property
     def is_usual(self) -> bool:

@@ -28,7 +28,6 @@ from starcat.products.kind import (
     RowCost,
     SpecFacts,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.products.tiling import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.triangles import distinct_triangles
 from starcat.sections import FieldDeg
@@ -218,18 +217,6 @@ def _ragged(lists: Sequence[Rows]) -> Ragged:
     return Ragged(offsets, np.concatenate([np.empty(0, dtype=np.int32), *lists]))
 
 
-def _make(inputs: ProductInputs, wanted: Levels) -> LevelRows:
-    return find_levels(
-        inputs.directions,
-        inputs.mag,
-        inputs.field_size,
-        wanted.fields(inputs.field_size),
-        boresights=inputs.boresights,
-        stars_per_field=wanted.stars_per_field,
-        brightest=inputs.brightest,
-    )
-
-
 def _count(inputs: ProductInputs, wanted: Levels) -> Extent:
     fields = wanted.fields(inputs.field_size)
     stars, triangles, records = 0.0, 0.0, 0.0
@@ -250,9 +237,16 @@ def _file_bytes(extent: Extent, stars: int, wanted: Levels) -> float:
 
 KIND = ProductKind(
     name="levels",
-    make=_make,
+    make=lambda inputs, wanted: find_levels(
+        inputs.directions,
+        inputs.mag,
+        inputs.field_size,
+        wanted.fields(inputs.field_size),
+        boresights=inputs.boresights,
+        stars_per_field=wanted.stars_per_field,
+        brightest=inputs.brightest,
+    ),
     section=Levels,
-    layout=LAYOUTS["levels"],
     count=_count,
     cost=RowCost(24.0, 60.0, 0.6),
     file_bytes=_file_bytes,

@@ -29,7 +29,6 @@ from starcat.products.kind import (
     neighbour_extent,
     rows_by_star_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.sections import SmallDeg
 
 POSITION = 60
@@ -165,15 +164,6 @@ def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
     return step
 
 
-def _make(inputs: ProductInputs, wanted: Neighbours) -> NeighbourRows:
-    return find_neighbours(
-        inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
-        angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
-        separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
-    )
-
-
 def _count(inputs: ProductInputs, wanted: Neighbours) -> Extent:
     radius_deg = wanted.radius_deg or inputs.half_field_deg
     rings = np.ceil(radius_deg / wanted.separation_bin_deg)
@@ -181,16 +171,17 @@ def _count(inputs: ProductInputs, wanted: Neighbours) -> Extent:
     return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg), bins)
 
 
-def _file_bytes(extent: Extent, stars: int, wanted: Neighbours) -> float:
-    return rows_by_star_bytes(extent, stars, 22.1)  # with its angle and separations
-
-
 KIND = ProductKind(
     name="neighbours",
-    make=_make,
+    make=lambda inputs, wanted: find_neighbours(
+        inputs.directions,
+        inputs.radius_rad(wanted.radius_deg),
+        angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
+        separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
+    ),
     section=Neighbours,
-    layout=LAYOUTS["neighbours"],
     count=_count,
     cost=RowCost(44.0, 50.0, 2.4),
-    file_bytes=_file_bytes,
+    # With its angle and separations.
+    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, 22.1),
 )

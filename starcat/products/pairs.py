@@ -20,7 +20,6 @@ from starcat.products.kind import (
     RowCost,
     star_row_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 
 POSITION = 40
 
@@ -92,10 +91,6 @@ def find_pairs(
     return StarPairs(i, j, build_kvector(angle[order]))
 
 
-def _make(inputs: ProductInputs, wanted: Pairs) -> StarPairs:
-    return find_pairs(inputs.directions, *wanted.range_rad(inputs))
-
-
 def _count(inputs: ProductInputs, wanted: Pairs) -> Extent:
     near, (least, reach) = inputs.neighbourhoods, wanted.range_rad(inputs)
     # Each pair is a neighbour of either of its stars.
@@ -110,9 +105,8 @@ def _file_bytes(extent: Extent, stars: int, wanted: Pairs) -> float:
 
 KIND = ProductKind(
     name="pairs",
-    make=_make,
+    make=lambda inputs, wanted: find_pairs(inputs.directions, *wanted.range_rad(inputs)),
     section=Pairs,
-    layout=LAYOUTS["pairs"],
     count=_count,
     cost=RowCost(28.0, 110.0, 1.3),
     file_bytes=_file_bytes,

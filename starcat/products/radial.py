@@ -26,7 +26,6 @@ from starcat.products.kind import (
     ProductSection,
     RowCost,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.products.neighbours import position_angles
 from starcat.sections import SmallDeg
 
@@ -121,7 +120,6 @@ KIND = ProductKind(
     name="radial",
     make=_make,
     section=Radial,
-    layout=LAYOUTS["radial"],
     count=_count,
     cost=RowCost(12.0, 60.0, 1.2),
     file_bytes=_file_bytes,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from starcat.products.kind import ProductKind
-from starcat.products.layouts import LAYOUTS
 
 POSITION = 10
 
-KIND = ProductKind(name="stars", layout=LAYOUTS["stars"], cost=None)
+KIND = ProductKind(name="stars", cost=None)

@@ -27,7 +27,6 @@ from starcat.products.kind import (
     RowCost,
     star_row_bytes,
 )
-from starcat.products.layouts import LAYOUTS
 from starcat.products.tiling import FieldStars
 
 POSITION = 50
@@ -154,10 +153,6 @@ def _distinct_rows(
     return rows[first], np.diff(first, append=len(rows))
 
 
-def _make(inputs: ProductInputs, wanted: Triangles) -> FieldTriangles:
-    return find_triangles(inputs.fields, inputs.directions, inputs.brightest)
-
-
 def _count(inputs: ProductInputs, wanted: Triangles) -> Extent:
     records, distinct = count_triangles(inputs.fields, len(inputs.directions), inputs.brightest)
     return Extent(distinct, reached=distinct, records=records)
@@ -170,9 +165,8 @@ def _file_bytes(extent: Extent, stars: int, wanted: Triangles) -> float:
 
 KIND = ProductKind(
     name="triangles",
-    make=_make,
+    make=lambda inputs, wanted: find_triangles(inputs.fields, inputs.directions, inputs.brightest),
     section=Triangles,
-    layout=LAYOUTS["triangles"],
     count=_count,
     cost=RowCost(34.0, 50.0, 2.6),
     file_bytes=_file_bytes,
