@@ -41,8 +41,8 @@ def unit_of_argument(name: str) -> str:
 
     Examples
     --------
-    >>> unit_of("velocity_km_s"), unit_of("position_km"), unit_of("prior")
-    ('km / s', 'km', '')
+    >>> unit_of_argument("velocity_km_s"), unit_of_argument("prior")
+    ('km / s', '')
     """
     return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
 

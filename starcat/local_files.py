@@ -54,7 +54,7 @@ def keys_of_files(model: type[BaseModel]) -> tuple[str, ...]:
     --------
     >>> from starcat.specs.build_spec import BuildSpec
     >>> keys_of_files(BuildSpec)
-    ('camera.response.file', 'camera.response.optics_file')
+    ('selection.region.moc_file', 'camera.response.file', 'camera.response.optics_file')
     """
     return tuple(".".join(path) for path, _ in _local_files(model, ()))
 

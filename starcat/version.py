@@ -59,7 +59,7 @@ def missing_packages(what: str, error: ModuleNotFoundError) -> str:
 
     Examples
     --------
-    >>> print(lacking("build", ModuleNotFoundError(name="typer")))
+    >>> print(missing_packages("build", ModuleNotFoundError(name="typer")))
     build needs the library 'typer', which is not installed; pip install ...
     """
     name = (error.name or "").partition(".")[0]

@@ -107,7 +107,7 @@ def picture_name(designation: str) -> str:
 
     Examples
     --------
-    >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
+    >>> picture_name("Gaia DR3 3221269181884277504"), picture_name("SAO 308")
     ('Gaia …84277504', 'SAO 308')
     """
     words = designation.split() or [""]

@@ -33,7 +33,7 @@ def project_sky(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
 
     Examples
     --------
-    >>> x, y = project([270.0], [0.0])
+    >>> x, y = project_sky([270.0], [0.0])
     >>> round(float(x[0] / HALF_WIDTH), 9), abs(round(float(y[0]), 9))
     (0.5, 0.0)
     """

@@ -268,7 +268,8 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     assert len(calls) == 1
     assert len(set(found)) == 1
     assert len(found) == 6
-    assert [(one.source, one.stars) for one in catalogs.offered()[0].read] == [("sao", 600)]
+    [sao] = [one for one in catalogs.offered() if one.name == "sao"]
+    assert [(one.source, one.stars) for one in sao.read] == [("sao", 600)]
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
     assert catalogs.estimate(small).cost.stars == found[0]
