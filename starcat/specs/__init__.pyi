@@ -8,6 +8,7 @@ from starcat.specs.keys import REQUIRED as REQUIRED
 from starcat.specs.keys import SpecKey as SpecKey
 from starcat.specs.keys import spec_sections as spec_sections
 from starcat.specs.keys import spec_toml as spec_toml
+from starcat.specs.keys import unit_of as unit_of
 from starcat.specs.reading import MAX_CHARACTERS as MAX_CHARACTERS
 from starcat.specs.reading import all_that_is_wrong as all_that_is_wrong
 from starcat.specs.reading import changed as changed

@@ -20,6 +20,7 @@ from tomlkit.exceptions import TOMLKitError
 from starcat.catalog import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.products import USUAL_PRODUCTS
+from starcat.selection import form_fields
 from starcat.specs import (
     REQUIRED,
     BuildSpec,
@@ -39,6 +40,9 @@ BEFORE = "toml-before"
 LENS = "lens"
 ENABLED = "enabled"
 
+RULE_FIELDS = form_fields()
+"""How the form shows the keys of rules of selection, by key; the rules say it themselves."""
+
 FIELDS = (
     "name",
     "version",
@@ -51,20 +55,10 @@ FIELDS = (
     "camera.fov_x_deg",
     "camera.focal_length_mm",
     "camera.pixel_um",
-    "selection.faint_limit_mag",
-    "selection.bright_limit_mag",
-    "selection.max_stars_per_field",
-    "selection.doubles.min_separation_deg",
-    "selection.doubles.action",
     "boresights.count",
     "boresights.brightest",
     "camera.response.name",
-    "selection.max_drift_arcsec",
-    "selection.thinning",
-    "selection.neighbours.psf_sigma_px",
-    "selection.neighbours.max_offset_px",
-    "selection.neighbours.max_contamination",
-    "selection.neighbours.action",
+    *RULE_FIELDS,
 )
 """Keys that the form has a field for, by the same names."""
 
@@ -94,6 +88,17 @@ class SpecForm:
     content: Mapping[str, Any]  # what the text says; nothing where it cannot be read
     spec: BuildSpec | None  # None: something is wrong
     wrong: tuple[ConfigError, ...] = ()
+
+    @property
+    def tells_of_sensor(self) -> bool:
+        """Whether a rule that goes by the sensor is used."""
+        sensor = {key: shown for key, shown in RULE_FIELDS.items() if shown.group == "sensor"}
+        for key, shown in sensor.items():
+            value = self.values.get(key, "")
+            usual = shown.choices[0][0] if shown.choices else ""
+            if shown.kind != "number" and value not in ("", usual):
+                return True
+        return False
 
     @property
     def error(self) -> ConfigError | None:

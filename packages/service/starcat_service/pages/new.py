@@ -15,7 +15,7 @@ from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.pipeline import advice
 from starcat.products import USUAL_PRODUCTS
-from starcat.specs import CameraSpec, preset, preset_names
+from starcat.specs import CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
 from starcat_service.catalogs import is_here
 from starcat_service.jobs.submission import check_title, submit_build
@@ -28,6 +28,7 @@ from starcat_service.pages.design import (
     pinned_draft,
 )
 from starcat_service.pages.draft import (
+    RULE_FIELDS,
     TEXT,
     SpecForm,
     draft_of_content,
@@ -329,6 +330,8 @@ def _page(
         draft=draft,
         refused=refused and refused.detail,
         is_first=is_first,
+        rule_fields=RULE_FIELDS,
+        unit_of=unit_of,
         presets=_presets(),
         chosen=form.get(PRESET, ""),
         response_per=form.get(PER, ""),
