@@ -106,12 +106,6 @@ COLOURS = (
 )  # fmt: skip
 """Those of ``--map-0`` to ``--map-9`` in the style sheet; the first is of fields with too few."""
 
-MAX_DOTS = 2500
-"""Dots of an SVG by itself; each takes some 75 bytes."""
-
-SCALE = 125.0
-WIDTH, HEIGHT = round(2 * SCALE * HALF_WIDTH) + 16, round(2 * SCALE * HALF_HEIGHT) + 44
-
 
 @dataclass(frozen=True, eq=False)
 class Fields:
