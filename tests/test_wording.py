@@ -138,7 +138,7 @@ def starcat_open(folder: Path):
 def client(tmp_path_factory, small_artifact):
     root = tmp_path_factory.mktemp("wording")
     add_database(root, small_artifact)
-    with client_of(root, anonymous="publisher", query_time_s=3.0) as client:
+    with client_of(root, anonymous="publisher", query_time_s=10.0) as client:
         yield client
 
 
