@@ -1,5 +1,20 @@
 /* The two ways to an attitude: lost in space, and from a prior attitude.
  *
+ *     identify a frame:
+ *       check the arguments, turn centroids into directions
+ *       for each triangle of centroids, the most promising first (triangles.c):
+ *         look up triangles of stars, or pyramids (pyramids.c)
+ *         for each of them: try its attitude (verify.c)
+ *         stop if an attitude is certain, or if the steps are spent
+ *       answer with the best attitude, if chance does not explain it (answer.c)
+ *
+ *     track a frame:
+ *       predict the stars of the frame from the prior attitude
+ *       for each of the first eight centroids:
+ *         for each star near it, the nearest first:
+ *           find the star that the farthest centroid is then
+ *           try the attitude of the two (verify.c); stop if it is certain
+ *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"

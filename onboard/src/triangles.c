@@ -1,5 +1,17 @@
 /* Triangles of centroids, one after the other, and the triangles of stars that they may be.
  *
+ *     for each triangle of centroids:
+ *       with magnitudes: those of the brightest centroids first
+ *       without: those with the shortest longest side first
+ *       in a crowded frame: those of near centroids, all over the frame in turn
+ *     skip it if a side is short or an angle is narrow; few centroids: try such triangles last
+ *     find the range of its area in the K-vector of the image
+ *     for each triangle of stars in the range:
+ *       compare the three sides, by length first, then in every order of the corners
+ *       compare the handedness
+ *       make the attitude, and try it (verify.c)
+ *     without a focal length: by shape first, then by a range of areas
+ *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"

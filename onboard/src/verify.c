@@ -1,6 +1,19 @@
 /* Verification: whether an attitude explains a frame. Every proposal of every method comes here.
  * The same rules as the ground's starcat/matcher/verification.py.
  *
+ *     try an attitude:
+ *       gather the stars of its field, and put them on the detector
+ *       repeat until the matched stars stay the same:
+ *         match centroids and stars that are each other's nearest, within the tolerance
+ *         fit the attitude to them
+ *       bound the probability that chance matches as many so well (chance.c)
+ *       if a centroid without a star competes for a matched star: try that match, too
+ *       if the attitude is not certain: try smaller tolerances
+ *       if much of the frame is not explained: try larger tolerances
+ *       withhold the attitude if it explains too small a fraction of the frame, or if another
+ *       focal length explains the frame better
+ *       keep it if it is better than the best one so far
+ *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"
