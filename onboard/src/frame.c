@@ -18,7 +18,7 @@ void starcat_set_default_options(starcat_options *options) {
   options->max_steps = 4000000u;
 }
 
-static starcat_status check_options(const starcat_options *o) {
+starcat_status starcat_check_options(const starcat_options *o) {
   if (!starcat_are_finite((const real *)(const void *)o, 5)) {
     return STARCAT_E_NOT_FINITE;
   }
@@ -177,7 +177,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   if (frame->count > STARCAT_MAX_CENTROIDS) {
     return STARCAT_E_TOO_MANY_CENTROIDS;
   }
-  starcat_status status = check_options(options);
+  starcat_status status = starcat_check_options(options);
   if (status == STARCAT_OK) {
     status = starcat_prepare_camera(camera, &call->camera);
   }

@@ -223,6 +223,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
 /* frame.c */
+starcat_status starcat_check_options(const starcat_options *o);
 void starcat_list_columns(starcat_call *call);
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
                              const starcat_camera *camera, const starcat_options *options,

@@ -5,7 +5,7 @@
  */
 #include <string.h>
 
-#include "starcat_update.h"
+#include "starcat_session.h"
 #include "unit.h"
 
 #define BLOCK 4096u
@@ -281,6 +281,25 @@ static void patch_all(void) {
               (uint32_t)(unit_scratch.size - rows) - bytes[3]);
 }
 
+/* The same patch in one piece of a session, which applies it in idle time. */
+static void check_patch_of_session(void) {
+  static starcat_session session;
+  begin();
+  patch_all();
+  put_word(36, (uint32_t)patch.size);
+  memset(&session, 0, sizeof session);
+  starcat_prepare_session(&session);
+  session.slots = slots;
+  session.patch = patch_words;
+  session.patch_capacity = sizeof patch_words;
+  CHECK_IS(starcat_start_session(&session), STARCAT_OK);
+  CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+  CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+  CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_READY);
+  CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+}
+
 static void check_steps(void) {
   begin();
   patch_all();
@@ -379,5 +398,6 @@ void test_update(void) {
   check_update_errors();
   test_parity();
   check_steps();
+  check_patch_of_session();
   check_refused();
 }
