@@ -61,7 +61,7 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
                                  const starcat_real q[4], starcat_real error_rad,
                                  starcat_options *left) {
   starcat_frame moved = *frame;
-  if (is_correctable(s, frame)) {
+  if (is_correctable(s, frame) != 0) {
     for (uint32_t n = 0; n < frame->count; n++) {
       s->x_px[n] = frame->x_px[n];
       s->y_px[n] = frame->y_px[n];
@@ -80,12 +80,12 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
 /* Identify a frame lost in space, and once more with its centroids corrected. */
 static starcat_status identify_corrected(starcat_session *s, const starcat_frame *frame,
                                          starcat_options *left) {
-  starcat_real q[4];
   starcat_status status =
       starcat_identify_frame(&s->image, &s->camera, left, frame, &s->work, &s->result);
   s->steps += s->result.steps;
   left->max_steps -= s->result.steps;
   if ((status == STARCAT_IDENTIFIED) && (s->correct != NULL)) {
+    starcat_real q[4];
     if (left->max_steps == 0u) {
       s->result.n_matched = 0;
       s->result.reason = STARCAT_REASON_STEPS;
@@ -124,7 +124,7 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
   s->result.n_matched = 0;
   s->result.n_usable = 0;
   s->result.reason = STARCAT_REASON_NONE;
-  if ((status == STARCAT_OK) && (frame != NULL) && is_fresh(s, time)) {
+  if ((status == STARCAT_OK) && (frame != NULL) && (is_fresh(s, time) != 0)) {
     s->mode = STARCAT_MODE_TRACK;
     status = track_from(s, frame, s->q_prior, s->prior_error_rad, &left);
   }

@@ -65,6 +65,7 @@ CFE_Status_t STARCAT_APP_Init(void) {
     Status = MakePipe();
   }
   if (Status == CFE_SUCCESS) {
+    STARCAT_APP_FillHk();
     CFE_EVS_SendEvent(STARCAT_APP_INIT_INF_EID, CFE_EVS_EventType_INFORMATION,
                       "STARCAT: starcat %s started, image %.*s, status %d", starcat_version(),
                       STARCAT_APP_NAME_LEN, STARCAT_APP_Data.HkTlm.Payload.ImageName,

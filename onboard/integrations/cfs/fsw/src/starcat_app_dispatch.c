@@ -77,7 +77,7 @@ void STARCAT_APP_TaskPipe(const CFE_SB_Buffer_t *Buffer) {
         STARCAT_APP_Frame((const STARCAT_APP_FrameTlm_t *)Buffer);
       } else {
         STARCAT_APP_Data.HkTlm.Payload.FramesIn++;
-        STARCAT_APP_Data.HkTlm.Payload.FrameErrors++;
+        STARCAT_APP_Data.FramesOfWrongLength++;
       }
       break;
     case STARCAT_APP_WAKEUP_MID:

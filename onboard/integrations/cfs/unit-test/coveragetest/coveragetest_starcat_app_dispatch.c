@@ -62,7 +62,7 @@ static void TestFrames(void) {
   CALLED(STARCAT_APP_Frame, 1);
   IS(LastEvent(), STARCAT_APP_LEN_ERR_EID);
   IS(HK.FramesIn, 1);
-  IS(HK.FrameErrors, 1);
+  IS(STARCAT_APP_Data.FramesOfWrongLength, 1);
   IS(HK.CommandErrorCounter, 0);
 }
 
