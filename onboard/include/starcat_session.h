@@ -53,11 +53,11 @@ typedef enum {
 /* What idle work came to. */
 typedef enum {
   STARCAT_EVENT_NONE = 0,
-  STARCAT_EVENT_READY = 1,    /* the new image is whole */
-  STARCAT_EVENT_REFUSED = 2,  /* it is not, or the patch is none of this image */
-  STARCAT_EVENT_MENDED = 3,   /* damage of the image in use was made good from parity */
+  STARCAT_EVENT_READY = 1,     /* the new image is whole */
+  STARCAT_EVENT_REFUSED = 2,   /* it is not, or the patch is none of this image */
+  STARCAT_EVENT_MENDED = 3,    /* damage of the image in use was made good from parity */
   STARCAT_EVENT_FELL_BACK = 4, /* it could not be, and the image of the other slot is in use */
-  STARCAT_EVENT_NO_IMAGE = 5  /* that cannot be used either */
+  STARCAT_EVENT_NO_IMAGE = 5   /* that cannot be used either */
 } starcat_event;
 
 /* Move centroids, in place, to where they would be in a camera at rest that is turned by the attitude
@@ -71,17 +71,17 @@ typedef struct {
   uint32_t frames_tracked;           /* from the last attitude */
   uint32_t frames_not_identified[6]; /* without an answer, by starcat_reason from 1 on */
   uint32_t frames_without_image;
-  uint32_t frames_refused;           /* their number of centroids, options or camera cannot be */
-  uint32_t scrub_passes;             /* how often the whole image was checked */
-  uint32_t damage_found;             /* how often a block of the image in use was damaged */
+  uint32_t frames_refused; /* their number of centroids, options or camera cannot be */
+  uint32_t scrub_passes;   /* how often the whole image was checked */
+  uint32_t damage_found;   /* how often a block of the image in use was damaged */
   uint32_t blocks_mended;
   uint32_t fall_backs;
 } starcat_counts;
 
 typedef struct {
   /* To be set, and changed between calls. */
-  starcat_slots slots;          /* of an image in ROM: zeros */
-  void *patch;                  /* memory for a patch, at a multiple of 4; null: none */
+  starcat_slots slots; /* of an image in ROM: zeros */
+  void *patch;         /* memory for a patch, at a multiple of 4; null: none */
   size_t patch_capacity;
   starcat_camera camera;
   uint32_t has_own_camera;      /* 0: the camera is that which the image in use was built for */
@@ -99,16 +99,16 @@ typedef struct {
 
   /* To be read. */
   starcat_image image;
-  starcat_status image_status;  /* of the image in use: STARCAT_OK, else why there is none */
-  starcat_mode mode;            /* of the last frame; its result, and all steps that it took */
+  starcat_status image_status; /* of the image in use: STARCAT_OK, else why there is none */
+  starcat_mode mode;           /* of the last frame; its result, and all steps that it took */
   starcat_result result;
   uint32_t steps;
   starcat_load load;            /* may be set to STARCAT_LOAD_FAILED, to give a load up */
   size_t load_bytes, load_size; /* that were read, of all */
   uint32_t is_patch;
-  uint32_t check_block;         /* of the new image, which is checked next */
-  uint32_t scrub_block;         /* of the image in use, which is checked next */
-  starcat_status event_status;  /* of the last event: its status, block, and blocks mended */
+  uint32_t check_block;        /* of the new image, which is checked next */
+  uint32_t scrub_block;        /* of the image in use, which is checked next */
+  starcat_status event_status; /* of the last event: its status, block, and blocks mended */
   uint32_t event_block, event_mended;
   starcat_counts counts;
 
@@ -129,8 +129,7 @@ starcat_status starcat_start_session(starcat_session *session);
 starcat_status starcat_use_image(starcat_session *session, const void *bytes, size_t size);
 
 /* Check options, and a camera unless it is null, as starcat_identify_frame does. */
-starcat_status starcat_check_settings(const starcat_camera *camera,
-                                      const starcat_options *options);
+starcat_status starcat_check_settings(const starcat_camera *camera, const starcat_options *options);
 
 /* Identify a frame: from the last attitude if that is fresh at `time`, and lost in space with the steps
  * that are left if that fails or is not. With `correct` the attitude is fitted to corrected

@@ -52,8 +52,8 @@ static int is_fresh(const starcat_session *s, uint64_t time) {
 
 /* Whether a frame has centroids that can be corrected; the library refuses it if not. */
 static int is_correctable(const starcat_session *s, const starcat_frame *frame) {
-  return (s->correct != NULL) && (frame->count <= STARCAT_MAX_CENTROIDS) &&
-         (frame->x_px != NULL) && (frame->y_px != NULL);
+  return (s->correct != NULL) && (frame->count <= STARCAT_MAX_CENTROIDS) && (frame->x_px != NULL) &&
+         (frame->y_px != NULL);
 }
 
 /* Track a frame from an attitude, by which its centroids are corrected. */
@@ -70,8 +70,8 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
     moved.x_px = s->x_px;
     moved.y_px = s->y_px;
   }
-  const starcat_status status = starcat_track_frame(&s->image, &s->camera, left, &moved, q,
-                                                    error_rad, &s->work, &s->result);
+  const starcat_status status =
+      starcat_track_frame(&s->image, &s->camera, left, &moved, q, error_rad, &s->work, &s->result);
   s->steps += s->result.steps;
   left->max_steps -= s->result.steps;
   return status;
@@ -156,12 +156,11 @@ static starcat_event note_event(starcat_session *s, starcat_event event, starcat
 static starcat_event check_load(starcat_session *s) {
   const uint32_t blocks = s->is_patch != 0u ? 0u : (uint32_t)(s->load_size / STARCAT_BLOCK_BYTES);
   uint32_t bad = 0;
-  starcat_status status = s->is_patch != 0u
-                              ? starcat_apply_patch(&s->slots, s->patch, s->load_size)
-                              : starcat_find_missing_block(&s->slots, blocks, &bad);
+  starcat_status status = s->is_patch != 0u ? starcat_apply_patch(&s->slots, s->patch, s->load_size)
+                                            : starcat_find_missing_block(&s->slots, blocks, &bad);
   if ((status == STARCAT_OK) && (s->is_patch == 0u)) {
-    status = starcat_scrub_image(s->slots.bytes[1u - s->slots.active], s->load_size,
-                                 s->check_block, s->blocks_per_tick, &bad);
+    status = starcat_scrub_image(s->slots.bytes[1u - s->slots.active], s->load_size, s->check_block,
+                                 s->blocks_per_tick, &bad);
   }
   s->check_block += s->blocks_per_tick;
   if (status != STARCAT_OK) {

@@ -41,9 +41,7 @@ static void begin_in_slots(void) {
   CHECK_IS(starcat_start_session(&session), STARCAT_OK);
 }
 
-static void look(void) {
-  sky_look(&session.image, &session.camera, &state, 0.2, 12, 0, &truth);
-}
+static void look(void) { sky_look(&session.image, &session.camera, &state, 0.2, 12, 0, &truth); }
 
 static starcat_status answer(uint64_t time) {
   const starcat_frame frame = unit_frame_of(&truth);

@@ -20,13 +20,13 @@ static bool HasLength(const CFE_SB_Buffer_t *Buffer, size_t Expected) {
 }
 
 /* Call a handler if the length is right; count the command as wrong if not. */
-#define OBEY(handler, type)                                         \
-  do {                                                              \
-    if (HasLength(Buffer, sizeof(type))) {                          \
-      handler((const type *)Buffer);                                \
-    } else {                                                        \
-      STARCAT_APP_Data.HkTlm.Payload.CommandErrorCounter++;         \
-    }                                                               \
+#define OBEY(handler, type)                                 \
+  do {                                                      \
+    if (HasLength(Buffer, sizeof(type))) {                  \
+      handler((const type *)Buffer);                        \
+    } else {                                                \
+      STARCAT_APP_Data.HkTlm.Payload.CommandErrorCounter++; \
+    }                                                       \
   } while (0)
 
 static void GroundCommand(const CFE_SB_Buffer_t *Buffer) {

@@ -9,10 +9,9 @@
 /* Give a frame to the session, in the numbers of the library. */
 static starcat_status Answer(const STARCAT_APP_FrameTlm_Payload_t *Given) {
   static starcat_real Numbers[4][STARCAT_APP_MAX_CENTROIDS];
-  const starcat_frame Frame = {
-      Given->Count, Numbers[0], Numbers[1],
-      (Given->Flags & STARCAT_APP_HAS_MAGNITUDES) != 0 ? Numbers[2] : NULL,
-      (Given->Flags & STARCAT_APP_HAS_SIGMAS) != 0 ? Numbers[3] : NULL};
+  const starcat_frame Frame = {Given->Count, Numbers[0], Numbers[1],
+                               (Given->Flags & STARCAT_APP_HAS_MAGNITUDES) != 0 ? Numbers[2] : NULL,
+                               (Given->Flags & STARCAT_APP_HAS_SIGMAS) != 0 ? Numbers[3] : NULL};
   for (uint32 n = 0; (n < Given->Count) && (n < STARCAT_APP_MAX_CENTROIDS); n++) {
     Numbers[0][n] = (starcat_real)Given->X_px[n];
     Numbers[1][n] = (starcat_real)Given->Y_px[n];

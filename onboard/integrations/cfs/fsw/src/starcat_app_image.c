@@ -93,9 +93,10 @@ static void TellEvent(starcat_event Event) {
                         (unsigned int)SESSION.slots.active);
       break;
     case STARCAT_EVENT_NO_IMAGE:
-      CFE_EVS_SendEvent(STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
-                        "STARCAT: block %lu is damaged beyond its parity, no image is left, status %d",
-                        Block, Status);
+      CFE_EVS_SendEvent(
+          STARCAT_APP_NO_IMAGE_ERR_EID, CFE_EVS_EventType_CRITICAL,
+          "STARCAT: block %lu is damaged beyond its parity, no image is left, status %d", Block,
+          Status);
       break;
     default:
       break;
