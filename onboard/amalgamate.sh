@@ -1,6 +1,6 @@
 #!/bin/sh
 # The library as two files, starcat.c and starcat.h: to drop into any build, with starcat_update.h for
-# who receives images in flight. All but the functions of these headers is static.
+# who receives images in flight and starcat_session.h for who lets a session do it. All but the functions of these headers is static.
 #
 #   sh amalgamate.sh FOLDER
 #
@@ -47,4 +47,4 @@ inlined "$from/include/starcat.h" >"$to/starcat.h"
 END
   inlined "$from"/src/*.c
 } >"$to/starcat.c"
-cp "$from/LICENSE" "$from/include/starcat_update.h" "$to"
+cp "$from/LICENSE" "$from/include/starcat_update.h" "$from/include/starcat_session.h" "$to"

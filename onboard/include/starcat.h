@@ -90,36 +90,36 @@ typedef STARCAT_REAL starcat_real;
 
 /* What a call came to. Values below 0 are errors of the caller or of the image. */
 typedef enum {
-  STARCAT_OK = 0,                   /* done */
-  STARCAT_IDENTIFIED = 0,           /* the same of a frame: it has an answer */
-  STARCAT_NO_MATCH = 1,             /* no attitude explains the frame beyond chance */
-  STARCAT_TOO_FEW_STARS = 2,        /* fewer than four usable centroids, or two directions */
-  STARCAT_INCOMPLETE = 3,           /* there is more to come, or to do */
-  STARCAT_E_NULL = -1,              /* a pointer is null */
-  STARCAT_E_SHORT = -2,             /* fewer bytes than the image says it has */
-  STARCAT_E_MAGIC = -3,             /* not an image of starcat */
-  STARCAT_E_VERSION = -4,           /* a format that this library does not read */
-  STARCAT_E_BYTE_ORDER = -5,        /* written for the other byte order */
-  STARCAT_E_ALIGNMENT = -6,         /* the image does not begin at a multiple of 8 */
-  STARCAT_E_LAYOUT = -7,            /* sizes or sections that contradict each other */
-  STARCAT_E_CRC = -8,               /* a damaged block; starcat_scrub_image names it */
-  STARCAT_E_CAPACITY = -9,          /* more stars in a field than STARCAT_MAX_STARS */
+  STARCAT_OK = 0,            /* done */
+  STARCAT_IDENTIFIED = 0,    /* the same of a frame: it has an answer */
+  STARCAT_NO_MATCH = 1,      /* no attitude explains the frame beyond chance */
+  STARCAT_TOO_FEW_STARS = 2, /* fewer than four usable centroids, or two directions */
+  STARCAT_INCOMPLETE = 3,    /* there is more to come, or to do */
+  STARCAT_E_NULL = -1,       /* a pointer is null */
+  STARCAT_E_SHORT = -2,      /* fewer bytes than the image says it has */
+  STARCAT_E_MAGIC = -3,      /* not an image of starcat */
+  STARCAT_E_VERSION = -4,    /* a format that this library does not read */
+  STARCAT_E_BYTE_ORDER = -5, /* written for the other byte order */
+  STARCAT_E_ALIGNMENT = -6,  /* the image does not begin at a multiple of 8 */
+  STARCAT_E_LAYOUT = -7,     /* sizes or sections that contradict each other */
+  STARCAT_E_CRC = -8,        /* a damaged block; starcat_scrub_image names it */
+  STARCAT_E_CAPACITY = -9,   /* more stars in a field than STARCAT_MAX_STARS */
   STARCAT_E_TOO_MANY_CENTROIDS = -10,
-  STARCAT_E_NOT_FINITE = -11,       /* an option, the prior or a direction is not finite */
-  STARCAT_E_CAMERA = -12,           /* a camera that cannot be */
-  STARCAT_E_OPTIONS = -13,          /* an option out of range */
-  STARCAT_E_BUDGET = -14            /* the steps are used up before an answer was found */
+  STARCAT_E_NOT_FINITE = -11, /* an option, the prior or a direction is not finite */
+  STARCAT_E_CAMERA = -12,     /* a camera that cannot be */
+  STARCAT_E_OPTIONS = -13,    /* an option out of range */
+  STARCAT_E_BUDGET = -14      /* the steps are used up before an answer was found */
 } starcat_status;
 
 /* Why a frame has no answer. */
 typedef enum {
   STARCAT_REASON_NONE = 0,
   STARCAT_REASON_TOO_FEW_STARS = 1,
-  STARCAT_REASON_NO_CANDIDATE = 2,  /* no pattern of the frame is in the image */
-  STARCAT_REASON_CHANCE = 3,        /* no attitude fits better than chance */
-  STARCAT_REASON_SHARE = 4,         /* the best agreement explains too little of the frame */
-  STARCAT_REASON_SCALE = 5,         /* the frame is of another scale than the camera */
-  STARCAT_REASON_STEPS = 6          /* the steps were used up */
+  STARCAT_REASON_NO_CANDIDATE = 2, /* no pattern of the frame is in the image */
+  STARCAT_REASON_CHANCE = 3,       /* no attitude fits better than chance */
+  STARCAT_REASON_SHARE = 4,        /* the best agreement explains too little of the frame */
+  STARCAT_REASON_SCALE = 5,        /* the frame is of another scale than the camera */
+  STARCAT_REASON_STEPS = 6         /* the steps were used up */
 } starcat_reason;
 
 /* Results of a centroid beside the row of its star, which is 0 or more. */
@@ -143,34 +143,34 @@ typedef struct {
   const int64_t *star_ids;
   const uint32_t *grid;
   const uint32_t *kvector;
-  const void *features;    /* triangles or pairs: rows of uint16_t or uint32_t */
-  const uint16_t *radii;   /* null for the method pyramid */
-  const char *name;        /* up to 96 bytes, filled with zeros */
+  const void *features;           /* triangles or pairs: rows of uint16_t or uint32_t */
+  const uint16_t *radii;          /* null for the method pyramid */
+  const char *name;               /* up to 96 bytes, filled with zeros */
   const uint8_t *manifest_sha256; /* 32 bytes */
 } starcat_image;
 
 /* A camera with square pixels; Brown's distortion as in OpenCV. Its corners are up to 89.4 degrees
  * from its axis. */
 typedef struct {
-  starcat_real width_px, height_px;      /* 1 to 1e6 */
-  starcat_real focal_length_px;          /* 0.01 to 1e9 */
-  starcat_real x0_px, y0_px;             /* principal point */
-  starcat_real k1, k2, k3, p1, p2;       /* 0: none */
-  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: any */
+  starcat_real width_px, height_px; /* 1 to 1e6 */
+  starcat_real focal_length_px;     /* 0.01 to 1e9 */
+  starcat_real x0_px, y0_px;        /* principal point */
+  starcat_real k1, k2, k3, p1, p2;  /* 0: none */
+  starcat_real fold_radius;         /* largest x/z that the distortion holds for; 0: any */
 } starcat_camera;
 
 typedef struct {
-  starcat_real tolerance_px;             /* largest error of a centroid, as a radius: 1e-6 to 1e6 */
-  starcat_real noise_px;                 /* standard deviation on each axis; 0: not stated.
+  starcat_real tolerance_px; /* largest error of a centroid, as a radius: 1e-6 to 1e6 */
+  starcat_real noise_px;     /* standard deviation on each axis; 0: not stated.
                                             If stated, 1e-6 to 1e6; tolerance_px is 3 times this */
-  starcat_real noise_mag;                /* standard deviation of magnitudes, up to 1e6; 0: not
+  starcat_real noise_mag;    /* standard deviation of magnitudes, up to 1e6; 0: not
                                             stated */
-  starcat_real log_chance;               /* natural logarithm of the largest accepted probability
+  starcat_real log_chance;   /* natural logarithm of the largest accepted probability
                                             that chance agrees as well */
-  starcat_real fov_error;                /* largest relative error of the focal length, up to 0.5:
+  starcat_real fov_error;    /* largest relative error of the focal length, up to 0.5:
                                             it is then found with the attitude, which the method
                                             triangle can; 0: it is known */
-  uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
+  uint32_t max_steps;        /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
 /* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN or
@@ -186,25 +186,25 @@ typedef struct {
 } starcat_frame;
 
 typedef struct {
-  starcat_real q_body_from_icrs[4];      /* x, y, z, w; see the head of this file */
-  starcat_real matrix[9];                /* the same attitude, A by rows: camera = A * icrs */
-  starcat_real residual_rad;             /* root mean square of the matched centroids */
-  starcat_real log_chance;               /* natural logarithm of the bound; 0 if not identified */
+  starcat_real q_body_from_icrs[4]; /* x, y, z, w; see the head of this file */
+  starcat_real matrix[9];           /* the same attitude, A by rows: camera = A * icrs */
+  starcat_real residual_rad;        /* root mean square of the matched centroids */
+  starcat_real log_chance;          /* natural logarithm of the bound; 0 if not identified */
   uint32_t n_matched;
-  uint32_t steps;                        /* steps that were taken */
-  uint32_t n_tried;                      /* attitudes that were verified */
-  starcat_real focal_length_px;          /* the given one, or the one that was found */
-  uint32_t reason;                       /* of starcat_reason: why there is no answer */
-  uint32_t n_usable;                     /* centroids that could be used */
-  uint32_t best_n_matched;               /* if not identified: matches of the best agreement, */
-  starcat_real best_log_chance;          /* its bound */
-  starcat_real best_share;               /* and the share of the frame that it explains */
-  starcat_real covariance_rad2[9];       /* of small turns about the camera's x, y and z, with the
+  uint32_t steps;                      /* steps that were taken */
+  uint32_t n_tried;                    /* attitudes that were verified */
+  starcat_real focal_length_px;        /* the given one, or the one that was found */
+  uint32_t reason;                     /* of starcat_reason: why there is no answer */
+  uint32_t n_usable;                   /* centroids that could be used */
+  uint32_t best_n_matched;             /* if not identified: matches of the best agreement, */
+  starcat_real best_log_chance;        /* its bound */
+  starcat_real best_share;             /* and the share of the frame that it explains */
+  starcat_real covariance_rad2[9];     /* of small turns about the camera's x, y and z, with the
                                             stated noise, else with that of the residuals; zeros
                                             if not identified, or its stars determine no attitude */
-  starcat_real reduced_chi_square;       /* squared residuals in the stated noise, a degree of
+  starcat_real reduced_chi_square;     /* squared residuals in the stated noise, a degree of
                                             freedom: above 2 that is too small; 0: not stated */
-  int32_t star[STARCAT_MAX_CENTROIDS];   /* row in the image, or one of the negative numbers */
+  int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */
 } starcat_result;
 
 /* Memory that a call works in; its contents are nobody's business and need not be set. */
@@ -219,30 +219,31 @@ void starcat_get_camera(const starcat_image *image, starcat_camera *camera);
 void starcat_set_default_options(starcat_options *options);
 
 /* Open an image of `size` bytes at `bytes`, which stays where it is. */
-starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
+starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size,
+                                  uint32_t flags);
 
 /* Check blocks `first` to `first + count` of an image; every block if count is 0. On
  * STARCAT_E_CRC `bad_block` is the first one that is damaged. */
 starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
-                             uint32_t *bad_block);
+                                   uint32_t *bad_block);
 
 /* Identify the stars of a frame without any prior knowledge. */
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
-                                const starcat_options *options, const starcat_frame *frame,
-                                starcat_workspace *work, starcat_result *result);
+                                      const starcat_options *options, const starcat_frame *frame,
+                                      starcat_workspace *work, starcat_result *result);
 
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
  * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is
  * STARCAT_E_CAPACITY: state the prior more narrowly. */
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
-                             const starcat_options *options, const starcat_frame *frame,
-                             const starcat_real q_prior[4], starcat_real uncertainty_rad,
-                             starcat_workspace *work, starcat_result *result);
+                                   const starcat_options *options, const starcat_frame *frame,
+                                   const starcat_real q_prior[4], starcat_real uncertainty_rad,
+                                   starcat_workspace *work, starcat_result *result);
 
 /* Find the attitude A that fits pairs of unit vectors (rows) best: body = A icrs. `body` has camera
  * components. A component beyond 2 is an error. */
 starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
-                                uint32_t count, starcat_real q_body_from_icrs[4]);
+                                    uint32_t count, starcat_real q_body_from_icrs[4]);
 
 #include "starcat_workspace.h"
 

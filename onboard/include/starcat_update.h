@@ -49,12 +49,13 @@ starcat_status starcat_receive_image(starcat_slots *slots, size_t size, uint32_t
 
 /* Write `count` bytes at `offset` of the image that is received. STARCAT_E_SHORT: beyond its end. */
 starcat_status starcat_put_piece(starcat_slots *slots, size_t offset, const uint8_t *bytes,
-                           size_t count);
+                                 size_t count);
 
 /* Find a block of 4096 bytes that has not been received whole: one of the check blocks at the end
  * of the image, by which the others are told, else the first from `first` on. STARCAT_INCOMPLETE:
  * there is one, its number in `block`. STARCAT_OK: there is none, and `block` is their number. */
-starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first, uint32_t *block);
+starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first,
+                                          uint32_t *block);
 
 /* Open the image of the other slot, every block checked, and make that slot the active one. If it
  * cannot be used (STARCAT_INCOMPLETE: it has not been received whole) nothing changes but `image`, which has to be opened again by starcat_start_image. Called

@@ -21,14 +21,14 @@
 /* Which star each centroid of a frame is under an attitude. */
 typedef struct {
   starcat_real matrix[9];
-  starcat_real focal;      /* the camera's focal length, over the one that was given */
+  starcat_real focal; /* the camera's focal length, over the one that was given */
   starcat_real residual_rad;
   starcat_real log_chance; /* 0 where it is withheld */
   starcat_real log_bound;  /* the same whether it is withheld or not */
   starcat_real share;      /* of the frame that it explains; 1 where chance explains it */
   uint32_t n_matched;
-  uint32_t withheld;       /* a reason, 0: not withheld */
-  uint32_t is_firm;        /* whether its stars alone determine the whole frame */
+  uint32_t withheld;                   /* a reason, 0: not withheld */
+  uint32_t is_firm;                    /* whether its stars alone determine the whole frame */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, -1: none */
 } starcat_agreement;
 

@@ -36,9 +36,8 @@ static real find_centroid_noise(const starcat_call *call, uint32_t centroid) {
 
 /* List the centroids of the best agreement that are stars, with directions of the image or others,
  * and their weights: one over the square of the noise, over the largest. Returns how many. */
-static uint32_t take_stars(const starcat_image *image, const real *directions,
-                           const real *sigma_px, uint32_t count, uint32_t given,
-                           starcat_workspace *w) {
+static uint32_t take_stars(const starcat_image *image, const real *directions, const real *sigma_px,
+                           uint32_t count, uint32_t given, starcat_workspace *w) {
   real least = R(0.0);
   uint32_t n = 0;
   for (uint32_t i = 0; i < count; i++) {
@@ -70,7 +69,7 @@ static uint32_t take_stars(const starcat_image *image, const real *directions,
 static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result *result) {
   real square = R(0.0);
   starcat_refine_attitude(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
-                 count, 4);
+                          count, 4);
   starcat_make_quaternion(result->matrix, result->q_body_from_icrs);
   starcat_make_matrix(result->q_body_from_icrs, result->matrix);
   for (uint32_t i = 0; i < count; i++) {
@@ -93,8 +92,8 @@ void starcat_fit_answer(const starcat_image *image, const real *directions, cons
 
 /* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
  * the attitude. Sums the squared residuals of stated noise, in it, and counts these centroids. */
-static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen,
-                      real *chi_square, uint32_t *n_stated) {
+static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real *chi_square,
+                      uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
   real square = R(0.0);
   for (uint32_t n = 0; n < n_seen; n++) {
@@ -160,7 +159,7 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
 }
 
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
-                           starcat_result *result) {
+                                starcat_result *result) {
   starcat_workspace *w = call->work;
   result->steps = options->max_steps - call->own->steps_left;
   result->n_tried = call->own->n_tried;
@@ -171,8 +170,7 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   call->focal = R(0.0); /* so that the directions are worked out again */
   starcat_set_focal(call, w->best.focal);
   const uint32_t count = call->own->count;
-  const uint32_t n_seen =
-      take_stars(call->image, NULL, call->sigma_px, count, call->own->given, w);
+  const uint32_t n_seen = take_stars(call->image, NULL, call->sigma_px, count, call->own->given, w);
   if (n_seen < STARCAT_MIN_STARS) {
     return refuse_frame(call, result);
   }

@@ -7,7 +7,7 @@
 /* The attitude that turns a1 into b1 exactly, and a2 into the plane of b1 and b2 (TRIAD; Black
  * 1964). Returns 0 if two directions coincide. */
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
-                  real m[9]) {
+                      real m[9]) {
   real bn[3], an[3], bt[3], at[3];
   starcat_cross(b1, b2, bn);
   starcat_cross(a1, a2, an);
@@ -93,7 +93,7 @@ static void turn_matrix(real m[9], const real w[3]) {
  * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
  * It works with differences of directions, so that narrow fields lose no digits. */
 void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
-                    const real *weight, uint32_t count, uint32_t most) {
+                             const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {
     real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
     for (uint32_t i = 0; i < count; i++) {
@@ -151,8 +151,7 @@ void starcat_make_quaternion(const real m[9], real q[4]) {
     q[k] = m[3u * k + i] + m[3u * i + k];
     q[3] = m[3u * j + k] - m[3u * k + j];
   }
-  real scale =
-      R(1.0) / STARCAT_SQRT(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  real scale = R(1.0) / STARCAT_SQRT(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   if (q[3] < R(0.0)) {
     scale = -scale;
   }
@@ -188,7 +187,7 @@ static real spread(const real (*v)[3], uint32_t i, uint32_t j) {
 }
 
 starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
-                                uint32_t count, starcat_real q_body_from_icrs[4]) {
+                                    uint32_t count, starcat_real q_body_from_icrs[4]) {
   real m[9], widest = R(0.0);
   uint32_t second = 0;
   if ((body == NULL) || (icrs == NULL) || (q_body_from_icrs == NULL)) {

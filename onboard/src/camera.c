@@ -23,8 +23,8 @@
 /* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
 static void apply_distortion(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
-  const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
-                      R(2.0) * (c->p2 * u + c->p1 * v);
+  const real factor =
+      R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) + R(2.0) * (c->p2 * u + c->p1 * v);
   *x = u * factor + s * c->p2;
   *y = v * factor + s * c->p1;
 }
@@ -43,8 +43,8 @@ static int distort_point(const starcat_camera *c, real u, real v, real *x, real 
 static void differentiate_distortion(const starcat_camera *c, real u, real v, real slope[4]) {
   const real s = u * u + v * v;
   const real along = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
-  const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
-                      R(2.0) * (c->p2 * u + c->p1 * v);
+  const real factor =
+      R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) + R(2.0) * (c->p2 * u + c->p1 * v);
   const real du = R(2.0) * (u * along + c->p2), dv = R(2.0) * (v * along + c->p1);
   slope[0] = factor + u * du + R(2.0) * u * c->p2;
   slope[1] = u * dv + R(2.0) * v * c->p2;

@@ -14,7 +14,7 @@
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
-#define LEAST_EXTENT R(1e-6) /* of stars on the detector, square pixels */
+#define LEAST_EXTENT R(1e-6)                    /* of stars on the detector, square pixels */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
@@ -39,7 +39,8 @@ static real information_of_places(const starcat_call *call, real *of_scale) {
       cross[1] -= x * (b + y * y);
     }
   }
-  *of_scale = starcat_solve_symmetric(h, cross, share, unused) ? along - starcat_dot(cross, share) : R(0.0);
+  *of_scale =
+      starcat_solve_symmetric(h, cross, share, unused) ? along - starcat_dot(cross, share) : R(0.0);
   return h[0] * (h[3] * h[5] - h[4] * h[4]) + h[1] * (h[2] * h[4] - h[1] * h[5]) +
          h[2] * (h[1] * h[4] - h[2] * h[3]);
 }
@@ -96,7 +97,8 @@ static real log_of_sum(real a, real b) {
 
 /* Logarithm of the bound; 0 if it says nothing. */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched) {
-  const uint32_t fewer = call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
+  const uint32_t fewer =
+      call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   const int is_stated = call->noise_px > R(0.0);
   real of_scale;
   const real information = information_of_places(call, &of_scale);
@@ -113,7 +115,8 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
                          STARCAT_LOG(starcat_larger(information * of_scale, STARCAT_LEAST_NUMBER)),
                          4));
   }
-  expected -= is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(call->own->count - 3u));
+  expected -=
+      is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(call->own->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
 }
 
@@ -163,7 +166,7 @@ static int invert_angles(const starcat_information *matched, starcat_information
 /* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
  * whether its stars determine the whole frame, even where the focal length is not trusted. */
 void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
-                   starcat_agreement *found) {
+                             starcat_agreement *found) {
   const starcat_workspace *w = call->work;
   const real n = (real)found->n_matched;
   starcat_information matched = {{0}, {0}, R(0.0)}, centroids = matched, stars = matched;
@@ -234,9 +237,8 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
     }
   }
   const real excess = product / starcat_larger(extent, LEAST_EXTENT);
-  const real corner_px =
-      STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
-                   call->camera.half_height * call->camera.half_height);
+  const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
+                                      call->camera.half_height * call->camera.half_height);
   const real moved = excess < R(0.0) ? -excess * corner_px : excess * corner_px;
   if (!(moved > tolerance_px)) {
     return 0;

@@ -18,7 +18,7 @@ void starcat_set_default_options(starcat_options *options) {
   options->max_steps = 4000000u;
 }
 
-static starcat_status check_options(const starcat_options *o) {
+starcat_status starcat_check_options(const starcat_options *o) {
   if (!starcat_are_finite((const real *)(const void *)o, 5)) {
     return STARCAT_E_NOT_FINITE;
   }
@@ -47,7 +47,8 @@ static int comes_before(const starcat_call *call, real magnitude, real square, r
 }
 
 /* Put a centroid where it belongs among those that are in order. */
-static void insert_centroid(const starcat_call *call, uint32_t row, real magnitude, real x, real y) {
+static void insert_centroid(const starcat_call *call, uint32_t row, real magnitude, real x,
+                            real y) {
   starcat_workspace *w = call->work;
   const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
   const real square = dx * dx + dy * dy;
@@ -138,7 +139,8 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   starcat_allow_scales(call, options->fov_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = STARCAT_REACH * call->tolerance_px;
-  call->mag_reach = call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->mag_reach =
+      call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
   call->log_certain = options->log_chance;
@@ -151,9 +153,9 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
 }
 
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
-                             const starcat_camera *camera, const starcat_options *options,
-                             const starcat_frame *frame, starcat_workspace *work,
-                             starcat_result *result) {
+                                  const starcat_camera *camera, const starcat_options *options,
+                                  const starcat_frame *frame, starcat_workspace *work,
+                                  starcat_result *result) {
   if ((image == NULL) || (camera == NULL) || (options == NULL) || (frame == NULL) ||
       (work == NULL) || (result == NULL)) {
     return STARCAT_E_NULL;
@@ -177,7 +179,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   if (frame->count > STARCAT_MAX_CENTROIDS) {
     return STARCAT_E_TOO_MANY_CENTROIDS;
   }
-  starcat_status status = check_options(options);
+  starcat_status status = starcat_check_options(options);
   if (status == STARCAT_OK) {
     status = starcat_prepare_camera(camera, &call->camera);
   }
@@ -207,8 +209,8 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
     if (result->star[i] == STARCAT_NO_STAR) {
       const int is_known =
           (call->own->has_magnitudes != 0u) && starcat_is_finite(frame->magnitudes + i);
-      insert_centroid(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE, frame->x_px[i],
-             frame->y_px[i]);
+      insert_centroid(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE,
+                      frame->x_px[i], frame->y_px[i]);
     }
   }
   drop_repeats(call, result);

@@ -1,19 +1,21 @@
 /* The two ways to an attitude: lost in space, and from a prior attitude.
  *
- *     identify a frame:
- *       check the arguments, turn centroids into directions
- *       for each triangle of centroids, the most promising first (triangles.c):
- *         look up triangles of stars, or pyramids (pyramids.c)
- *         for each of them: try its attitude (verify.c)
- *         stop if an attitude is certain, or if the steps are spent
- *       answer with the best attitude, if chance does not explain it (answer.c)
+ *     identify_frame:
+ *         begin: order the usable centroids, brightest first
+ *         for each triangle of centroids, until an attitude is certain or the steps are used up:
+ *             for each feature of the image that it may be:  [triangles.c, pyramids.c]
+ *                 try the attitude that this gives, and keep the best one  [verify.c]
+ *         end: fit the best attitude to its stars, or withhold it  [answer.c]
  *
- *     track a frame:
- *       predict the stars of the frame from the prior attitude
- *       for each of the first eight centroids:
- *         for each star near it, the nearest first:
- *           find the star that the farthest centroid is then
- *           try the attitude of the two (verify.c); stop if it is certain
+ *     track_frame:
+ *         begin as above; gather the stars that the prior attitude may show
+ *         for each of the first eight centroids a:
+ *             for b in (the centroid farthest from a, the next one in order):
+ *                 predict where the prior puts the stars
+ *                 for each star near a, the nearest first:
+ *                     find the star nearest to where b then has to be
+ *                     try the attitude of these two pairs, and stop if it is certain
+ *         end as above
  *
  * SPDX-License-Identifier: MIT
  */
@@ -25,15 +27,16 @@
 #define MOST_ANCHORS 8u
 
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
-                                const starcat_options *options, const starcat_frame *frame,
-                                starcat_workspace *work, starcat_result *result) {
+                                      const starcat_options *options, const starcat_frame *frame,
+                                      starcat_workspace *work, starcat_result *result) {
   starcat_call call;
-  const starcat_status status = starcat_begin_call(&call, image, camera, options, frame, work, result);
+  const starcat_status status =
+      starcat_begin_call(&call, image, camera, options, frame, work, result);
   if (status != STARCAT_OK) {
     return status;
   }
-  starcat_search_triangles(&call,
-                        image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle : starcat_look_up_pyramid);
+  starcat_search_triangles(&call, image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle
+                                                                    : starcat_look_up_pyramid);
   return starcat_end_call(&call, options, result);
 }
 
@@ -85,8 +88,8 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
 static int predict_stars(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
-    call->own->n_near = starcat_gather_stars(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
-                               w->near_row, w->near_icrs);
+    call->own->n_near = starcat_gather_stars(call, p->matrix + 6, p->cos_radius, p->sin_radius,
+                                             STARCAT_MAX_STARS, w->near_row, w->near_icrs);
     if ((call->own->n_near > STARCAT_MAX_STARS) || !starcat_spend_steps(call, call->own->n_near)) {
       return 0;
     }
@@ -102,7 +105,8 @@ static real square_from(const starcat_workspace *w, uint32_t star, real x, real 
 }
 
 /* The star predicted next farther from a centroid than `past`; -1 if none is within the slack. */
-static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t centroid, real *past) {
+static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t centroid,
+                              real *past) {
   const starcat_workspace *w = call->work;
   real least = p->shift_px * p->shift_px;
   int32_t found = -1;
@@ -195,9 +199,9 @@ static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
 }
 
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
-                             const starcat_options *options, const starcat_frame *frame,
-                             const starcat_real q_prior[4], starcat_real uncertainty_rad,
-                             starcat_workspace *work, starcat_result *result) {
+                                   const starcat_options *options, const starcat_frame *frame,
+                                   const starcat_real q_prior[4], starcat_real uncertainty_rad,
+                                   starcat_workspace *work, starcat_result *result) {
   starcat_call call;
   prior p;
   if (q_prior == NULL) {

@@ -38,10 +38,10 @@ static real read_f64(const uint8_t *bytes, size_t offset) {
 
 /* CRC-32 of zlib, PNG and Ethernet, four bits at a time. */
 uint32_t starcat_update_crc(uint32_t crc, const uint8_t *bytes, size_t count) {
-  static const uint32_t table[16] = {
-      0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
-      0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
-      0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
+  static const uint32_t table[16] = {0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu,
+                                     0x76dc4190u, 0x6b6b51f4u, 0x4db26158u, 0x5005713cu,
+                                     0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
+                                     0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
   uint32_t left = ~crc;
   for (size_t n = 0; n < count; n++) {
     left ^= bytes[n];
@@ -70,7 +70,8 @@ static starcat_status check_start(const void *bytes, size_t size) {
     }
   }
   if (read_u32(image, 8) != STARCAT_BYTE_ORDER) {
-    return read_u32(image, 8) == STARCAT_BYTE_ORDER_SWAPPED ? STARCAT_E_BYTE_ORDER : STARCAT_E_MAGIC;
+    return read_u32(image, 8) == STARCAT_BYTE_ORDER_SWAPPED ? STARCAT_E_BYTE_ORDER
+                                                            : STARCAT_E_MAGIC;
   }
   if (read_u16(image, 12) != STARCAT_FORMAT_MAJOR) {
     return STARCAT_E_VERSION;
@@ -108,7 +109,7 @@ int starcat_is_block_sound(const uint8_t *image, uint32_t data, uint32_t block) 
 }
 
 starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
-                             uint32_t *bad_block) {
+                                   uint32_t *bad_block) {
   const uint8_t *image = bytes;
   const starcat_status status = check_start(bytes, size);
   if (bad_block == NULL) {
@@ -168,7 +169,8 @@ static int has_section(const sections *found, uint32_t kind, uint64_t count, uin
 static int is_complete(const starcat_image *image, const sections *found) {
   const uint64_t cells = (uint64_t)image->grid_bands * image->grid_sectors + 1u;
   const uint64_t stars = image->n_stars, index = image->index_bytes;
-  const int common = has_section(found, DIRECTIONS, stars, 12) && has_section(found, MAGNITUDES, stars, 2) &&
+  const int common = has_section(found, DIRECTIONS, stars, 12) &&
+                     has_section(found, MAGNITUDES, stars, 2) &&
                      has_section(found, STAR_IDS, stars, 8) && has_section(found, GRID, cells, 4) &&
                      has_section(found, KVECTOR, image->n_kvector, 4);
   if (image->method == STARCAT_TRIANGLE) {
@@ -216,7 +218,8 @@ static starcat_status check_numbers(const starcat_image *image) {
   return read_u32(image->bytes, 56) > STARCAT_MAX_STARS ? STARCAT_E_CAPACITY : STARCAT_OK;
 }
 
-starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size, uint32_t flags) {
+starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size,
+                                  uint32_t flags) {
   uint32_t bad = 0;
   sections found;
   if (image == NULL) {

@@ -30,27 +30,27 @@
 #define STARCAT_MIN_STARS 4u
 #define STARCAT_MIN_SHARE (R(1.0) / R(3.0))
 #define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
-#define STARCAT_REACH R(1.5)          /* largest distance of a match, in tolerances */
+#define STARCAT_REACH R(1.5) /* largest distance of a match, in tolerances */
 #define STARCAT_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
-#define STARCAT_SURE_CORNER R(0.5)    /* largest error of a corner of firm stars, in tolerances */
-#define STARCAT_OTHER_SCALES R(0.05)  /* errors of the focal length that are looked for */
-#define STARCAT_FOCAL_MARGIN R(0.02)  /* of the field's radius, where the focal length is fitted */
+#define STARCAT_SURE_CORNER R(0.5)   /* largest error of a corner of firm stars, in tolerances */
+#define STARCAT_OTHER_SCALES R(0.05) /* errors of the focal length that are looked for */
+#define STARCAT_FOCAL_MARGIN R(0.02) /* of the field's radius, where the focal length is fitted */
 #define STARCAT_OVER_CHANCE \
   R(2.0) /* of the centroids within a smaller reach, over its area's share */
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
-#define STARCAT_LOG_ROUNDING R(1e-4)   /* logarithms of chances that differ by less are the same */
-#define STARCAT_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
+#define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less are the same */
+#define STARCAT_RIVAL_REACH R(4.0)    /* how near a rival is to a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define STARCAT_SCALE_DEVIATIONS R(3.0)
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
 #define STARCAT_MAG_DEVIATIONS R(3.5)
 #define STARCAT_MIN_SIDE_PX R(10.0)
-#define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
+#define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675)   /* 15 degrees */
 #define STARCAT_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define STARCAT_FEW_CENTROIDS 12u
-#define STARCAT_LEAST_COSINE R(0.01)  /* of the angle from the axis to what a camera sees */
-#define STARCAT_LEAST_PX R(1e-6)      /* of a tolerance or a noise */
+#define STARCAT_LEAST_COSINE R(0.01) /* of the angle from the axis to what a camera sees */
+#define STARCAT_LEAST_PX R(1e-6)     /* of a tolerance or a noise */
 #define STARCAT_LARGEST_PX R(1e6)
 #define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
 /* Least weight of a centroid over the largest, which rounding still leaves room for; least side of
@@ -68,8 +68,8 @@
 #define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
 #define STARCAT_SPREAD_CENTROIDS \
-  400u /* that make triangles with their neighbours, the first ones */
-#define STARCAT_MOST_TRIANGLES 5000u  /* of centroids that are looked up */
+  400u                               /* that make triangles with their neighbours, the first ones */
+#define STARCAT_MOST_TRIANGLES 5000u /* of centroids that are looked up */
 
 /* A camera as a call uses it. */
 typedef struct {
@@ -84,10 +84,10 @@ typedef struct {
 /* What a call counts. It is not in the workspace, where a flipped bit of it would lead out of that;
  * what is in there and leads to a place is held to its range by starcat_limit_place when it is used. */
 typedef struct {
-  uint32_t given;          /* centroids of the frame */
-  uint32_t count;          /* those that can be used */
+  uint32_t given; /* centroids of the frame */
+  uint32_t count; /* those that can be used */
   uint32_t has_magnitudes;
-  uint32_t is_crowded;     /* whether separations of pairs are not listed */
+  uint32_t is_crowded;       /* whether separations of pairs are not listed */
   uint32_t n_near, n_within; /* stars around the field of an attitude; those within reach of it */
   uint32_t steps_left, n_tried;
 } starcat_counters;
@@ -104,10 +104,10 @@ typedef struct {
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
   real log_scales, bend;
   real tolerance_px, tolerance_rad, reach_px;
-  real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
+  real noise_px;       /* standard deviation of a centroid on each axis; 0: not stated */
   real columns_per_px; /* columns of the detector that list its centroids */
-  real mag_reach; /* largest difference of magnitudes of a match; 0: any */
-  real log_limit; /* largest accepted chance */
+  real mag_reach;      /* largest difference of magnitudes of a match; 0: any */
+  real log_limit;      /* largest accepted chance */
   real log_certain;
   const real *sigma_px; /* noise of the frame's centroids; null: not stated */
   starcat_optics camera;
@@ -155,7 +155,7 @@ static inline void starcat_read_star(const starcat_image *image, uint32_t row, r
 
 /* The rows of the stars of a feature. */
 static inline void starcat_read_rows(const starcat_image *image, uint32_t feature, uint32_t width,
-                                   uint32_t rows[3]) {
+                                     uint32_t rows[3]) {
   const size_t at = (size_t)feature * width;
   if (image->index_bytes == 2u) {
     const uint16_t *indices = image->features;
@@ -186,11 +186,11 @@ int starcat_spend_steps(const starcat_call *call, uint32_t steps);
 
 /* attitude.c */
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
-                  real m[9]);
+                      real m[9]);
 int starcat_solve_symmetric(const real m[6], const real v[3], real x[3], real inverse[6]);
 int starcat_invert_information(const starcat_information *m, starcat_information *inverse);
 void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
-                    const real *weight, uint32_t count, uint32_t most);
+                             const real *weight, uint32_t count, uint32_t most);
 void starcat_make_quaternion(const real m[9], real q[4]);
 void starcat_make_matrix(const real q[4], real m[9]);
 
@@ -203,8 +203,8 @@ int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x
 void starcat_find_turns(const starcat_optics *camera, const real body[3], real turn[2][3]);
 
 /* sky.c */
-uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
-                        uint32_t most, uint32_t *rows, real (*icrs)[3]);
+uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r,
+                              real sin_r, uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
 void starcat_count_ways(const starcat_call *call, uint32_t most);
@@ -214,7 +214,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n);
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched);
 void starcat_add_information(starcat_information *h, const real b[3]);
 void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
-                   starcat_agreement *found);
+                             starcat_agreement *found);
 int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
 
 /* verify.c */
@@ -223,11 +223,12 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
 /* frame.c */
+starcat_status starcat_check_options(const starcat_options *o);
 void starcat_list_columns(starcat_call *call);
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
-                             const starcat_camera *camera, const starcat_options *options,
-                             const starcat_frame *frame, starcat_workspace *work,
-                             starcat_result *result);
+                                  const starcat_camera *camera, const starcat_options *options,
+                                  const starcat_frame *frame, starcat_workspace *work,
+                                  starcat_result *result);
 
 /* answer.c */
 #ifdef STARCAT_GROUND /* of Python, which knows directions before they were rounded */
@@ -235,14 +236,14 @@ void starcat_fit_answer(const starcat_image *image, const real *directions, cons
                         starcat_workspace *work, starcat_result *result);
 #endif
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
-                           starcat_result *result);
+                                starcat_result *result);
 
 /* triangles.c, pyramids.c */
 typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j);
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up);
 void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
-                          uint32_t *stop);
+                       uint32_t *stop);
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 

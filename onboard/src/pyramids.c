@@ -135,7 +135,8 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
 }
 
 /* Complete a pair by a third star. Returns 1 if the search can end. */
-static int complete_pyramid(starcat_call *call, const base *o, const real first[3], const real second[3]) {
+static int complete_pyramid(starcat_call *call, const base *o, const real first[3],
+                            const real second[3]) {
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
@@ -153,7 +154,8 @@ static int complete_pyramid(starcat_call *call, const base *o, const real first[
   for (uint32_t k = 0; k < 3u; k++) {
     third[k] *= scale;
   }
-  uint32_t count = starcat_gather_stars(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
+  uint32_t count =
+      starcat_gather_stars(call, third, o->cos_reach, o->sin_reach, MOST_THIRD, rows, found);
   if (call->own->steps_left == 0u) {
     return 1;
   }

@@ -73,13 +73,12 @@ static void gather_sectors(cap *query, uint32_t band, uint32_t first, uint32_t l
  * little farther. Returns their number, or
  * most + 1 if there are more than `most`, or if the steps are used up: a step a band, and one a
  * star that is looked at. */
-uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r, real sin_r,
-                        uint32_t most, uint32_t *rows, real (*icrs)[3]) {
+uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r,
+                              real sin_r, uint32_t most, uint32_t *rows, real (*icrs)[3]) {
   const starcat_image *image = call->image;
   const real x = centre[0], y = centre[1], z = centre[2];
   const real level = STARCAT_SQRT(x * x + y * y);
-  cap query = {image, centre, cos_r - COSINE_MARGIN,  rows, icrs, most,
-               0,     0,      call->own->steps_left};
+  cap query = {image, centre, cos_r - COSINE_MARGIN, rows, icrs, most, 0, 0, call->own->steps_left};
   const int has_pole = (z >= cos_r) || (-z >= cos_r) || (level <= sin_r);
   const real high = z >= cos_r ? R(1.0) : z * cos_r + level * sin_r;
   const real low = -z >= cos_r ? R(-1.0) : z * cos_r - level * sin_r;

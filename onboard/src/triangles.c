@@ -1,16 +1,19 @@
 /* Triangles of centroids, one after the other, and the triangles of stars that they may be.
  *
- *     for each triangle of centroids:
- *       with magnitudes: those of the brightest centroids first
- *       without: those with the shortest longest side first
- *       in a crowded frame: those of near centroids, all over the frame in turn
- *     skip it if a side is short or an angle is narrow; few centroids: try such triangles last
- *     find the range of its area in the K-vector of the image
- *     for each triangle of stars in the range:
- *       compare the three sides, by length first, then in every order of the corners
- *       compare the handedness
- *       make the attitude, and try it (verify.c)
- *     without a focal length: by shape first, then by a range of areas
+ *     search_triangles:
+ *         if a frame without magnitudes has more than 32 centroids:
+ *             take the triangles of each centroid and its neighbours
+ *         else for round in (well shaped, poorly shaped if there are 12 centroids or fewer):
+ *             with magnitudes: take triangles of the brightest centroids first
+ *             else: take those with the longest sides first
+ *         take, if it has the shape of this round: look it up, up to 5,000 times
+ *
+ *     look_up_triangle:
+ *         compute area and circumradius of the triangle, and their errors
+ *         for each block of 32 features of the image whose area fits:
+ *             for each feature of the block whose circumradius fits:
+ *                 for each order of its stars that keeps the handedness:
+ *                     if all sides fit: try the attitude  [verify.c]
  *
  * SPDX-License-Identifier: MIT
  */
@@ -38,7 +41,7 @@ typedef struct {
   starcat_look_up look_up;
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
-  int poor; /* in the second round, those that the first has left out */
+  int poor;      /* in the second round, those that the first has left out */
   uint32_t left; /* triangles that may still be looked up */
 } search;
 
@@ -48,8 +51,9 @@ static uint32_t pair_of(uint32_t i, uint32_t j) {
 
 real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j) {
   const starcat_workspace *w = call->work;
-  return call->own->is_crowded != 0u ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
-                             : w->separation_rad[pair_of(i, j)];
+  return call->own->is_crowded != 0u
+             ? starcat_angle_of_chord(starcat_chord_square(w->body[i], w->body[j]))
+             : w->separation_rad[pair_of(i, j)];
 }
 
 /* Whether a triangle has no side as short as `least` and no angle as narrow as one of a cosine
@@ -258,7 +262,7 @@ static int search_by_neighbours(starcat_call *call, search *s) {
         if (!is_earlier(w, a, i, b, first, second, a < i) &&
             !is_earlier(w, b, i, a, first, second, b < i) &&
             (take_triangle(call, s, i < low ? i : low, i < low ? low : (i < high ? i : high),
-                  i < high ? high : i) != 0)) {
+                           i < high ? high : i) != 0)) {
           return 1;
         }
       }
@@ -283,7 +287,8 @@ void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
   const uint32_t rounds = s.count <= STARCAT_FEW_CENTROIDS ? 2u : 1u;
   for (uint32_t n = 0; n < rounds; n++) {
     s.poor = n > 0u;
-    if ((call->own->has_magnitudes != 0u ? search_by_brightness(call, &s) : search_by_longest_side(call, &s)) != 0) {
+    if ((call->own->has_magnitudes != 0u ? search_by_brightness(call, &s)
+                                         : search_by_longest_side(call, &s)) != 0) {
       return;
     }
   }
@@ -291,7 +296,7 @@ void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
 
 /* The rows of the features whose value is between two numbers, and few others. */
 void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
-                          uint32_t *stop) {
+                       uint32_t *stop) {
   const real end = (real)(image->n_kvector - 1u);
   const real first = (low - image->kvector_intercept) / image->kvector_slope - R(0.001);
   const real last = (high - image->kvector_intercept) / image->kvector_slope + R(1.001);
@@ -311,8 +316,8 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
 /* An observed triangle as it is compared with those of stars. */
 typedef struct {
   uint32_t triple[3];
-  real low[3], high[3]; /* squares of the chords that each side may be */
-  real least[3], most[3]; /* the same by length, the shortest first */
+  real low[3], high[3];        /* squares of the chords that each side may be */
+  real least[3], most[3];      /* the same by length, the shortest first */
   real sides[3], error, slack; /* of the sides; of the scale */
   int is_right_handed;
 } sought;
@@ -347,8 +352,8 @@ static void bound_shape(const starcat_call *call, sought *o) {
   o->most[2] = ABOVE * most * most;
 }
 
-static void observe_triangle(const starcat_call *call, const uint32_t triple[3], const real sides[3],
-                    sought *o) {
+static void observe_triangle(const starcat_call *call, const uint32_t triple[3],
+                             const real sides[3], sought *o) {
   const starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
@@ -509,7 +514,7 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
 
 /* Area and circumradius of a plane triangle and the errors that those of its sides cause. */
 static void compute_features(const real sides[3], real error, real *area, real *area_error,
-                        real *radius, real *radius_error) {
+                             real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
   const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
@@ -542,7 +547,8 @@ static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
 }
 
 /* Compare the triangles of stars of some areas and circumradii. Returns 1 if the search can end. */
-static int look_up_features(starcat_call *call, const sought *o, const real area[2], const real radius[2]) {
+static int look_up_features(starcat_call *call, const sought *o, const real area[2],
+                            const real radius[2]) {
   const starcat_image *image = call->image;
   const real quantum = image->radius_quantum_rad;
   const uint16_t low = quantise_radius(radius[0] - quantum, quantum);
@@ -577,8 +583,8 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
   const real x = scale * a * (b * b + c * c - a * a) - R(2.0) / a;
   const real y = scale * b * (a * a + c * c - b * b) - R(2.0) / b;
   const real z = scale * c * (a * a + b * b - c * c) - R(2.0) / c;
-  const real shape_error = shape * (error * STARCAT_SQRT(x * x + y * y + z * z) +
-                                    R(3.0) * o->slack * o->slack);
+  const real shape_error =
+      shape * (error * STARCAT_SQRT(x * x + y * y + z * z) + R(3.0) * o->slack * o->slack);
   const real thinnest = shape - shape_error;
   const real end = (area + area_error) / (shortest * shortest);
   real part[2], radii[2];
@@ -602,7 +608,7 @@ int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const
   real area, area_error, radius, radius_error;
   sought o;
   compute_features(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
-              &radius_error);
+                   &radius_error);
   observe_triangle(call, triple, sides, &o);
   if (call->fov_error > R(0.0)) {
     return look_up_similar(call, &o, area, area_error, radius);

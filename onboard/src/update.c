@@ -29,8 +29,8 @@ static int lay_out_blocks(uint8_t *bytes, size_t size, blocks_of_image *image) {
   }
   image->bytes = bytes;
   image->blocks = (uint32_t)(size / STARCAT_BLOCK_BYTES);
-  image->data = image->blocks -
-                (image->blocks + STARCAT_CRCS_OF_BLOCK) / (STARCAT_CRCS_OF_BLOCK + 1u);
+  image->data =
+      image->blocks - (image->blocks + STARCAT_CRCS_OF_BLOCK) / (STARCAT_CRCS_OF_BLOCK + 1u);
   image->groups = (image->blocks + BLOCKS_OF_PARITY - 1u) / BLOCKS_OF_PARITY;
   return 1;
 }
@@ -52,9 +52,8 @@ size_t starcat_count_parity_bytes(size_t size) {
  * Groups are every so many blocks, so that a burst of damage meets each but once. The block of
  * parity comes behind those of the image, and is one of its group. */
 static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
-                    uint8_t part[CHUNK]) {
-  const uint32_t group =
-      block < image->blocks ? block % image->groups : block - image->blocks;
+                      uint8_t part[CHUNK]) {
+  const uint32_t group = block < image->blocks ? block % image->groups : block - image->blocks;
   for (uint32_t k = 0; k < CHUNK; k++) {
     part[k] = 0;
   }
@@ -144,12 +143,11 @@ static starcat_status check_size(const starcat_slots *slots, size_t size) {
     return STARCAT_E_LAYOUT;
   }
   return (size > slots->capacity) || (parity > slots->capacity - size) ? STARCAT_E_SHORT
-                                                                         : STARCAT_OK;
+                                                                       : STARCAT_OK;
 }
 
 /* Mend the image of a slot, write its parity, and open it. */
-static starcat_status use_slot(const starcat_slots *slots, uint32_t slot,
-                                starcat_image *image) {
+static starcat_status use_slot(const starcat_slots *slots, uint32_t slot, starcat_image *image) {
   uint32_t n_mended = 0;
   starcat_status status = check_size(slots, slots->size[slot]);
   if (status == STARCAT_OK) {
@@ -193,7 +191,7 @@ starcat_status starcat_receive_image(starcat_slots *slots, size_t size, uint32_t
 }
 
 starcat_status starcat_put_piece(starcat_slots *slots, size_t offset, const uint8_t *bytes,
-                           size_t count) {
+                                 size_t count) {
   const starcat_status status = check_slots(slots);
   if (status != STARCAT_OK) {
     return status;
@@ -211,7 +209,8 @@ starcat_status starcat_put_piece(starcat_slots *slots, size_t offset, const uint
   return STARCAT_OK;
 }
 
-starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first, uint32_t *block) {
+starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first,
+                                          uint32_t *block) {
   blocks_of_image image;
   const starcat_status status = check_slots(slots);
   if (status != STARCAT_OK) {
@@ -226,8 +225,9 @@ starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t f
   }
   for (uint32_t n = image.data; n < image.blocks; n++) {
     const uint8_t *check = find_block(&image, n);
-    if (!starcat_is_check_block_sound(check) || ((slots->coming_crc != 0u) &&
-                                     (read_number(check, STARCAT_WHOLE_AT) != slots->coming_crc))) {
+    if (!starcat_is_check_block_sound(check) ||
+        ((slots->coming_crc != 0u) &&
+         (read_number(check, STARCAT_WHOLE_AT) != slots->coming_crc))) {
       *block = n;
       return STARCAT_INCOMPLETE;
     }

@@ -50,12 +50,11 @@ static inline real starcat_angle_of_chord(real square) {
   const real half = STARCAT_SQRT(s);
   if (s < R(0.0225)) {
     return R(2.0) * half *
-           (R(1.0) +
-            s * (R(1.0 / 6.0) +
-                 s * (R(3.0 / 40.0) +
-                      s * (R(15.0 / 336.0) +
-                           s * (R(105.0 / 3456.0) +
-                                s * (R(945.0 / 42240.0) + s * R(10395.0 / 599040.0)))))));
+           (R(1.0) + s * (R(1.0 / 6.0) +
+                          s * (R(3.0 / 40.0) +
+                               s * (R(15.0 / 336.0) +
+                                    s * (R(105.0 / 3456.0) +
+                                         s * (R(945.0 / 42240.0) + s * R(10395.0 / 599040.0)))))));
   }
   return R(2.0) * STARCAT_ATAN2(half, STARCAT_SQRT(s < R(1.0) ? R(1.0) - s : R(0.0)));
 }

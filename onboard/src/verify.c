@@ -1,18 +1,19 @@
 /* Verification: whether an attitude explains a frame. Every proposal of every method comes here.
  * The same rules as the ground's starcat/matcher/verification.py.
  *
- *     try an attitude:
- *       gather the stars of its field, and put them on the detector
- *       repeat until the matched stars stay the same:
- *         match centroids and stars that are each other's nearest, within the tolerance
- *         fit the attitude to them
- *       bound the probability that chance matches as many so well (chance.c)
- *       if a centroid without a star competes for a matched star: try that match, too
- *       if the attitude is not certain: try smaller tolerances
- *       if much of the frame is not explained: try larger tolerances
- *       withhold the attitude if it explains too small a fraction of the frame, or if another
- *       focal length explains the frame better
- *       keep it if it is better than the best one so far
+ *     try_attitude:
+ *         fit: gather the stars of the field; up to four times, until the matches stay the same:
+ *             project the stars on the detector
+ *             match centroids and stars that are nearest to each other
+ *             refine the attitude on them
+ *         judge: bound the probability that chance matches as many as well  [chance.c]
+ *             withhold what explains too little of the frame, or is of another scale
+ *         if it is not due to chance: give stars to competing centroids that fit better
+ *         if it is not certain: fit anew with a smaller radius of matching
+ *         if much of the frame is unexplained: fit anew, from a wider radius down
+ *         if the frame fits another focal length better: withhold it
+ *         keep it if it is better than the best one so far
+ *         return whether the best one is certain, or the steps are used up
  *
  * SPDX-License-Identifier: MIT
  */
@@ -114,7 +115,7 @@ static int is_as_before(const starcat_call *call) {
 /* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
  * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
 static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
-                   const uint16_t *which, uint32_t n) {
+                         const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
     starcat_information h = {{0}, {0}, R(0.0)};
@@ -190,7 +191,8 @@ static int gather_field(const starcat_call *call, const real m[9]) {
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
   }
-  call->own->n_near = starcat_gather_stars(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
+  call->own->n_near =
+      starcat_gather_stars(call, m + 6, c, s, STARCAT_MAX_STARS, w->near_row, w->near_icrs);
   return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
@@ -209,7 +211,8 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
     starcat_project_stars(call, m, (factor > R(1.0) ? factor : R(1.0)) * call->reach_px);
-    if (!starcat_spend_steps(call, call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
+    if (!starcat_spend_steps(call,
+                             call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
       return 0;
     }
     matched = match_stars(call, factor * call->reach_px);
@@ -227,10 +230,12 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
 /* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
  * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
 static int spend_on_bound(const starcat_call *call) {
-  const uint32_t most = call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
+  const uint32_t most =
+      call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
   if (call->mag_reach > R(0.0)) {
-    steps += call->own->count * call->own->n_within + (call->own->count + call->own->n_within) * most;
+    steps +=
+        call->own->count * call->own->n_within + (call->own->count + call->own->n_within) * most;
   }
   return starcat_spend_steps(call, steps);
 }
@@ -242,7 +247,7 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
 
 /* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
 static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
-                  starcat_agreement *found) {
+                      starcat_agreement *found) {
   starcat_workspace *w = call->work;
   real square_px = R(0.0), square_rad = R(0.0);
   for (uint32_t k = 0; k < 9u; k++) {
@@ -307,7 +312,9 @@ static uint32_t find_rivals(const starcat_call *call) {
         }
       }
     }
-    if ((of < call->own->count) && starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, starcat_find_match(w, of))])) {
+    if ((of < call->own->count) &&
+        starcat_is_compatible(call, i,
+                              w->near_row[starcat_find_near(w, starcat_find_match(w, of))])) {
       w->rival[n] = (uint16_t)i;
       w->rival_of[n] = (uint16_t)of;
       n++;
@@ -325,7 +332,9 @@ static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, rea
   for (uint32_t i = 0; i < call->own->count; i++) {
     const uint32_t owner = i == rival ? centroid : i;
     if ((i != centroid) && (w->found.star[owner] >= 0)) {
-      starcat_read_star(call->image, starcat_limit_place((uint32_t)w->found.star[owner], call->image->n_stars), icrs[n]);
+      starcat_read_star(call->image,
+                        starcat_limit_place((uint32_t)w->found.star[owner], call->image->n_stars),
+                        icrs[n]);
       of[n] = (uint16_t)i;
       n++;
     }
@@ -438,7 +447,8 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     return 1;
   }
   starcat_set_focal(call, focal);
-  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0), found);
+  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0),
+            found);
   const uint32_t count = found->n_matched;
   count_nearer(call, count, nearer);
   if (found->log_chance < R(0.0)) {

@@ -17,8 +17,8 @@
 
 /* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
  * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
-static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
-                   uint32_t most) {
+static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t *numbers,
+                            uint32_t count, uint32_t most) {
   const int is_tight = bound >= 2u;
   real *sums = w->sums[bound];
   uint32_t unit = 1;
@@ -89,7 +89,8 @@ static void count_compatible(const starcat_call *call) {
   const real reach = call->mag_reach;
   uint16_t unknown = 0;
   for (uint32_t j = 0; j < call->own->n_within; j++) {
-    const int16_t stored = call->image->magnitudes[starcat_limit_place(w->near_row[starcat_find_near(w, j)], call->image->n_stars)];
+    const int16_t stored = call->image->magnitudes[starcat_limit_place(
+        w->near_row[starcat_find_near(w, j)], call->image->n_stars)];
     const int is_known = stored != INT16_MIN;
     w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
     w->nearest[j] = is_known ? 0u : (uint16_t)call->own->count;

@@ -10,25 +10,25 @@
 
 extern unsigned check_count, check_failures;
 
-#define CHECK(condition)                                                                        \
-  do {                                                                                          \
-    check_count++;                                                                              \
-    if (!(condition)) {                                                                         \
-      check_failures++;                                                                         \
-      (void)fprintf(stderr, "%s:%d: not so: %s\n", __FILE__, __LINE__, #condition);             \
-    }                                                                                           \
+#define CHECK(condition)                                                            \
+  do {                                                                              \
+    check_count++;                                                                  \
+    if (!(condition)) {                                                             \
+      check_failures++;                                                             \
+      (void)fprintf(stderr, "%s:%d: not so: %s\n", __FILE__, __LINE__, #condition); \
+    }                                                                               \
   } while (0)
 
 /* Two integers, both printed where they differ. */
-#define CHECK_IS(found, expected)                                                               \
-  do {                                                                                          \
-    const long found_ = (long)(found), expected_ = (long)(expected);                            \
-    check_count++;                                                                              \
-    if (found_ != expected_) {                                                                  \
-      check_failures++;                                                                         \
-      (void)fprintf(stderr, "%s:%d: %s is %ld, not %s (%ld)\n", __FILE__, __LINE__, #found,     \
-                    found_, #expected, expected_);                                              \
-    }                                                                                           \
+#define CHECK_IS(found, expected)                                                           \
+  do {                                                                                      \
+    const long found_ = (long)(found), expected_ = (long)(expected);                        \
+    check_count++;                                                                          \
+    if (found_ != expected_) {                                                              \
+      check_failures++;                                                                     \
+      (void)fprintf(stderr, "%s:%d: %s is %ld, not %s (%ld)\n", __FILE__, __LINE__, #found, \
+                    found_, #expected, expected_);                                          \
+    }                                                                                       \
   } while (0)
 
 #define CHECK_NEAR(found, expected, error) \

@@ -31,7 +31,8 @@ int main(int argc, char **argv) {
     const size_t at = (size_t)(sky_uniform(&state) * (double)size);
     const uint8_t bit = (uint8_t)(1u << (unsigned)(8.0 * sky_uniform(&state)));
     bytes[at] = (uint8_t)(bytes[at] ^ bit);
-    missed += (uint32_t)((starcat_scrub_image(bytes, size, 0, 0, &bad) >= 0) || (bad != at / 4096u));
+    missed +=
+        (uint32_t)((starcat_scrub_image(bytes, size, 0, 0, &bad) >= 0) || (bad != at / 4096u));
     bytes[at] = (uint8_t)(bytes[at] ^ bit);
   }
   (void)printf("%d flips, %u missed\n", count, (unsigned)missed);

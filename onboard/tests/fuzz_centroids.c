@@ -70,9 +70,10 @@ static void change(fuzz_bytes *bytes, starcat_real *value) {
 }
 
 static void change_camera(fuzz_bytes *bytes, starcat_camera *c) {
-  starcat_real *const numbers[11] = {&c->width_px, &c->height_px, &c->focal_length_px, &c->x0_px,
-                                     &c->y0_px,    &c->k1,        &c->k2,              &c->k3,
-                                     &c->p1,       &c->p2,        &c->fold_radius};
+  starcat_real *const numbers[11] = {&c->width_px, &c->height_px,  &c->focal_length_px,
+                                     &c->x0_px,    &c->y0_px,      &c->k1,
+                                     &c->k2,       &c->k3,         &c->p1,
+                                     &c->p2,       &c->fold_radius};
   for (uint32_t n = fuzz_number(bytes, 1) % 32u; n < 11u; n += 1u + fuzz_number(bytes, 1) % 8u) {
     change(bytes, numbers[n]);
   }
@@ -135,16 +136,17 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
                                (count & 2u) != 0u ? y : NULL};
   fuzz_check(image, &options, &frame,
              starcat_identify_frame(image, &camera, &options, &frame, &work, &result), &result);
-  fuzz_check(image, &options, &frame,
-             starcat_track_frame(image, &camera, &options, &frame, q, uncertainty_rad, &work, &result),
-             &result);
+  fuzz_check(
+      image, &options, &frame,
+      starcat_track_frame(image, &camera, &options, &frame, q, uncertainty_rad, &work, &result),
+      &result);
   starcat_real(*vectors)[3] = malloc((size_t)(count / 3u + 1u) * sizeof *vectors);
   if ((vectors != NULL) && (x != NULL) && (y != NULL)) {
     for (uint32_t n = 0; n < count / 3u; n++) {
       memcpy(vectors[n], x + 3u * n, sizeof vectors[n]);
     }
     (void)starcat_fit_attitude((const starcat_real(*)[3])vectors, (const starcat_real(*)[3])vectors,
-                           count / 3u, q);
+                               count / 3u, q);
   }
   free(vectors);
   free(x);

@@ -74,7 +74,7 @@ static void use(const starcat_image *image, const starcat_camera *camera) {
                starcat_identify_frame(image, camera, &options, &frame, &work, &result), &result);
     fuzz_check(image, &options, &frame,
                starcat_track_frame(image, camera, &options, &frame, f->q_body_from_icrs,
-                             (starcat_real)0.02, &work, &result),
+                                   (starcat_real)0.02, &work, &result),
                &result);
   }
 }

@@ -25,8 +25,8 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
  * its steps are the fuzzer's. */
 static void apply(starcat_slots *slots, fuzz_bytes *bytes) {
   const size_t count = fuzz_number(bytes, 2) % 2048u, size = 40u + count;
-  const uint32_t words[8] = {0x01020304u, 1, (uint32_t)sound_size, 0, (uint32_t)sound_size, 0,
-                             fuzz_number(bytes, 1) % 8u, (uint32_t)size};
+  const uint32_t words[8] = {0x01020304u,          1, (uint32_t)sound_size,       0,
+                             (uint32_t)sound_size, 0, fuzz_number(bytes, 1) % 8u, (uint32_t)size};
   uint8_t *patch = malloc(size);
   if (patch != NULL) {
     memcpy(patch, "STARPAT", 8);
@@ -52,7 +52,7 @@ static void step(starcat_slots *slots, starcat_image *image, fuzz_bytes *bytes) 
     case 1:
       (void)starcat_receive_image(slots, sound_size, 0);
       (void)starcat_put_piece(slots, at % sound_size / BLOCK * BLOCK,
-                        (const uint8_t *)sound + at % sound_size / BLOCK * BLOCK, count);
+                              (const uint8_t *)sound + at % sound_size / BLOCK * BLOCK, count);
       break;
     case 2:
       fuzz_take(bytes, piece, sizeof piece);

@@ -71,9 +71,10 @@ int main(int argc, char **argv) {
       magnitudes[i] = number(&at);
     }
     for (int n = 0; n < repeats; n++) {
-      status = is_tracked ? starcat_track_frame(&image, &camera, &options, &frame, prior, PRIOR_RAD,
-                                          &work, &result)
-                          : starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
+      status = is_tracked
+                   ? starcat_track_frame(&image, &camera, &options, &frame, prior, PRIOR_RAD, &work,
+                                         &result)
+                   : starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
     }
     (void)printf("%d %u %u %u", (int)status, (unsigned)result.n_matched, (unsigned)result.n_tried,
                  (unsigned)result.steps);

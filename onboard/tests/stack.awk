@@ -25,7 +25,7 @@ function deepest(name,    n, i, list, most, below) {
   return done[name] = own[name] + most
 }
 END {
-  n = split("starcat_identify_frame starcat_track_frame starcat_open_image starcat_scrub_image starcat_fit_attitude", entry, " ")
+  n = split("starcat_identify_frame starcat_track_frame starcat_open_image starcat_scrub_image starcat_fit_attitude starcat_answer_frame", entry, " ")
   for (i = 1; i <= n; i++) {
     bytes = deepest(entry[i])
     if (!(entry[i] in own) || bytes > 8192) failed = 1

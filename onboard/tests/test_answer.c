@@ -16,7 +16,7 @@ static sky_frame truth;
 static starcat_status identify(const unit_sky *sky, const starcat_real *sigma_px) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, sigma_px};
   return starcat_identify_frame(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                          &unit_result);
+                                &unit_result);
 }
 
 /* The square of the error of an attitude in its covariance: 3 on average. */
@@ -29,8 +29,8 @@ static double deviation(void) {
   for (uint32_t k = 0; k < 9u; k++) {
     turn[k] = (starcat_real)0.0;
     for (uint32_t n = 0; n < 3u; n++) {
-      turn[k] += unit_result.matrix[3u * (k / 3u) + n] *
-                 (starcat_real)truth.matrix[3u * (k % 3u) + n];
+      turn[k] +=
+          unit_result.matrix[3u * (k / 3u) + n] * (starcat_real)truth.matrix[3u * (k % 3u) + n];
     }
   }
   e[0] = turn[7];
@@ -47,8 +47,7 @@ static void check_means(unit_sky *sky, int is_weighted, double *square, double *
   *square = *chi_square = 0.0;
   for (uint32_t n = 0; n < FRAMES; n++) {
     starcat_real sigma_px[STARCAT_MAX_CENTROIDS];
-    sky_look(&sky->image, &sky->camera, &state, is_weighted ? 0.0 : NOISE_PX, SKY_SPOTS, 0,
-             &truth);
+    sky_look(&sky->image, &sky->camera, &state, is_weighted ? 0.0 : NOISE_PX, SKY_SPOTS, 0, &truth);
     for (uint32_t i = 0; i < truth.count; i++) {
       sigma_px[i] = (starcat_real)(0.05 * (double)(1u << i % 4u));
       if (is_weighted) {
@@ -101,7 +100,7 @@ static void check_one_place(const unit_sky *sky) {
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   const starcat_agreement best = unit_work.best;
   CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                         &unit_result),
+                              &unit_result),
            STARCAT_OK);
   unit_work.best = best;
   for (uint32_t i = 0; i < call.own->count; i++) {
@@ -126,7 +125,7 @@ static void check_changed(const unit_sky *sky) {
   const starcat_agreement best = unit_work.best;
   for (uint32_t n = 0; n < 6u; n++) {
     CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                           &unit_result),
+                                &unit_result),
              STARCAT_OK);
     unit_work.best = best;
     for (uint32_t k = 0; k < 6u; k++) { /* turned by a half */
@@ -154,7 +153,7 @@ static void check_places(const unit_sky *sky) {
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   memcpy(m, unit_result.matrix, sizeof m);
   CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                         &unit_result),
+                              &unit_result),
            STARCAT_OK);
   traps_off(); /* the numbers make no sense, and may be none */
   memset(unit_work.in_column, 0xff, sizeof unit_work.in_column);

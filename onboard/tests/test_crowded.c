@@ -18,13 +18,14 @@ static uint8_t is_taken[SPOTS][SPOTS][SPOTS];
 
 static starcat_status identify(const unit_sky *of) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
-  return starcat_identify_frame(&of->image, &of->camera, &of->options, &frame, &unit_work, &unit_result);
+  return starcat_identify_frame(&of->image, &of->camera, &of->options, &frame, &unit_work,
+                                &unit_result);
 }
 
 static starcat_status begin(const unit_sky *of) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, NULL, NULL};
   return starcat_begin_call(&call, &of->image, &of->camera, &of->options, &frame, &unit_work,
-                       &unit_result);
+                            &unit_result);
 }
 
 static int count_taken(starcat_call *of, const uint32_t triple[3], const starcat_real sides[3]) {

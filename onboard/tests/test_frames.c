@@ -11,13 +11,13 @@
 
 static starcat_status identify(const unit_sky *sky, const starcat_frame *frame) {
   return starcat_identify_frame(&sky->image, &sky->camera, &sky->options, frame, &unit_work,
-                          &unit_result);
+                                &unit_result);
 }
 
 static starcat_status track(const unit_sky *sky, const starcat_frame *frame,
                             const starcat_real q[4], starcat_real uncertainty_rad) {
   return starcat_track_frame(&sky->image, &sky->camera, &sky->options, frame, q, uncertainty_rad,
-                       &unit_work, &unit_result);
+                             &unit_work, &unit_result);
 }
 
 static void check_nulls(const starcat_frame *frame, const starcat_real q[4]) {
@@ -29,8 +29,9 @@ static void check_nulls(const starcat_frame *frame, const starcat_real q[4]) {
            STARCAT_E_NULL);
   CHECK_IS(starcat_identify_frame(&s->image, &s->camera, NULL, frame, &unit_work, &unit_result),
            STARCAT_E_NULL);
-  CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, NULL, &unit_work, &unit_result),
-           STARCAT_E_NULL);
+  CHECK_IS(
+      starcat_identify_frame(&s->image, &s->camera, &s->options, NULL, &unit_work, &unit_result),
+      STARCAT_E_NULL);
   CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, frame, NULL, &unit_result),
            STARCAT_E_NULL);
   CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, frame, &unit_work, NULL),
@@ -89,9 +90,10 @@ static void check_cameras(const starcat_frame *frame, const starcat_real q[4]) {
   starcat_camera *c = &unit_scratch.camera;
   static const double low[5] = {0.0, 0.0, 1e-3, -2e6, -2e6};
   static const double high[5] = {2e6, 2e6, 2e9, 2e6, 2e6};
-  starcat_real *const numbers[11] = {&c->width_px, &c->height_px, &c->focal_length_px, &c->x0_px,
-                                     &c->y0_px,    &c->k1,        &c->k2,              &c->k3,
-                                     &c->p1,       &c->p2,        &c->fold_radius};
+  starcat_real *const numbers[11] = {&c->width_px, &c->height_px,  &c->focal_length_px,
+                                     &c->x0_px,    &c->y0_px,      &c->k1,
+                                     &c->k2,       &c->k3,         &c->p1,
+                                     &c->p2,       &c->fold_radius};
   for (uint32_t n = 0; n < 11u; n++) {
     const starcat_real least = (starcat_real)(n < 5u ? low[n] : -2e9);
     const starcat_real most = (starcat_real)(n < 5u ? high[n] : 2e9);
@@ -203,8 +205,8 @@ static uint32_t wrong_stars(const sky_frame *truth) {
     off = fmax(off, fabs((double)unit_result.matrix[k] - truth->matrix[k]));
   }
   for (uint32_t k = 0; k < 4u; k++) {
-    off = fmax(off, fabs((double)unit_result.q_body_from_icrs[k] -
-                         (double)truth->q_body_from_icrs[k]));
+    off = fmax(off,
+               fabs((double)unit_result.q_body_from_icrs[k] - (double)truth->q_body_from_icrs[k]));
   }
   CHECK(off < 0.02);
   return wrong;

@@ -53,8 +53,7 @@ static void check_known_rotations(void) {
 
 /* The example at the head of starcat.h, which MANUAL.md and the pages of the ground have too. */
 static void check_worked_example(void) {
-  static const double q_body_from_icrs[4] = {-0.781300520, 0.137764362,
-                                             0.208208671, 0.572048623};
+  static const double q_body_from_icrs[4] = {-0.781300520, 0.137764362, 0.208208671, 0.572048623};
   static const double v_icrs[3] = {-0.187455223, 0.939217529, -0.287629922};
   static const double v_camera[3] = {-0.003626651, 0.036746347, 0.999318044};
   static const double pixel[2] = {628.38680, 597.66855};
@@ -89,7 +88,8 @@ static void check_worked_example(void) {
 
 static starcat_status solve(starcat_real (*body)[3], starcat_real (*icrs)[3], uint32_t count,
                             starcat_real *q) {
-  return starcat_fit_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, count, q);
+  return starcat_fit_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, count,
+                              q);
 }
 
 void test_attitude(void) {

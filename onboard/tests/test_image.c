@@ -59,7 +59,8 @@ static void check_starts(void) {
   CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 0, 0), STARCAT_E_SHORT);
   CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 511, 0), STARCAT_E_SHORT);
   CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, 512, 0), STARCAT_E_SHORT);
-  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, unit_scratch.size - 1u, 0), STARCAT_E_SHORT);
+  CHECK_IS(starcat_open_image(&unit_scratch.image, bytes, unit_scratch.size - 1u, 0),
+           STARCAT_E_SHORT);
   CHECK_IS(start_with(0, 0), STARCAT_E_MAGIC);
   CHECK_IS(start_with(4, header(4) ^ 0x01010101u), STARCAT_E_MAGIC);
   CHECK_IS(start_with(8, 0), STARCAT_E_MAGIC);
@@ -213,11 +214,12 @@ static void use_scratch(void) {
     const starcat_frame frame = {truth.count, truth.x, truth.y, n == 1u ? NULL : truth.magnitudes,
                                  NULL};
     unit_scratch.options.max_steps = 20000;
-    (void)starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
-                           &unit_work, &unit_result);
+    (void)starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options,
+                                 &frame, &unit_work, &unit_result);
     CHECK(unit_result.steps <= 20000u);
-    (void)starcat_track_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
-                        truth.q_body_from_icrs, (starcat_real)0.01, &unit_work, &unit_result);
+    (void)starcat_track_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options,
+                              &frame, truth.q_body_from_icrs, (starcat_real)0.01, &unit_work,
+                              &unit_result);
     CHECK(unit_result.steps <= 20000u);
   }
 }

@@ -12,8 +12,8 @@ static starcat_call call;
 
 static starcat_status track(const unit_sky *sky, starcat_real uncertainty_rad) {
   const starcat_frame frame = unit_frame_of(&truth);
-  return starcat_track_frame(&sky->image, &sky->camera, &sky->options, &frame, truth.q_body_from_icrs,
-                       uncertainty_rad, &unit_work, &unit_result);
+  return starcat_track_frame(&sky->image, &sky->camera, &sky->options, &frame,
+                             truth.q_body_from_icrs, uncertainty_rad, &unit_work, &unit_result);
 }
 
 /* A frame that the sky identifies, its stars in the workspace, and the call that found them. */
@@ -22,7 +22,7 @@ static void begin(const unit_sky *sky, uint64_t seed, uint32_t n_spots, uint32_t
   CHECK_IS(unit_identify(sky, &truth), STARCAT_IDENTIFIED);
   const starcat_frame frame = unit_frame_of(&truth);
   CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                         &unit_result),
+                              &unit_result),
            STARCAT_OK);
 }
 
@@ -228,8 +228,8 @@ static void check_spread(void) {
     for (uint32_t steps = 100; steps < 10000000u; steps *= 3u) {
       unit_scratch.options.max_steps = steps;
       const starcat_status status =
-          starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options, &frame,
-                           &unit_work, &unit_result);
+          starcat_identify_frame(&unit_scratch.image, &unit_scratch.camera, &unit_scratch.options,
+                                 &frame, &unit_work, &unit_result);
       CHECK((status != STARCAT_IDENTIFIED) || ((n < 6u) && (unit_wrong_stars(&truth) <= 1u)));
     }
     CHECK_IS(unit_result.reason == (uint32_t)STARCAT_REASON_NONE, n < 6u);
@@ -438,7 +438,8 @@ static void check_cap(const double centre[3], double cosine, double sine, uint32
   const starcat_real margin = (starcat_real)IF_SINGLE(7e-7, 2e-9);
   uint32_t within = 0, beside = 0, missing = 0;
   call.own->steps_left = 1000000;
-  const uint32_t count = starcat_gather_stars(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
+  const uint32_t count =
+      starcat_gather_stars(&call, c, cos_r, (starcat_real)sine, most, rows, icrs);
   for (uint32_t row = 0; row < call.image->n_stars; row++) {
     starcat_real star[3];
     starcat_read_star(call.image, row, star);
@@ -468,7 +469,7 @@ static void check_narrow_caps(void) {
     }
     call.own->steps_left = 1000000;
     const uint32_t count = starcat_gather_stars(&call, centre, (starcat_real)(1.0 - 5e-13),
-                                          (starcat_real)1e-6, 8, rows, icrs);
+                                                (starcat_real)1e-6, 8, rows, icrs);
     missing += (uint32_t)!is_listed(rows, count, row);
   }
   CHECK_IS(missing, 0);
@@ -544,8 +545,8 @@ static void check_clusters(void) {
       }
     }
     const starcat_frame frame = unit_frame_of(&truth);
-    CHECK_IS(starcat_begin_call(&call, &unit_crowded.image, &unit_crowded.camera, &unit_crowded.options,
-                           &frame, &unit_work, &unit_result),
+    CHECK_IS(starcat_begin_call(&call, &unit_crowded.image, &unit_crowded.camera,
+                                &unit_crowded.options, &frame, &unit_work, &unit_result),
              STARCAT_OK);
     unit_matrix_of(&truth, m);
     for (uint32_t k = 0; k < 3u; k++) { /* turned by up to five reaches about y, and about z */

@@ -11,7 +11,7 @@ static starcat_call call;
 static starcat_status begin(const unit_sky *sky) {
   const starcat_frame frame = unit_frame_of(&truth);
   return starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                       &unit_result);
+                            &unit_result);
 }
 
 /* The focal length that was found, over the true one. */

@@ -5,7 +5,7 @@
  */
 #include <string.h>
 
-#include "starcat_update.h"
+#include "starcat_session.h"
 #include "unit.h"
 
 #define BLOCK 4096u
@@ -45,7 +45,8 @@ static void test_pieces(void) {
   const unit_sky *sky = &unit_pyramid;
   const uint32_t n_blocks = (uint32_t)(sky->size / BLOCK);
   begin();
-  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_E_LAYOUT); /* nothing is awaited */
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block),
+           STARCAT_E_LAYOUT); /* nothing is awaited */
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_E_LAYOUT);
   CHECK_IS(starcat_receive_image(&slots, sky->size, crc_of(sky)), STARCAT_OK);
   CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
@@ -61,7 +62,8 @@ static void test_pieces(void) {
   /* The computer starts anew with what it kept; the transfer goes on with what is missing. */
   CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
   CHECK(image.bytes == slots.bytes[0]);
-  for (uint32_t n = 0; n < n_blocks && starcat_find_missing_block(&slots, n, &block) == STARCAT_INCOMPLETE; n++) {
+  for (uint32_t n = 0;
+       n < n_blocks && starcat_find_missing_block(&slots, n, &block) == STARCAT_INCOMPLETE; n++) {
     send(sky, (size_t)block * BLOCK, ((size_t)block + 1u) * BLOCK, 1);
     n = block;
   }
@@ -166,9 +168,7 @@ static void test_parity(void) {
 }
 
 /* A patch, written step by step. */
-static struct {
-  size_t size;
-} patch;
+static struct { size_t size; } patch;
 
 static void put_byte(uint32_t byte) { ((uint8_t *)patch_words)[patch.size++] = (uint8_t)byte; }
 
@@ -281,6 +281,25 @@ static void patch_all(void) {
               (uint32_t)(unit_scratch.size - rows) - bytes[3]);
 }
 
+/* The same patch in one piece of a session, which applies it in idle time. */
+static void check_patch_of_session(void) {
+  static starcat_session session;
+  begin();
+  patch_all();
+  put_word(36, (uint32_t)patch.size);
+  memset(&session, 0, sizeof session);
+  starcat_prepare_session(&session);
+  session.slots = slots;
+  session.patch = patch_words;
+  session.patch_capacity = sizeof patch_words;
+  CHECK_IS(starcat_start_session(&session), STARCAT_OK);
+  CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+  CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+  CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_READY);
+  CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+}
+
 static void check_steps(void) {
   begin();
   patch_all();
@@ -311,8 +330,7 @@ static void check_steps(void) {
   put_step(RENUMBER_32, bytes / 4u - 2u, 0);
   put_step(RENUMBER_32, 1, 4);
   put_step(RENUMBER_32, 1, -8);
-  put_literal(unit_scratch.bytes + rows + bytes,
-              (uint32_t)(unit_scratch.size - rows) - bytes);
+  put_literal(unit_scratch.bytes + rows + bytes, (uint32_t)(unit_scratch.size - rows) - bytes);
   CHECK_IS(apply(), STARCAT_E_CRC); /* the last two are exchanged */
   const uint32_t last = row[bytes / 4u - 1u];
   row[bytes / 4u - 1u] = row[bytes / 4u - 2u];
@@ -351,16 +369,17 @@ static void check_refused(void) {
   CHECK_IS(apply(), STARCAT_E_LAYOUT);
   CHECK_IS(starcat_apply_patch(NULL, patch_words, patch.size), STARCAT_E_NULL);
   CHECK_IS(starcat_apply_patch(&slots, NULL, patch.size), STARCAT_E_NULL);
-  CHECK_IS(starcat_apply_patch(&slots, (uint8_t *)patch_words + 2, patch.size), STARCAT_E_ALIGNMENT);
+  CHECK_IS(starcat_apply_patch(&slots, (uint8_t *)patch_words + 2, patch.size),
+           STARCAT_E_ALIGNMENT);
   CHECK_IS(starcat_apply_patch(&slots, patch_words, 39), STARCAT_E_SHORT);
   CHECK_IS(starcat_apply_patch(&slots, patch_words, patch.size - 1u), STARCAT_E_SHORT);
   static const struct {
     size_t at;
     uint32_t value;
     starcat_status status;
-  } headers[] = {{0, 0, STARCAT_E_MAGIC},        {8, 0x04030201u, STARCAT_E_BYTE_ORDER},
-                 {12, 2, STARCAT_E_VERSION},     {16, 4096, STARCAT_E_VERSION},
-                 {20, 0, STARCAT_E_VERSION},     {24, 100, STARCAT_E_LAYOUT},
+  } headers[] = {{0, 0, STARCAT_E_MAGIC},         {8, 0x04030201u, STARCAT_E_BYTE_ORDER},
+                 {12, 2, STARCAT_E_VERSION},      {16, 4096, STARCAT_E_VERSION},
+                 {20, 0, STARCAT_E_VERSION},      {24, 100, STARCAT_E_LAYOUT},
                  {24, CAPACITY, STARCAT_E_SHORT}, {32, 3, STARCAT_E_LAYOUT},
                  {36, 39, STARCAT_E_LAYOUT}};
   for (size_t n = 0; n < sizeof headers / sizeof headers[0]; n++) {
@@ -379,5 +398,6 @@ void test_update(void) {
   check_update_errors();
   test_parity();
   check_steps();
+  check_patch_of_session();
   check_refused();
 }

@@ -45,7 +45,7 @@ starcat_frame unit_frame_of(const sky_frame *truth) {
 starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth) {
   const starcat_frame frame = unit_frame_of(truth);
   return starcat_identify_frame(&sky->image, &sky->camera, &sky->options, &frame, &unit_work,
-                          &unit_result);
+                                &unit_result);
 }
 
 uint32_t unit_wrong_stars(const sky_frame *truth) {
@@ -66,12 +66,12 @@ int main(int argc, char **argv) {
   static const struct {
     const char *name;
     void (*run)(void);
-  } tests[] = {{"open", test_open},       {"scrub", test_scrub},         {"damaged", test_damaged},
-               {"errors", test_errors},   {"dropped", test_dropped},     {"track", test_track},
-               {"budget", test_budget},   {"identify", test_identify},   {"camera", test_camera},
-               {"kernels", test_kernels}, {"attitude", test_attitude},   {"rare", test_rare},
-               {"answer", test_answer},   {"crowded", test_crowded},     {"scale", test_scale},
-               {"update", test_update}};
+  } tests[] = {{"open", test_open},       {"scrub", test_scrub},       {"damaged", test_damaged},
+               {"errors", test_errors},   {"dropped", test_dropped},   {"track", test_track},
+               {"budget", test_budget},   {"identify", test_identify}, {"camera", test_camera},
+               {"kernels", test_kernels}, {"attitude", test_attitude}, {"rare", test_rare},
+               {"answer", test_answer},   {"crowded", test_crowded},   {"scale", test_scale},
+               {"update", test_update},   {"session", test_session}};
   const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
   const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
   (void)argv;

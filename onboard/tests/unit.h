@@ -58,5 +58,6 @@ void test_answer(void);
 void test_crowded(void);
 void test_scale(void);
 void test_update(void);
+void test_session(void);
 
 #endif

@@ -25,8 +25,8 @@ class span {
   constexpr span(T *data, std::size_t size) noexcept : data_(data), size_(size) {}
   template <std::size_t N>
   constexpr span(T (&array)[N]) noexcept : data_(array), size_(N) {}
-  template <typename Container, typename = decltype(static_cast<T *>(
-                                    static_cast<const Container *>(nullptr)->data()))>
+  template <typename Container,
+            typename = decltype(static_cast<T *>(static_cast<const Container *>(nullptr)->data()))>
   constexpr span(const Container &container) noexcept
       : data_(container.data()), size_(container.size()) {}
   constexpr T *data() const noexcept { return data_; }
@@ -45,7 +45,8 @@ class span {
 class image {
  public:
   explicit image(span<const std::uint8_t> bytes, std::uint32_t flags = 0) noexcept
-      : status_(starcat_open_image(&image_, bytes.data(), bytes.size(), flags)), size_(bytes.size()) {}
+      : status_(starcat_open_image(&image_, bytes.data(), bytes.size(), flags)),
+        size_(bytes.size()) {}
   // Of the 64-bit words that starcat export --to c writes.
   explicit image(span<const std::uint64_t> words, std::uint32_t flags = 0) noexcept
       : status_(starcat_open_image(&image_, words.data(), 8u * words.size(), flags)),
@@ -117,7 +118,9 @@ class matcher {
 
   // Arrays of different lengths are STARCAT_E_NULL, an image that did not open is its status.
   starcat_status identify(const frame &given) noexcept { return call(given, nullptr); }
-  starcat_status track(const frame &given, const prior &near) noexcept { return call(given, &near); }
+  starcat_status track(const frame &given, const prior &near) noexcept {
+    return call(given, &near);
+  }
 
   // The answer to the last frame; a row of the image for each of its centroids, or a number below 0.
   const starcat_result &result() const noexcept { return result_; }
@@ -131,19 +134,21 @@ class matcher {
     if (!*image_) {
       return image_->status();
     }
-    if (given.y_px.size() != count || !fits(given.magnitudes, count) || !fits(given.sigma_px, count)) {
+    if (given.y_px.size() != count || !fits(given.magnitudes, count) ||
+        !fits(given.sigma_px, count)) {
       return STARCAT_E_NULL;
     }
     if (count > STARCAT_MAX_CENTROIDS) {
       return STARCAT_E_TOO_MANY_CENTROIDS;
     }
     const starcat_frame arrays = {static_cast<std::uint32_t>(count), given.x_px.data(),
-                                  given.y_px.data(), given.magnitudes.data(), given.sigma_px.data()};
+                                  given.y_px.data(), given.magnitudes.data(),
+                                  given.sigma_px.data()};
     const starcat_status status =
         near == nullptr
             ? starcat_identify_frame(image_->get(), &camera, &options, &arrays, &work_, &result_)
             : starcat_track_frame(image_->get(), &camera, &options, &arrays, near->q_body_from_icrs,
-                            near->uncertainty_rad, &work_, &result_);
+                                  near->uncertainty_rad, &work_, &result_);
     count_ = status >= 0 || status == STARCAT_E_BUDGET ? count : 0u;
     return status;
   }

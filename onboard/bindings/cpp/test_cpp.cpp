@@ -38,14 +38,16 @@ int main() {
   std::uint64_t state = 4;
   sky_frame truth;
   sky_look(image.get(), &matcher.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
-  const std::vector<starcat::real> x(truth.x, truth.x + truth.count), y(truth.y, truth.y + truth.count);
+  const std::vector<starcat::real> x(truth.x, truth.x + truth.count),
+      y(truth.y, truth.y + truth.count);
   std::array<starcat::real, 4> few{};
   const starcat::prior near = {{truth.q_body_from_icrs[0], truth.q_body_from_icrs[1],
                                 truth.q_body_from_icrs[2], truth.q_body_from_icrs[3]},
                                starcat::real(0.01)};
   for (const bool is_tracked : {false, true}) {
     const starcat::frame frame = {x, y};
-    CHECK((is_tracked ? matcher.track(frame, near) : matcher.identify(frame)) == STARCAT_IDENTIFIED);
+    CHECK((is_tracked ? matcher.track(frame, near) : matcher.identify(frame)) ==
+          STARCAT_IDENTIFIED);
     CHECK(matcher.stars().size() == truth.count);
     for (std::size_t n = 0; n < matcher.stars().size(); n++) {
       CHECK(matcher.stars()[n] == truth.star[n]);

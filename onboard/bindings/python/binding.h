@@ -46,5 +46,10 @@ typedef struct {
 #define STARCAT_MAX_STARS ...
 const char *starcat_version(void);
 int starcat_open_image(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
-int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px, const void *magnitudes, const void *sigma_px, const void *q_prior, double uncertainty_rad, starcat_memory *memory);
-void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop, const int64_t *starts, const double *pairs_px, const double *magnitudes, const double *sigma_px, starcat_answer *answers, int32_t *stars, starcat_memory *memory);
+int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
+                         const void *magnitudes, const void *sigma_px, const void *q_prior,
+                         double uncertainty_rad, starcat_memory *memory);
+void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
+                           const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           starcat_memory *memory);

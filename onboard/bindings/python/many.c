@@ -42,9 +42,9 @@ static void tell_answer(const starcat_result *result, starcat_answer *answer) {
 }
 
 static int identify_copied(const starcat_search *search, uint32_t count, const double *pairs_px,
-                    const double *magnitudes, const double *sigma_px, const double *q_prior,
-                    double uncertainty_rad, starcat_answer *answer, int32_t *star,
-                    starcat_memory *memory) {
+                           const double *magnitudes, const double *sigma_px, const double *q_prior,
+                           double uncertainty_rad, starcat_answer *answer, int32_t *star,
+                           starcat_memory *memory) {
   const starcat_frame frame = {count, memory->x_px, memory->y_px,
                                magnitudes == NULL ? NULL : memory->magnitudes, sigma_px};
   starcat_result *result = &memory->result;
@@ -63,10 +63,10 @@ static int identify_copied(const starcat_search *search, uint32_t count, const d
   }
   const double begun_s = now_s();
   const starcat_status status =
-      q_prior == NULL ? starcat_identify_frame(search->image, search->camera, search->options, &frame,
-                                         &memory->work, result)
+      q_prior == NULL ? starcat_identify_frame(search->image, search->camera, search->options,
+                                               &frame, &memory->work, result)
                       : starcat_track_frame(search->image, search->camera, search->options, &frame,
-                                      q_prior, uncertainty_rad, &memory->work, result);
+                                            q_prior, uncertainty_rad, &memory->work, result);
   answer->seconds = now_s() - begun_s;
   answer->status = (int32_t)status;
   answer->steps = (int64_t)result->steps;
@@ -85,21 +85,21 @@ static int identify_copied(const starcat_search *search, uint32_t count, const d
 }
 
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
-                const void *magnitudes, const void *sigma_px, const void *q_prior,
-                double uncertainty_rad, starcat_memory *memory) {
+                         const void *magnitudes, const void *sigma_px, const void *q_prior,
+                         double uncertainty_rad, starcat_memory *memory) {
   return identify_copied(search, count, pairs_px, magnitudes, sigma_px, q_prior, uncertainty_rad,
-                  &memory->answer, memory->star, memory);
+                         &memory->answer, memory->star, memory);
 }
 
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
-                  const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                  const double *sigma_px, starcat_answer *answers, int32_t *stars,
-                  starcat_memory *memory) {
+                           const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           starcat_memory *memory) {
   for (uint32_t n = first; n < stop; n++) {
     const int64_t start = starts[n];
     (void)identify_copied(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
-                   magnitudes == NULL ? NULL : magnitudes + start,
-                   sigma_px == NULL ? NULL : sigma_px + start, NULL, 0.0, answers + n,
-                   stars + start, memory);
+                          magnitudes == NULL ? NULL : magnitudes + start,
+                          sigma_px == NULL ? NULL : sigma_px + start, NULL, 0.0, answers + n,
+                          stars + start, memory);
   }
 }

@@ -47,13 +47,14 @@ typedef struct {
  * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
  * the status that the answer in the memory has too. */
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
-                const void *magnitudes, const void *sigma_px, const void *q_prior,
-                double uncertainty_rad, starcat_memory *memory);
+                         const void *magnitudes, const void *sigma_px, const void *q_prior,
+                         double uncertainty_rad, starcat_memory *memory);
 
 /* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
  * The centroids of frame n are those from starts[n] to starts[n + 1]. */
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
-                  const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                  const double *sigma_px, starcat_answer *answers, int32_t *stars, starcat_memory *memory);
+                           const int64_t *starts, const double *pairs_px, const double *magnitudes,
+                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           starcat_memory *memory);
 
 #endif

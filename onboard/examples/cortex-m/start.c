@@ -29,8 +29,8 @@ static void reset(void) {
 }
 
 __attribute__((section(".vectors"), used)) static const void *const VECTORS[16] = {
-    stack_end, (const void *)reset, (const void *)stop, (const void *)stop,
-    (const void *)stop, (const void *)stop, (const void *)stop};
+    stack_end,          (const void *)reset, (const void *)stop, (const void *)stop,
+    (const void *)stop, (const void *)stop,  (const void *)stop};
 
 void _init(void);
 void _init(void) {}

@@ -34,26 +34,53 @@
 enum { NONE, CAUGHT, RIGHT, WRONG, CRASH, N_OUTCOMES };
 
 /* Parts of the workspace and of the image, by which the outcomes are listed. */
-#define FIELD(name) {#name, offsetof(starcat_workspace, name)}
+#define FIELD(name) \
+  { #name, offsetof(starcat_workspace, name) }
 static const struct {
   const char *name;
   size_t at;
-} FIELDS[] = {
-    FIELD(row),        FIELD(x),
-    FIELD(y),              FIELD(magnitude),      FIELD(square),     FIELD(body),
-    FIELD(scaled),         FIELD(column),         FIELD(in_column),  FIELD(separation_rad),
-    FIELD(heap),           FIELD(neighbour),      FIELD(either),
-    FIELD(corner),         FIELD(third),          
-    FIELD(near_row),       FIELD(near_icrs),      FIELD(within),     FIELD(x_of),
-    FIELD(y_of),           FIELD(nearest),        FIELD(nearest_square), FIELD(match),
-    FIELD(before),         FIELD(match_square),   FIELD(rival),
-    FIELD(rival_of),       FIELD(compatible),     FIELD(log_ways),   FIELD(sums),
-    FIELD(log_largest),    FIELD(n_some),         FIELD(found),      FIELD(wider),
-    FIELD(best),               FIELD(seen),       FIELD(seen_body),
-    FIELD(seen_icrs),      FIELD(weight)};
+} FIELDS[] = {FIELD(row),
+              FIELD(x),
+              FIELD(y),
+              FIELD(magnitude),
+              FIELD(square),
+              FIELD(body),
+              FIELD(scaled),
+              FIELD(column),
+              FIELD(in_column),
+              FIELD(separation_rad),
+              FIELD(heap),
+              FIELD(neighbour),
+              FIELD(either),
+              FIELD(corner),
+              FIELD(third),
+              FIELD(near_row),
+              FIELD(near_icrs),
+              FIELD(within),
+              FIELD(x_of),
+              FIELD(y_of),
+              FIELD(nearest),
+              FIELD(nearest_square),
+              FIELD(match),
+              FIELD(before),
+              FIELD(match_square),
+              FIELD(rival),
+              FIELD(rival_of),
+              FIELD(compatible),
+              FIELD(log_ways),
+              FIELD(sums),
+              FIELD(log_largest),
+              FIELD(n_some),
+              FIELD(found),
+              FIELD(wider),
+              FIELD(best),
+              FIELD(seen),
+              FIELD(seen_body),
+              FIELD(seen_icrs),
+              FIELD(weight)};
 #define N_FIELDS (sizeof FIELDS / sizeof FIELDS[0])
-static const char *const SECTIONS[] = {"header", "directions", "magnitudes", "star_ids", "grid",
-                                       "kvector", "triangles", "radii", "pairs", "checks"};
+static const char *const SECTIONS[] = {"header",  "directions", "magnitudes", "star_ids", "grid",
+                                       "kvector", "triangles",  "radii",      "pairs",    "checks"};
 #define N_SECTIONS 10u
 #define N_PARTS (N_FIELDS + N_SECTIONS)
 
@@ -73,8 +100,8 @@ typedef struct {
 /* What the processes share: how far they are, and what they counted. */
 typedef struct {
   uint64_t at;
-  uint64_t missed; /* flips in the image whose block starcat_scrub_image did not name */
-  uint64_t traps;  /* calls that raised a floating-point exception */
+  uint64_t missed;  /* flips in the image whose block starcat_scrub_image did not name */
+  uint64_t traps;   /* calls that raised a floating-point exception */
   uint64_t longest; /* call, in basic blocks */
   uint64_t counts[N_PARTS][N_OUTCOMES];
   uint32_t part;
@@ -119,7 +146,7 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   due = at_block;
   a.status = (way & 1u) != 0u
                  ? starcat_track_frame(&s->image, &camera, &options, &frame, f->q_body_from_icrs,
-                                 (starcat_real)0.009, work, &a.result)
+                                       (starcat_real)0.009, work, &a.result)
                  : starcat_identify_frame(&s->image, &camera, &options, &frame, work, &a.result);
   a.blocks = blocks;
   due = 0;
@@ -210,8 +237,8 @@ static void flip(uint64_t index, uint64_t seed, tally *t) {
   const answer a = call(which, n, way, at_block);
   if (in_image) {
     const uint32_t block = (uint32_t)(at / 4096u);
-    t->missed += (uint64_t)((starcat_scrub_image(s->bytes, s->size, block, 1, &bad) >= 0) ||
-                            (bad != block));
+    t->missed +=
+        (uint64_t)((starcat_scrub_image(s->bytes, s->size, block, 1, &bad) >= 0) || (bad != block));
     *flipped = (uint8_t)(*flipped ^ mask);
   }
   t->traps += (uint64_t)(fetestexcept(FE_INVALID | FE_DIVBYZERO | FE_OVERFLOW) != 0);

@@ -4,8 +4,25 @@
 #include <math.h>
 #include <string.h>
 
-enum { SEED = 0, LENS = 4, FOCAL, TOLERANCE, NOISE, NOISE_MAG, FOV, CHANCE, STEPS, MAGNITUDES, COUNT,
-       KIND, TRACK, PRIOR, SPACING, ORDER, FALSE_SPOTS };
+enum {
+  SEED = 0,
+  LENS = 4,
+  FOCAL,
+  TOLERANCE,
+  NOISE,
+  NOISE_MAG,
+  FOV,
+  CHANCE,
+  STEPS,
+  MAGNITUDES,
+  COUNT,
+  KIND,
+  TRACK,
+  PRIOR,
+  SPACING,
+  ORDER,
+  FALSE_SPOTS
+};
 #define N_KINDS 9u
 #define DEFAULT_STEPS 255u /* a gene of ordinary frames alone, as it takes long */
 
@@ -39,8 +56,7 @@ void adversary_mutate(uint64_t *state, uint8_t genes[N_GENES]) {
 }
 
 /* The camera and the options. */
-static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state,
-                   adversary *made) {
+static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state, adversary *made) {
   static const double chances[4] = {-20.723265836946411, -300.0, -1.0, -1e9};
   static const double fov_errors[8] = {0.0, 0.0, 0.0, 0.0, 0.001, 0.02, 0.1, 0.5};
   static const double noises_mag[4] = {0.0, 0.1, 1.0, 100.0};
@@ -75,8 +91,7 @@ static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state
 }
 
 /* Spots of a kind that no sky has. */
-static void draw_spots(const uint8_t *g, const starcat_camera *c, uint64_t *state,
-                       sky_frame *sky) {
+static void draw_spots(const uint8_t *g, const starcat_camera *c, uint64_t *state, sky_frame *sky) {
   const double width = (double)c->width_px, height = (double)c->height_px;
   const double spacing = width * (1.0 + g[SPACING]) / 2048.0;
   const uint32_t columns = 2u + g[SPACING] % 9u;
@@ -195,8 +210,8 @@ starcat_status adversary_call(const starcat_image *image, const adversary *made,
   const starcat_frame frame = {sky->count, sky->x, sky->y,
                                made->has_magnitudes ? sky->magnitudes : NULL,
                                made->has_sigma ? made->sigma_px : NULL};
-  return made->is_tracked ? starcat_track_frame(image, &made->camera, &made->options, &frame,
-                                          sky->q_body_from_icrs, made->uncertainty_rad, work, result)
-                          : starcat_identify_frame(image, &made->camera, &made->options, &frame, work,
-                                             result);
+  return made->is_tracked
+             ? starcat_track_frame(image, &made->camera, &made->options, &frame,
+                                   sky->q_body_from_icrs, made->uncertainty_rad, work, result)
+             : starcat_identify_frame(image, &made->camera, &made->options, &frame, work, result);
 }

@@ -10,8 +10,10 @@ static uint64_t words[SKY_MOST_BYTES / 8u];
 
 int main(int argc, char **argv) {
   /* Triangles and pairs of few stars, and of many in a narrow reach. */
-  static const sky_recipe recipes[4] = {
-      {1, 2, SKY_STARS, 0.42, 8}, {2, 2, SKY_STARS, 0.698, 8}, {1, 2, 700, 0.17, 9}, {2, 4, 1500, 0.18, 8}};
+  static const sky_recipe recipes[4] = {{1, 2, SKY_STARS, 0.42, 8},
+                                        {2, 2, SKY_STARS, 0.698, 8},
+                                        {1, 2, 700, 0.17, 9},
+                                        {2, 4, 1500, 0.18, 8}};
   for (unsigned n = 0; (argc == 2) && (n < 4u); n++) {
     char path[1024];
     const size_t size = sky_image(&recipes[n], (uint8_t *)words);

@@ -90,7 +90,8 @@ static int measure_open(void) {
   const uint64_t opened = clock_now();
   (void)starcat_scrub_image(image_begin, size, 1, 1, &bad);
   const uint64_t scrubbed = clock_now();
-  (void)printf("open %llu blocks: %lu\nscrub %llu\n", (unsigned long long)(opened - start + CLOCK_STEP),
+  (void)printf("open %llu blocks: %lu\nscrub %llu\n",
+               (unsigned long long)(opened - start + CLOCK_STEP),
                (unsigned long)(image.total_bytes / 4096u),
                (unsigned long long)(scrubbed - opened + CLOCK_STEP));
   return status == STARCAT_IDENTIFIED;
@@ -109,7 +110,7 @@ static void measure_attitude(void) {
   }
   const uint64_t before = clock_now();
   (void)starcat_fit_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs,
-                         STARCAT_MAX_CENTROIDS, q);
+                             STARCAT_MAX_CENTROIDS, q);
   (void)printf("attitude %llu pairs: %u\n", (unsigned long long)(clock_now() - before + CLOCK_STEP),
                STARCAT_MAX_CENTROIDS);
 }

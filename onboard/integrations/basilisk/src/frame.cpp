@@ -16,13 +16,13 @@ constexpr int kTries = 40;                            // to find a place on a di
 
 // A body that hides stars, shines on the lens and is taken for stars.
 struct Body {
-  Vector middle;                    // direction, ICRS
+  Vector middle;  // direction, ICRS
   double radius_rad;
-  double glare_mag, glare_rad;      // loss of limit at its edge, and the angle by which it falls to 1/e
-  double lit;                       // 1: its edge at the field is in the Sun, 0: in the dark
-  double false_lit, false_dark;     // false centroids that it makes
-  double false_rad;                 // how far beyond its edge
-  double brightest_mag;             // of these, below the limit
+  double glare_mag, glare_rad;  // loss of limit at its edge, and the angle by which it falls to 1/e
+  double lit;                   // 1: its edge at the field is in the Sun, 0: in the dark
+  double false_lit, false_dark;  // false centroids that it makes
+  double false_rad;              // how far beyond its edge
+  double brightest_mag;          // of these, below the limit
 
   double above(const Vector &direction) const {
     return std::acos(std::clamp(middle.dot(direction), -1.0, 1.0)) - radius_rad;
@@ -90,9 +90,8 @@ double streak(const Lens &lens, const Optics &optics, const Vector &rate, const 
 }
 
 // Stars that may be seen, brightest first, those within a spot of a brighter one added to it.
-std::vector<Centroid> spots_of(const std::vector<Star> &sky, const Lens &lens,
-                               const Optics &optics, const Scene &scene,
-                               const std::vector<Body> &bodies) {
+std::vector<Centroid> spots_of(const std::vector<Star> &sky, const Lens &lens, const Optics &optics,
+                               const Scene &scene, const std::vector<Body> &bodies) {
   std::vector<Centroid> near;
   const Vector axis = scene.camera_from_icrs.row(2);
   const double edge = std::cos(lens.corner_rad() + 0.2 * kDegree);
@@ -120,7 +119,8 @@ std::vector<Centroid> spots_of(const std::vector<Star> &sky, const Lens &lens,
       spots.push_back(star);
       continue;
     }
-    const double own = std::pow(10.0, -0.4 * star.mag), light = own + std::pow(10.0, -0.4 * spot->mag);
+    const double own = std::pow(10.0, -0.4 * star.mag),
+                 light = own + std::pow(10.0, -0.4 * spot->mag);
     spot->x_px += (star.x_px - spot->x_px) * own / light;
     spot->y_px += (star.y_px - spot->y_px) * own / light;
     spot->mag = -2.5 * std::log10(light);

@@ -8,7 +8,7 @@
 
 #include "architecture/utilities/rigidBodyKinematics.h"
 #include "frame.h"
-#include "starcat.hpp"
+#include "starcat_session.h"
 
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
@@ -20,7 +20,6 @@ namespace {
 constexpr double kLight_m_s = 299792458.0;
 constexpr double kNano = 1e-9;
 constexpr double kLeastNoise_px = 0.4, kNoise_mag = 0.3;  // as they are stated to the library
-constexpr double kRefined_rad = 1e-3;  // by which an attitude may change when aberration is taken out
 
 Vector3d vector_of(const double (&from)[3]) { return Vector3d(from[0], from[1], from[2]); }
 
@@ -41,31 +40,26 @@ void quaternion_of(const Matrix3d &matrix, double (&q)[4]) {
   q[3] = sign * turn.w();
 }
 
+// Return the matrix of such a quaternion.
+Matrix3d matrix_of_quaternion(const double q[4]) {
+  return Eigen::Quaterniond(q[3], q[0], q[1], q[2]).toRotationMatrix().transpose();
+}
+
 }  // namespace
 
 // What the library and the frames are made of, kept out of the header that SWIG reads.
 struct StarcatTracker::Parts {
   std::vector<std::uint64_t> words;
-  std::unique_ptr<starcat::image> image;
-  std::unique_ptr<starcat::matcher> matcher;
+  starcat_session session{};
+  Vector3d beta;  // what is known on board of the velocity, in that of light
   star_camera::Lens lens{};
   std::vector<star_camera::Star> sky;
   star_camera::Random random{0}, drops{0};  // the same frames are dropped whatever is in them
   std::vector<Centroid> last;
-};
 
-// The centroids of a frame, without what only the simulation knows.
-struct StarcatTracker::Given {
-  explicit Given(const std::vector<Centroid> &from) : centroids(from) {
-    for (const Centroid &one : from) {
-      x.push_back(one.x_px);
-      y.push_back(one.y_px);
-      mag.push_back(one.mag);
-      sigma.push_back(one.sigma_px);
-    }
-  }
-  const std::vector<Centroid> &centroids;
-  std::vector<double> x, y, mag, sigma;
+  starcat_status identify(std::uint64_t now, const std::vector<Centroid> &seen);
+  static void removeAberration(void *context, const double q[4], std::uint32_t count, double *x_px,
+                               double *y_px);
 };
 
 StarcatTracker::StarcatTracker() : dcm_CB(Matrix3d::Identity()), parts(new Parts) {}
@@ -77,14 +71,21 @@ void StarcatTracker::loadImage(const std::string &path) {
   const std::vector<char> bytes((std::istreambuf_iterator<char>(file)), {});
   parts->words.assign((bytes.size() + 7u) / 8u, 0u);
   std::copy(bytes.begin(), bytes.end(), reinterpret_cast<char *>(parts->words.data()));
-  parts->image = std::make_unique<starcat::image>(parts->words);
-  if (!*parts->image) {
-    bskLogger.bskError("starcatTracker: %s is no image that opens (code %d); write one with "
-                       "starcat export DATABASE --to onboard -o FILE", path.c_str(),
-                       static_cast<int>(parts->image->status()));
+  starcat_session &session = parts->session;
+  starcat_prepare_session(&session);
+  const starcat_status status =
+      starcat_use_image(&session, parts->words.data(), 8u * parts->words.size());
+  if (status != STARCAT_OK) {
+    bskLogger.bskError(
+        "starcatTracker: %s is no image that opens (code %d); write one with "
+        "starcat export DATABASE --to onboard -o FILE",
+        path.c_str(), static_cast<int>(status));
   }
-  parts->matcher = std::make_unique<starcat::matcher>(*parts->image);
-  const starcat::camera &camera = parts->matcher->camera;
+  session.options.noise_mag = kNoise_mag;
+  session.prior_age = 1;  // the filter turns its attitude on to the time of the frame
+  session.correct = &Parts::removeAberration;
+  session.context = parts.get();
+  const starcat_camera &camera = session.camera;
   parts->lens = {camera.width_px, camera.height_px, camera.focal_length_px};
 }
 
@@ -92,9 +93,10 @@ void StarcatTracker::setSky(const std::vector<double> &directions,
                             const std::vector<double> &magnitudes,
                             const std::vector<long long> &ids) {
   if (directions.size() != 3 * magnitudes.size() || ids.size() != magnitudes.size()) {
-    bskLogger.bskError("starcatTracker: %zu numbers of directions, %zu magnitudes and %zu ids; "
-                       "expected three, one and one a star", directions.size(), magnitudes.size(),
-                       ids.size());
+    bskLogger.bskError(
+        "starcatTracker: %zu numbers of directions, %zu magnitudes and %zu ids; "
+        "expected three, one and one a star",
+        directions.size(), magnitudes.size(), ids.size());
   }
   parts->sky.clear();
   for (std::size_t n = 0; n < magnitudes.size(); n++) {
@@ -129,7 +131,7 @@ void StarcatTracker::Reset(uint64_t) {
       !navTransInMsg.isLinked()) {
     bskLogger.bskError("starcatTracker: link scStateInMsg, sunInMsg, moonInMsg and navTransInMsg");
   }
-  if (!parts->matcher || parts->sky.empty()) {
+  if (parts->session.image_status != STARCAT_OK || parts->words.empty() || parts->sky.empty()) {
     bskLogger.bskError("starcatTracker: call loadImage and setSky before the simulation starts");
   }
   parts->random = star_camera::Random(RNGSeed);
@@ -161,8 +163,8 @@ void StarcatTracker::see(uint64_t now, StarcatFrameMsgPayload &frame) {
   const SCStatesMsgPayload truth = scStateInMsg();
   const SpicePlanetStateMsgPayload sun = sunInMsg(), moon = moonInMsg();
   const Vector3d place = vector_of(truth.r_BN_N), sun_velocity = vector_of(sun.VelocityVector);
-  const Vector3d earth = earthInMsg.isLinked() ? vector_of(earthInMsg().PositionVector)
-                                               : Vector3d(Vector3d::Zero());
+  const Vector3d earth =
+      earthInMsg.isLinked() ? vector_of(earthInMsg().PositionVector) : Vector3d(Vector3d::Zero());
   star_camera::Scene scene;
   scene.camera_from_icrs = dcm_CB * matrix_of(truth.sigma_BN);
   scene.rate_rad_s = dcm_CB * vector_of(truth.omega_BN_B);
@@ -190,71 +192,73 @@ void StarcatTracker::see(uint64_t now, StarcatFrameMsgPayload &frame) {
   }
 
   // From here on as on board.
-  const Vector3d beta = (vector_of(navTransInMsg().v_BN_N) - sun_velocity) / kLight_m_s;
-  Given given(seen.centroids);
-  Matrix3d prior;
-  frame.tracked = expected(now, prior) && identify(given, &prior, beta);
-  if (frame.tracked || identify(given, nullptr, beta)) {
-    answer(now, given, frame);
+  starcat_session &session = parts->session;
+  parts->beta = (vector_of(navTransInMsg().v_BN_N) - sun_velocity) / kLight_m_s;
+  session.prior_error_rad = priorError;
+  session.prior_time = now;
+  session.has_prior = expected(now, session.q_prior) ? 1u : 0u;
+  const starcat_status status = parts->identify(now, seen.centroids);
+  frame.tracked = status == STARCAT_IDENTIFIED && session.mode == STARCAT_MODE_TRACK;
+  if (status == STARCAT_IDENTIFIED) {
+    answer(now, frame);
   } else {
-    frame.outcome = STARCAT_OUTCOME_WITHHELD + static_cast<int>(parts->matcher->result().reason);
+    frame.outcome = STARCAT_OUTCOME_WITHHELD + static_cast<int>(session.result.reason);
   }
-  frame.steps = static_cast<int>(parts->matcher->result().steps);
+  frame.steps = static_cast<int>(session.steps);
 }
 
 // The attitude that the filter expects, turned on from the time of its message to now.
-bool StarcatTracker::expected(uint64_t now, Matrix3d &camera_from_icrs) {
+bool StarcatTracker::expected(uint64_t now, double (&q)[4]) {
   if (!navAttInMsg.isLinked() || !navAttInMsg.isWritten()) {
     return false;
   }
   const NavAttMsgPayload known = navAttInMsg();
-  const Vector3d turn = vector_of(known.omega_BN_B) * (static_cast<double>(now) * kNano - known.timeTag);
+  const Vector3d turn =
+      vector_of(known.omega_BN_B) * (static_cast<double>(now) * kNano - known.timeTag);
   const double angle = turn.norm();
   const Vector3d axis = angle > 0.0 ? Vector3d(turn / angle) : Vector3d(Vector3d::UnitX());
-  const Matrix3d moved = Eigen::AngleAxisd(-angle, axis).toRotationMatrix() * matrix_of(known.sigma_BN);
-  camera_from_icrs = dcm_CB * moved;
+  const Matrix3d moved =
+      Eigen::AngleAxisd(-angle, axis).toRotationMatrix() * matrix_of(known.sigma_BN);
+  quaternion_of(dcm_CB * moved, q);
   return true;
 }
 
-// Identify, with the centroids moved to where they were without aberration. That needs an attitude
-// good to a degree, so a frame that was identified without one is fitted once more.
-bool StarcatTracker::identify(const Given &given, const Matrix3d *prior, const Vector3d &beta) {
-  starcat::matcher &matcher = *parts->matcher;
-  double squares = 0.0;
-  for (const double sigma_px : given.sigma) {
-    squares += sigma_px * sigma_px;
+// Move centroids to where they were without aberration, as an attitude tells it.
+void StarcatTracker::Parts::removeAberration(void *context, const double q[4], std::uint32_t count,
+                                             double *x_px, double *y_px) {
+  const Parts &known = *static_cast<const Parts *>(context);
+  const Matrix3d near = matrix_of_quaternion(q);
+  for (std::uint32_t n = 0; n < count; n++) {
+    const Vector3d seen = near.transpose() * known.lens.direction(x_px[n], y_px[n]);
+    known.lens.project(near * star_camera::aberrated(seen, -known.beta), x_px[n], y_px[n]);
   }
-  const double mean = squares / std::max<double>(static_cast<double>(given.sigma.size()), 1.0);
-  matcher.options.noise_px = std::max(kLeastNoise_px, std::sqrt(mean));
-  matcher.options.noise_mag = kNoise_mag;
-  Matrix3d near;
-  double error_rad = priorError;
-  if (prior != nullptr) {
-    near = *prior;
-  } else {
-    if (matcher.identify({given.x, given.y, given.mag, given.sigma}) != STARCAT_IDENTIFIED) {
-      return false;
-    }
-    near = Eigen::Map<const RowMajor>(matcher.result().matrix);
-    error_rad = kRefined_rad;
-  }
-  std::vector<double> x = given.x, y = given.y;
-  for (std::size_t n = 0; n < x.size(); n++) {
-    const Vector3d seen = near.transpose() * parts->lens.direction(given.x[n], given.y[n]);
-    parts->lens.project(near * star_camera::aberrated(seen, -beta), x[n], y[n]);
-  }
-  starcat::prior given_prior{};
-  quaternion_of(near, given_prior.q_body_from_icrs);
-  given_prior.uncertainty_rad = error_rad;
-  return matcher.track({x, y, given.mag, given.sigma}, given_prior) == STARCAT_IDENTIFIED;
 }
 
-void StarcatTracker::answer(uint64_t now, const Given &given, StarcatFrameMsgPayload &frame) {
-  const starcat::matcher &matcher = *parts->matcher;
-  const Matrix3d camera = Eigen::Map<const RowMajor>(matcher.result().matrix);
+// Give a frame to the session, with the mean of its noises and without what only the simulation knows.
+starcat_status StarcatTracker::Parts::identify(std::uint64_t now,
+                                               const std::vector<Centroid> &seen) {
+  std::vector<double> x, y, mag, sigma;
+  double squares = 0.0;
+  for (const Centroid &one : seen) {
+    x.push_back(one.x_px);
+    y.push_back(one.y_px);
+    mag.push_back(one.mag);
+    sigma.push_back(one.sigma_px);
+    squares += one.sigma_px * one.sigma_px;
+  }
+  const double mean = squares / std::max<double>(static_cast<double>(seen.size()), 1.0);
+  session.options.noise_px = std::max(kLeastNoise_px, std::sqrt(mean));
+  const starcat_frame frame = {static_cast<std::uint32_t>(seen.size()), x.data(), y.data(),
+                               mag.data(), sigma.data()};
+  return starcat_answer_frame(&session, &frame, now);
+}
+
+void StarcatTracker::answer(uint64_t now, StarcatFrameMsgPayload &frame) {
+  const starcat_session &session = parts->session;
+  const Matrix3d camera = Eigen::Map<const RowMajor>(session.result.matrix);
   const RowMajor body = dcm_CB.transpose() * camera, rows = camera;
   const RowMajor spread = dcm_CB.transpose() *
-                          Matrix3d(Eigen::Map<const RowMajor>(matcher.result().covariance_rad2)) *
+                          Matrix3d(Eigen::Map<const RowMajor>(session.result.covariance_rad2)) *
                           dcm_CB;
   double copy[3][3];
   std::copy(body.data(), body.data() + 9, &copy[0][0]);
@@ -262,11 +266,11 @@ void StarcatTracker::answer(uint64_t now, const Given &given, StarcatFrameMsgPay
   std::copy(spread.data(), spread.data() + 9, frame.covariance_B);
   frame.valid = 1;
   frame.outcome = STARCAT_OUTCOME_IDENTIFIED;
-  for (std::size_t n = 0; n < given.centroids.size(); n++) {
-    const std::int32_t row = matcher.stars()[n];
+  for (std::size_t n = 0; n < parts->last.size(); n++) {
+    const std::int32_t row = session.result.star[n];
     if (row >= 0) {
-      const std::int64_t named = parts->image->star_ids()[static_cast<std::size_t>(row)];
-      const Centroid &true_one = given.centroids[n];
+      const std::int64_t named = session.image.star_ids[row];
+      const Centroid &true_one = parts->last[n];
       frame.nNamed++;
       frame.nMisnamed += named != true_one.id && named != true_one.blended_id;
     }

@@ -73,12 +73,10 @@ class StarcatTracker : public SysModel {
 
  private:
   struct Parts;
-  struct Given;
   bool isDropped(double time_s);
   void see(uint64_t now, StarcatFrameMsgPayload &frame);
-  bool expected(uint64_t now, Eigen::Matrix3d &camera_from_icrs);
-  bool identify(const Given &given, const Eigen::Matrix3d *prior, const Eigen::Vector3d &beta);
-  void answer(uint64_t now, const Given &given, StarcatFrameMsgPayload &frame);
+  bool expected(uint64_t now, double (&q_camera_from_icrs)[4]);
+  void answer(uint64_t now, StarcatFrameMsgPayload &frame);
 
   std::unique_ptr<Parts> parts;
   std::vector<double> outages;

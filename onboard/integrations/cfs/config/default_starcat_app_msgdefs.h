@@ -14,7 +14,7 @@
 #define STARCAT_APP_HAS_MAGNITUDES 1
 #define STARCAT_APP_HAS_SIGMAS     2
 
-/* How a frame was identified. */
+/* How a frame was identified: the numbers of starcat_mode. */
 #define STARCAT_APP_MODE_NONE     0 /* there is no image */
 #define STARCAT_APP_MODE_IDENTIFY 1 /* lost in space */
 #define STARCAT_APP_MODE_TRACK    2 /* from the last attitude */
@@ -24,7 +24,7 @@
 #define STARCAT_APP_CAMERA_OF_TABLE   1
 #define STARCAT_APP_CAMERA_OF_COMMAND 2
 
-/* How far a new image has come. */
+/* How far a new image has come: the numbers of starcat_load. */
 #define STARCAT_APP_LOAD_NONE     0
 #define STARCAT_APP_LOAD_READING  1 /* from its file, a few pieces a tick */
 #define STARCAT_APP_LOAD_CHECKING 2 /* its blocks, a few a tick */

@@ -67,9 +67,10 @@ static size_t read_whole(const char *folder, const char *name, void *into, size_
 static void compare_with_truth(const attitude_out *out) {
   const double *q = out->Quaternion, *m = truth[out->Sequence];
   const double x = q[0], y = q[1], z = q[2], w = q[3];
-  const double found[9] = {1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y),
-                           2 * (x * y - w * z),     1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
-                           2 * (x * z + w * y),     2 * (y * z - w * x),     1 - 2 * (x * x + y * y)};
+  const double found[9] = {
+      1 - 2 * (y * y + z * z), 2 * (x * y + w * z),     2 * (x * z - w * y),
+      2 * (x * y - w * z),     1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+      2 * (x * z + w * y),     2 * (y * z - w * x),     1 - 2 * (x * x + y * y)};
   double turned[9], square = 0.0;
   for (int i = 0; i < 3; i++) {
     for (int j = 0; j < 3; j++) { /* found times the truth's transpose: nearly 1 */
@@ -82,8 +83,8 @@ static void compare_with_truth(const attitude_out *out) {
   const double e[3] = {0.5 * (turned[5] - turned[7]), 0.5 * (turned[6] - turned[2]),
                        0.5 * (turned[1] - turned[3])};
   const double trace = turned[0] + turned[4] + turned[8];
-  const double deg = atan2(sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2]), 0.5 * (trace - 1.0)) *
-                     57.29577951308232;
+  const double deg =
+      atan2(sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2]), 0.5 * (trace - 1.0)) * 57.29577951308232;
   const double *c = out->Covariance_rad2;
   /* The inverse of a symmetric matrix, by its minors. */
   const double a = c[3] * c[5] - c[4] * c[4], b = c[2] * c[4] - c[1] * c[5],
@@ -91,8 +92,7 @@ static void compare_with_truth(const attitude_out *out) {
   const double determinant = c[0] * a + c[1] * b + c[2] * d;
   square = (a * e[0] * e[0] + (c[0] * c[5] - c[2] * c[2]) * e[1] * e[1] +
             (c[0] * c[3] - c[1] * c[1]) * e[2] * e[2] +
-            2.0 * (b * e[0] * e[1] + d * e[0] * e[2] +
-                   (c[1] * c[2] - c[0] * c[4]) * e[1] * e[2])) /
+            2.0 * (b * e[0] * e[1] + d * e[0] * e[2] + (c[1] * c[2] - c[0] * c[4]) * e[1] * e[2])) /
            determinant;
   worst_deg = deg > worst_deg ? deg : worst_deg;
   worst_sigmas = square > worst_sigmas ? square : worst_sigmas;
@@ -147,8 +147,8 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
     return STARCAT_E_CRC;
   }
   if ((hk.Tracking == 1) && has_prior && (fabs(now_s - prior_s) < age_s - 1e-6)) {
-    const starcat_status status = starcat_track_frame(image, &camera, &options, &frame, prior, prior_rad,
-                                                &work, &result);
+    const starcat_status status =
+        starcat_track_frame(image, &camera, &options, &frame, prior, prior_rad, &work, &result);
     *mode = STARCAT_APP_MODE_TRACK;
     *steps = result.steps;
     if ((status == STARCAT_IDENTIFIED) || (result.steps >= options.max_steps)) {
@@ -157,7 +157,8 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
     options.max_steps -= result.steps;
   }
   *mode = STARCAT_APP_MODE_IDENTIFY;
-  const starcat_status status = starcat_identify_frame(image, &camera, &options, &frame, &work, &result);
+  const starcat_status status =
+      starcat_identify_frame(image, &camera, &options, &frame, &work, &result);
   *steps += result.steps;
   return status;
 }
@@ -321,6 +322,6 @@ int main(int argc, char **argv) {
   (void)printf("  housekeeping packets          %6u\n", hks);
   (void)printf("  packets                       %6u\n", packets);
   (void)printf("  differences to the library    %6u\n", differences);
-  return (answers != TEST_FRAMES) || (right != TEST_FRAMES) || (wrong > 0u) ||
-         (differences > 0u) || (worst_sigmas > MOST_SIGMAS_SQUARE) || (identified + tracked != right);
+  return (answers != TEST_FRAMES) || (right != TEST_FRAMES) || (wrong > 0u) || (differences > 0u) ||
+         (worst_sigmas > MOST_SIGMAS_SQUARE) || (identified + tracked != right);
 }

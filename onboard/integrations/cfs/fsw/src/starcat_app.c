@@ -12,8 +12,8 @@ static CFE_Status_t MakePipe(void) {
   static const CFE_SB_MsgId_Atom_t Subscribed[] = {STARCAT_APP_CMD_MID, STARCAT_APP_SEND_HK_MID,
                                                    STARCAT_APP_WAKEUP_MID,
                                                    STARCAT_APP_FRAME_TLM_MID};
-  CFE_Status_t Status = CFE_SB_CreatePipe(&STARCAT_APP_Data.Pipe, STARCAT_APP_PIPE_DEPTH,
-                                          STARCAT_APP_PIPE_NAME);
+  CFE_Status_t Status =
+      CFE_SB_CreatePipe(&STARCAT_APP_Data.Pipe, STARCAT_APP_PIPE_DEPTH, STARCAT_APP_PIPE_NAME);
   for (size_t n = 0; (n < sizeof Subscribed / sizeof Subscribed[0]) && (Status == CFE_SUCCESS);
        n++) {
     Status = CFE_SB_Subscribe(CFE_SB_ValueToMsgId(Subscribed[n]), STARCAT_APP_Data.Pipe);
@@ -26,9 +26,9 @@ static CFE_Status_t MakePipe(void) {
 }
 
 static CFE_Status_t LoadTable(void) {
-  CFE_Status_t Status =
-      CFE_TBL_Register(&STARCAT_APP_Data.Table, STARCAT_APP_TABLE_NAME, sizeof(STARCAT_APP_Config_t),
-                       CFE_TBL_OPT_DEFAULT, STARCAT_APP_ValidateConfig);
+  CFE_Status_t Status = CFE_TBL_Register(&STARCAT_APP_Data.Table, STARCAT_APP_TABLE_NAME,
+                                         sizeof(STARCAT_APP_Config_t), CFE_TBL_OPT_DEFAULT,
+                                         STARCAT_APP_ValidateConfig);
   if (Status == CFE_SUCCESS) {
     Status = CFE_TBL_Load(STARCAT_APP_Data.Table, CFE_TBL_SRC_FILE, STARCAT_APP_TABLE_FILE);
   }
@@ -65,6 +65,7 @@ CFE_Status_t STARCAT_APP_Init(void) {
     Status = MakePipe();
   }
   if (Status == CFE_SUCCESS) {
+    STARCAT_APP_FillHk();
     CFE_EVS_SendEvent(STARCAT_APP_INIT_INF_EID, CFE_EVS_EventType_INFORMATION,
                       "STARCAT: starcat %s started, image %.*s, status %d", starcat_version(),
                       STARCAT_APP_NAME_LEN, STARCAT_APP_Data.HkTlm.Payload.ImageName,

@@ -7,8 +7,7 @@
 
 #include "cfe.h"
 
-#include "starcat.h"
-#include "starcat_update.h"
+#include "starcat_session.h"
 
 #include "starcat_app_eventids.h"
 #include "starcat_app_msg.h"
@@ -25,26 +24,13 @@ typedef struct {
   uint32 RunStatus;
   CFE_SB_PipeId_t Pipe;
   CFE_TBL_Handle_t Table;
-  STARCAT_APP_HkTlm_t HkTlm; /* what it reports is counted in it */
+  STARCAT_APP_HkTlm_t HkTlm;
   STARCAT_APP_AttitudeTlm_t AttitudeTlm;
 
-  starcat_slots Slots;
-  starcat_image Image; /* the one in use, if HasImage */
-  bool HasImage;
-  starcat_camera Camera;
-  starcat_options Options;
+  starcat_session Session;     /* its clock counts 2^-32 s */
   STARCAT_APP_Config_t Config; /* the table as it was taken over */
-
-  bool HasPrior;
-  uint64 PriorTime; /* of the frame of the last attitude, in 2^-32 s */
-  starcat_real Prior[4];
-
+  uint32 FramesOfWrongLength;
   osal_id_t LoadFile;
-  bool IsPatch;
-  uint32 CheckBlock;
-
-  starcat_workspace Work;
-  starcat_result Result;
 } STARCAT_APP_Data_t;
 
 extern STARCAT_APP_Data_t STARCAT_APP_Data;
@@ -57,6 +43,7 @@ CFE_Status_t STARCAT_APP_Init(void);
 void STARCAT_APP_TaskPipe(const CFE_SB_Buffer_t *Buffer);
 
 /* starcat_app_cmds.c: commands, housekeeping */
+void STARCAT_APP_FillHk(void);
 void STARCAT_APP_NoopCmd(const STARCAT_APP_NoopCmd_t *Msg);
 void STARCAT_APP_ResetCountersCmd(const STARCAT_APP_ResetCountersCmd_t *Msg);
 void STARCAT_APP_LoadImageCmd(const STARCAT_APP_LoadImageCmd_t *Msg);
@@ -71,8 +58,7 @@ void STARCAT_APP_SendHkCmd(const STARCAT_APP_SendHkCmd_t *Msg);
 /* starcat_app_config.c: table, camera */
 CFE_Status_t STARCAT_APP_ValidateConfig(void *Table);
 CFE_Status_t STARCAT_APP_ManageConfig(void);
-starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
-                                         const starcat_options *Options);
+void STARCAT_APP_SetTracking(uint8 Tracking);
 void STARCAT_APP_TakeCamera(const STARCAT_APP_Camera_t *From, starcat_camera *Camera);
 
 /* starcat_app_frame.c: frames to attitudes */
@@ -80,7 +66,6 @@ void STARCAT_APP_Frame(const STARCAT_APP_FrameTlm_t *Msg);
 
 /* starcat_app_image.c: images in their slots */
 void STARCAT_APP_StartImages(void);
-void STARCAT_APP_ImageInUse(starcat_status Status);
 CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch);
 void STARCAT_APP_Wakeup(const STARCAT_APP_WakeupCmd_t *Msg);
 

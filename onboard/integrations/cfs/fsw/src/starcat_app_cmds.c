@@ -7,6 +7,7 @@
 #include <string.h>
 
 #define HK (STARCAT_APP_Data.HkTlm.Payload)
+#define SESSION (STARCAT_APP_Data.Session)
 
 void STARCAT_APP_NoopCmd(const STARCAT_APP_NoopCmd_t *Msg) {
   (void)Msg;
@@ -20,15 +21,8 @@ void STARCAT_APP_ResetCountersCmd(const STARCAT_APP_ResetCountersCmd_t *Msg) {
   HK.CommandCounter = 0;
   HK.CommandErrorCounter = 0;
   HK.FramesIn = 0;
-  HK.FramesIdentified = 0;
-  HK.FramesTracked = 0;
-  memset(HK.FramesNotIdentified, 0, sizeof HK.FramesNotIdentified);
-  HK.FramesWithoutImage = 0;
-  HK.FrameErrors = 0;
-  HK.ScrubPasses = 0;
-  HK.DamageFound = 0;
-  HK.BlocksMended = 0;
-  HK.FallBacks = 0;
+  STARCAT_APP_Data.FramesOfWrongLength = 0;
+  memset(&SESSION.counts, 0, sizeof SESSION.counts);
   CFE_EVS_SendEvent(STARCAT_APP_RESET_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: counters are 0");
 }
@@ -54,35 +48,24 @@ void STARCAT_APP_LoadPatchCmd(const STARCAT_APP_LoadPatchCmd_t *Msg) {
 
 void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg) {
   (void)Msg;
-  /* What is half read might be the old image still; what is not checked, or failed, may not be. */
-  const bool IsBusy = (HK.LoadState == STARCAT_APP_LOAD_READING) ||
-                      (HK.LoadState == STARCAT_APP_LOAD_CHECKING);
-  starcat_image Image; /* a switch that fails writes it too */
-  starcat_status Status = STARCAT_NO_MATCH;
-  if (!IsBusy) {
-    Status = starcat_switch_image(&STARCAT_APP_Data.Slots, &Image);
-  }
+  const starcat_status Status = starcat_change_image(&SESSION);
   if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_SWITCH_ERR_EID, CFE_EVS_EventType_ERROR,
-                      "STARCAT: no switch: %s, status %d",
-                      IsBusy ? "an image is being loaded" : "the other image cannot be used",
+                      "STARCAT: no switch: the other image cannot be used, or not yet, status %d",
                       (int)Status);
     return;
   }
   HK.CommandCounter++;
-  HK.LoadState = STARCAT_APP_LOAD_NONE;
-  STARCAT_APP_Data.Image = Image;
-  STARCAT_APP_ImageInUse(Status);
   CFE_EVS_SendEvent(STARCAT_APP_SWITCH_INF_EID, CFE_EVS_EventType_INFORMATION,
-                    "STARCAT: image %.*s of slot %u is in use", STARCAT_APP_NAME_LEN, HK.ImageName,
-                    (unsigned int)HK.ActiveSlot);
+                    "STARCAT: image %.*s of slot %u is in use", STARCAT_APP_NAME_LEN,
+                    SESSION.image.name, (unsigned int)SESSION.slots.active);
 }
 
 void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
   starcat_camera Camera;
   STARCAT_APP_TakeCamera(&Msg->Payload.Camera, &Camera);
-  const starcat_status Status = STARCAT_APP_CheckSettings(&Camera, &STARCAT_APP_Data.Options);
+  const starcat_status Status = starcat_check_settings(&Camera, &SESSION.options);
   if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_CAMERA_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -92,7 +75,8 @@ void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
   }
   HK.CommandCounter++;
   HK.CameraSource = STARCAT_APP_CAMERA_OF_COMMAND;
-  STARCAT_APP_Data.Camera = Camera;
+  SESSION.camera = Camera;
+  SESSION.has_own_camera = 1;
   CFE_EVS_SendEvent(STARCAT_APP_CAMERA_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: camera of %.1f by %.1f px, focal length %.3f px",
                     (double)Camera.width_px, (double)Camera.height_px,
@@ -101,8 +85,7 @@ void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
 
 static void SetTracking(uint8 Tracking) {
   HK.CommandCounter++;
-  HK.Tracking = Tracking;
-  STARCAT_APP_Data.HasPrior = false;
+  STARCAT_APP_SetTracking(Tracking);
   CFE_EVS_SendEvent(STARCAT_APP_TRACKING_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: tracking is %s", Tracking != 0 ? "on" : "off");
 }
@@ -118,9 +101,9 @@ void STARCAT_APP_DisableTrackingCmd(const STARCAT_APP_DisableTrackingCmd_t *Msg)
 }
 
 void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
-  starcat_options Options = STARCAT_APP_Data.Options;
+  starcat_options Options = SESSION.options;
   Options.max_steps = Msg->Payload.MaxSteps;
-  const starcat_status Status = STARCAT_APP_CheckSettings(NULL, &Options);
+  const starcat_status Status = starcat_check_settings(NULL, &Options);
   if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_BUDGET_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -129,14 +112,44 @@ void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
     return;
   }
   HK.CommandCounter++;
-  HK.MaxSteps = Options.max_steps;
-  STARCAT_APP_Data.Options = Options;
+  SESSION.options = Options;
   CFE_EVS_SendEvent(STARCAT_APP_BUDGET_INF_EID, CFE_EVS_EventType_INFORMATION,
-                    "STARCAT: a frame may take %lu steps", (unsigned long)HK.MaxSteps);
+                    "STARCAT: a frame may take %lu steps", (unsigned long)Options.max_steps);
+}
+
+/* What housekeeping tells of the session. */
+void STARCAT_APP_FillHk(void) {
+  const starcat_counts *Counts = &SESSION.counts;
+  const bool HasImage = SESSION.image_status == STARCAT_OK;
+  HK.FramesIdentified = Counts->frames_identified;
+  HK.FramesTracked = Counts->frames_tracked;
+  memcpy(HK.FramesNotIdentified, Counts->frames_not_identified, sizeof HK.FramesNotIdentified);
+  HK.FramesWithoutImage = Counts->frames_without_image;
+  HK.FrameErrors = Counts->frames_refused + STARCAT_APP_Data.FramesOfWrongLength;
+  HK.ImageStatus = (int16)SESSION.image_status;
+  HK.ActiveSlot = (uint8)SESSION.slots.active;
+  HK.LoadState = (uint8)SESSION.load;
+  HK.LoadBytes = (uint32)SESSION.load_bytes;
+  HK.LoadSize = (uint32)SESSION.load_size;
+  HK.MaxSteps = SESSION.options.max_steps;
+  HK.ScrubBlock = SESSION.scrub_block;
+  HK.ScrubPasses = Counts->scrub_passes;
+  HK.DamageFound = Counts->damage_found;
+  HK.BlocksMended = Counts->blocks_mended;
+  HK.FallBacks = Counts->fall_backs;
+  HK.ImageBytes = 0;
+  memset(HK.ImageName, 0, sizeof HK.ImageName);
+  memset(HK.ImageDigest, 0, sizeof HK.ImageDigest);
+  if (HasImage) {
+    HK.ImageBytes = (uint32)SESSION.slots.size[SESSION.slots.active];
+    memcpy(HK.ImageName, SESSION.image.name, sizeof HK.ImageName);
+    memcpy(HK.ImageDigest, SESSION.image.manifest_sha256, sizeof HK.ImageDigest);
+  }
 }
 
 void STARCAT_APP_SendHkCmd(const STARCAT_APP_SendHkCmd_t *Msg) {
   (void)Msg;
+  STARCAT_APP_FillHk();
   CFE_SB_TimeStampMsg(CFE_MSG_PTR(STARCAT_APP_Data.HkTlm.TelemetryHeader));
   CFE_SB_TransmitMsg(CFE_MSG_PTR(STARCAT_APP_Data.HkTlm.TelemetryHeader), true);
   (void)STARCAT_APP_ManageConfig();

@@ -30,17 +30,12 @@ static void TakeOptions(const STARCAT_APP_Config_t *Config, starcat_options *Opt
   Options->max_steps = Config->MaxSteps;
 }
 
-/* What the library says to a camera and to options: with them it looks at a frame of no centroids,
- * for which it needs no image. Options may be checked without a camera. */
-starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
-                                         const starcat_options *Options) {
-  static const starcat_image NoImage;
-  static const starcat_frame NoFrame;
-  static const starcat_camera AnyCamera = {1024, 1024, 2048, 512, 512, 0, 0, 0, 0, 0, 0};
-  const starcat_status Status =
-      starcat_identify_frame(&NoImage, Camera != NULL ? Camera : &AnyCamera, Options, &NoFrame,
-                       &STARCAT_APP_Data.Work, &STARCAT_APP_Data.Result);
-  return Status == STARCAT_TOO_FEW_STARS ? STARCAT_OK : Status;
+/* Begin frames with the last attitude, while it is fresh by the table, or with none. */
+void STARCAT_APP_SetTracking(uint8 Tracking) {
+  const uint64 Age = ((uint64)STARCAT_APP_Data.Config.PriorAge_ms << 32) / 1000u;
+  STARCAT_APP_Data.HkTlm.Payload.Tracking = Tracking;
+  STARCAT_APP_Data.Session.prior_age = Tracking != 0 ? Age : 0u;
+  STARCAT_APP_Data.Session.has_prior = 0;
 }
 
 CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
@@ -50,7 +45,7 @@ CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
   TakeOptions(Config, &Options);
   STARCAT_APP_TakeCamera(&Config->Camera, &Camera);
   const starcat_status Status =
-      STARCAT_APP_CheckSettings(Config->CameraOfImage == 0 ? &Camera : NULL, &Options);
+      starcat_check_settings(Config->CameraOfImage == 0 ? &Camera : NULL, &Options);
   const bool IsSound = (Config->Prior_rad > 0.0) && (Config->Prior_rad <= WIDEST_PRIOR_RAD) &&
                        (Config->ScrubBlocks > 0) && (Config->LoadPieces > 0) &&
                        (Config->CameraOfImage <= 1) && (Config->Tracking <= 1);
@@ -64,19 +59,20 @@ CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
 }
 
 static void TakeConfig(const STARCAT_APP_Config_t *Config) {
-  STARCAT_APP_HkTlm_Payload_t *Hk = &STARCAT_APP_Data.HkTlm.Payload;
+  starcat_session *Session = &STARCAT_APP_Data.Session;
   STARCAT_APP_Data.Config = *Config;
-  TakeOptions(Config, &STARCAT_APP_Data.Options);
-  Hk->MaxSteps = Config->MaxSteps;
-  Hk->Tracking = Config->Tracking;
-  STARCAT_APP_Data.HasPrior = false;
+  TakeOptions(Config, &Session->options);
+  Session->prior_error_rad = (starcat_real)Config->Prior_rad;
+  Session->blocks_per_tick = Config->ScrubBlocks;
+  STARCAT_APP_SetTracking(Config->Tracking);
+  Session->has_own_camera = Config->CameraOfImage == 0 ? 1u : 0u;
   if (Config->CameraOfImage == 0) {
-    Hk->CameraSource = STARCAT_APP_CAMERA_OF_TABLE;
-    STARCAT_APP_TakeCamera(&Config->Camera, &STARCAT_APP_Data.Camera);
+    STARCAT_APP_Data.HkTlm.Payload.CameraSource = STARCAT_APP_CAMERA_OF_TABLE;
+    STARCAT_APP_TakeCamera(&Config->Camera, &Session->camera);
   } else {
-    Hk->CameraSource = STARCAT_APP_CAMERA_OF_IMAGE;
-    if (STARCAT_APP_Data.HasImage) {
-      starcat_get_camera(&STARCAT_APP_Data.Image, &STARCAT_APP_Data.Camera);
+    STARCAT_APP_Data.HkTlm.Payload.CameraSource = STARCAT_APP_CAMERA_OF_IMAGE;
+    if (Session->image_status == STARCAT_OK) {
+      starcat_get_camera(&Session->image, &Session->camera);
     }
   }
   CFE_EVS_SendEvent(STARCAT_APP_TABLE_INF_EID, CFE_EVS_EventType_INFORMATION,

@@ -20,13 +20,13 @@ static bool HasLength(const CFE_SB_Buffer_t *Buffer, size_t Expected) {
 }
 
 /* Call a handler if the length is right; count the command as wrong if not. */
-#define OBEY(handler, type)                                         \
-  do {                                                              \
-    if (HasLength(Buffer, sizeof(type))) {                          \
-      handler((const type *)Buffer);                                \
-    } else {                                                        \
-      STARCAT_APP_Data.HkTlm.Payload.CommandErrorCounter++;         \
-    }                                                               \
+#define OBEY(handler, type)                                 \
+  do {                                                      \
+    if (HasLength(Buffer, sizeof(type))) {                  \
+      handler((const type *)Buffer);                        \
+    } else {                                                \
+      STARCAT_APP_Data.HkTlm.Payload.CommandErrorCounter++; \
+    }                                                       \
   } while (0)
 
 static void GroundCommand(const CFE_SB_Buffer_t *Buffer) {
@@ -77,7 +77,7 @@ void STARCAT_APP_TaskPipe(const CFE_SB_Buffer_t *Buffer) {
         STARCAT_APP_Frame((const STARCAT_APP_FrameTlm_t *)Buffer);
       } else {
         STARCAT_APP_Data.HkTlm.Payload.FramesIn++;
-        STARCAT_APP_Data.HkTlm.Payload.FrameErrors++;
+        STARCAT_APP_Data.FramesOfWrongLength++;
       }
       break;
     case STARCAT_APP_WAKEUP_MID:

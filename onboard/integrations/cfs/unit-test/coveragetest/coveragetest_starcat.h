@@ -1,4 +1,4 @@
-/* What the coverage tests share: each begins with zeros and with the app's image in use.
+/* What the coverage tests share: each begins with zeros, and so with an image in use.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -13,6 +13,7 @@
 #include "uttest.h"
 
 #define HK (STARCAT_APP_Data.HkTlm.Payload)
+#define SESSION (STARCAT_APP_Data.Session)
 #define MOST_EVENTS 64
 
 static uint16 Events[MOST_EVENTS]; /* identifiers in order */
@@ -22,7 +23,6 @@ static void Setup(void) {
   memset(&STARCAT_APP_Data, 0, sizeof STARCAT_APP_Data);
   memset(Events, 0, sizeof Events);
   UT_SetDataBuffer(UT_KEY(CFE_EVS_SendEvent), Events, sizeof Events, false);
-  STARCAT_APP_Data.HasImage = true;
 }
 
 static uint16 LastEvent(void) {

@@ -8,17 +8,17 @@ static void TestNoop(void) {
 }
 
 static void TestResetCounters(void) {
-  STARCAT_APP_HkTlm_Payload_t Zeros;
+  starcat_counts Zeros;
   memset(&Zeros, 0, sizeof Zeros);
   memset(&HK, 0x55, sizeof HK);
+  memset(&SESSION.counts, 0x55, sizeof SESSION.counts);
+  SESSION.scrub_block = 5;
+  STARCAT_APP_Data.FramesOfWrongLength = 5;
   STARCAT_APP_ResetCountersCmd(NULL);
   IS(HK.CommandCounter + HK.CommandErrorCounter, 0);
-  IS(HK.FramesIn + HK.FramesIdentified + HK.FramesTracked, 0);
-  IS(memcmp(HK.FramesNotIdentified, Zeros.FramesNotIdentified, sizeof HK.FramesNotIdentified), 0);
-  IS(HK.FramesWithoutImage + HK.FrameErrors, 0);
-  IS(HK.ScrubPasses + HK.DamageFound + HK.BlocksMended + HK.FallBacks, 0);
-  IS(HK.ScrubBlock, 0x55555555); /* no counter */
-  IS(HK.ImageName[0], 0x55);
+  IS(HK.FramesIn + STARCAT_APP_Data.FramesOfWrongLength, 0);
+  IS(memcmp(&SESSION.counts, &Zeros, sizeof Zeros), 0);
+  IS(SESSION.scrub_block, 5); /* no counter */
   IS(LastEvent(), STARCAT_APP_RESET_INF_EID);
 }
 
@@ -42,28 +42,14 @@ static void TestLoadPatch(void) {
 }
 
 static void TestSwitchImage(void) {
-  HK.LoadState = STARCAT_APP_LOAD_READY;
+  SESSION.image.name = "name";
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandCounter, 1);
-  IS(HK.LoadState, STARCAT_APP_LOAD_NONE);
-  IS(STARCAT_APP_Data.Image.n_stars, 4321);
-  CALLED(STARCAT_APP_ImageInUse, 1);
   IS(LastEvent(), STARCAT_APP_SWITCH_INF_EID);
-}
-
-static void TestSwitchImageThatCannotBe(void) {
-  ONCE(starcat_switch_image, STARCAT_E_CRC);
+  ONCE(starcat_change_image, STARCAT_INCOMPLETE);
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandErrorCounter, 1);
   IS(LastEvent(), STARCAT_APP_SWITCH_ERR_EID);
-  IS(STARCAT_APP_Data.Image.n_stars, 0); /* nothing changes */
-  HK.LoadState = STARCAT_APP_LOAD_READING;
-  STARCAT_APP_SwitchImageCmd(NULL);
-  HK.LoadState = STARCAT_APP_LOAD_CHECKING;
-  STARCAT_APP_SwitchImageCmd(NULL);
-  IS(HK.CommandErrorCounter, 3);
-  CALLED(starcat_switch_image, 1);
-  CALLED(STARCAT_APP_ImageInUse, 0);
 }
 
 static void TestSetCamera(void) {
@@ -73,21 +59,20 @@ static void TestSetCamera(void) {
   STARCAT_APP_SetCameraCmd(&Msg);
   IS(HK.CommandCounter, 1);
   IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_COMMAND);
-  IS(STARCAT_APP_Data.Camera.focal_length_px, 99);
+  IS(SESSION.camera.focal_length_px, 99);
+  IS(SESSION.has_own_camera, 1);
   IS(LastEvent(), STARCAT_APP_CAMERA_INF_EID);
   Msg.Payload.Camera.FocalLength_px = 77.0;
-  ONCE(STARCAT_APP_CheckSettings, STARCAT_E_CAMERA);
+  ONCE(starcat_check_settings, STARCAT_E_CAMERA);
   STARCAT_APP_SetCameraCmd(&Msg);
   IS(HK.CommandErrorCounter, 1);
-  IS(STARCAT_APP_Data.Camera.focal_length_px, 99);
+  IS(SESSION.camera.focal_length_px, 99);
   IS(LastEvent(), STARCAT_APP_CAMERA_ERR_EID);
 }
 
 static void TestTracking(void) {
-  STARCAT_APP_Data.HasPrior = true;
   STARCAT_APP_EnableTrackingCmd(NULL);
   IS(HK.Tracking, 1);
-  IS(STARCAT_APP_Data.HasPrior, false);
   STARCAT_APP_DisableTrackingCmd(NULL);
   IS(HK.Tracking, 0);
   IS(HK.CommandCounter, 2);
@@ -100,23 +85,42 @@ static void TestSetBudget(void) {
   Msg.Payload.MaxSteps = 500;
   STARCAT_APP_SetBudgetCmd(&Msg);
   IS(HK.CommandCounter, 1);
-  IS(HK.MaxSteps, 500);
-  IS(STARCAT_APP_Data.Options.max_steps, 500);
+  IS(SESSION.options.max_steps, 500);
   IS(LastEvent(), STARCAT_APP_BUDGET_INF_EID);
   Msg.Payload.MaxSteps = 0;
-  ONCE(STARCAT_APP_CheckSettings, STARCAT_E_OPTIONS);
+  ONCE(starcat_check_settings, STARCAT_E_OPTIONS);
   STARCAT_APP_SetBudgetCmd(&Msg);
   IS(HK.CommandErrorCounter, 1);
-  IS(STARCAT_APP_Data.Options.max_steps, 500);
+  IS(SESSION.options.max_steps, 500);
   IS(LastEvent(), STARCAT_APP_BUDGET_ERR_EID);
 }
 
 static void TestSendHk(void) {
+  static char Name[STARCAT_APP_NAME_LEN] = "name";
+  static uint8 Digest[32] = {1, 2, 3};
+  SESSION.image.name = Name;
+  SESSION.image.manifest_sha256 = Digest;
+  SESSION.slots.active = 1;
+  SESSION.slots.size[1] = 4096;
+  SESSION.counts.frames_not_identified[STARCAT_REASON_SHARE - 1] = 8;
+  SESSION.counts.frames_refused = 2;
+  STARCAT_APP_Data.FramesOfWrongLength = 3;
   STARCAT_APP_SendHkCmd(NULL);
+  IS(HK.FramesNotIdentified[STARCAT_REASON_SHARE - 1], 8);
+  IS(HK.FrameErrors, 5);
+  IS(HK.ActiveSlot, 1);
+  IS(HK.ImageBytes, 4096);
+  IS(HK.ImageName[0], 'n');
+  IS(HK.ImageDigest[2], 3);
   CALLED(CFE_SB_TimeStampMsg, 1);
   CALLED(CFE_SB_TransmitMsg, 1);
   CALLED(STARCAT_APP_ManageConfig, 1);
   IS(HK.CommandCounter, 0);
+  SESSION.image_status = STARCAT_E_CRC;
+  STARCAT_APP_SendHkCmd(NULL);
+  IS(HK.ImageStatus, STARCAT_E_CRC);
+  IS(HK.ImageBytes, 0);
+  IS(HK.ImageName[0], 0);
 }
 
 void UtTest_Setup(void) {
@@ -125,7 +129,6 @@ void UtTest_Setup(void) {
   ADD(TestLoadImage);
   ADD(TestLoadPatch);
   ADD(TestSwitchImage);
-  ADD(TestSwitchImageThatCannotBe);
   ADD(TestSetCamera);
   ADD(TestTracking);
   ADD(TestSetBudget);

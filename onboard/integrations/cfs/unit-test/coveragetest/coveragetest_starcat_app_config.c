@@ -11,21 +11,7 @@ static STARCAT_APP_Config_t Sound(void) {
   return Config;
 }
 
-static int32 Validated(STARCAT_APP_Config_t Config) {
-  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
-  return STARCAT_APP_ValidateConfig(&Config);
-}
-
-static void TestCheckSettings(void) {
-  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
-  IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
-     STARCAT_OK);
-  ONCE(starcat_identify_frame, STARCAT_TOO_FEW_STARS);
-  IS(STARCAT_APP_CheckSettings(NULL, &STARCAT_APP_Data.Options), STARCAT_OK);
-  ONCE(starcat_identify_frame, STARCAT_E_CAMERA);
-  IS(STARCAT_APP_CheckSettings(&STARCAT_APP_Data.Camera, &STARCAT_APP_Data.Options),
-     STARCAT_E_CAMERA);
-}
+static int32 Validated(STARCAT_APP_Config_t Config) { return STARCAT_APP_ValidateConfig(&Config); }
 
 static void TestValidate(void) {
   STARCAT_APP_Config_t Config = Sound();
@@ -33,7 +19,7 @@ static void TestValidate(void) {
   Config.CameraOfImage = 1;
   IS(Validated(Config), CFE_SUCCESS);
   CALLED(CFE_EVS_SendEvent, 0);
-  ONCE(starcat_identify_frame, STARCAT_E_OPTIONS);
+  ONCE(starcat_check_settings, STARCAT_E_OPTIONS);
   IS(STARCAT_APP_ValidateConfig(&Config), -1);
   IS(LastEvent(), STARCAT_APP_TABLE_ERR_EID);
 }
@@ -68,21 +54,25 @@ static void TestManage(void) {
   Config.Camera.FocalLength_px = 500.0;
   Config.Tolerance_px = 3.0;
   Config.Tracking = 1;
-  STARCAT_APP_Data.HasPrior = true;
+  Config.PriorAge_ms = 2000;
+  SESSION.has_prior = 1;
   Manage(&Config);
   IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_TABLE);
-  IS(STARCAT_APP_Data.Camera.focal_length_px, 500);
-  IS(STARCAT_APP_Data.Options.tolerance_px, 3);
-  IS(STARCAT_APP_Data.Options.max_steps, 100);
-  IS(HK.MaxSteps, 100);
+  IS(SESSION.camera.focal_length_px, 500);
+  IS(SESSION.options.tolerance_px, 3);
+  IS(SESSION.options.max_steps, 100);
+  IS(SESSION.has_own_camera, 1);
   IS(HK.Tracking, 1);
-  IS(STARCAT_APP_Data.HasPrior, false);
+  UtAssert_True(SESSION.prior_age == (uint64)2 << 32, "age");
+  IS(SESSION.has_prior, 0);
   IS(LastEvent(), STARCAT_APP_TABLE_INF_EID);
   Config.CameraOfImage = 1;
+  Config.Tracking = 0;
   Manage(&Config);
+  IS(SESSION.prior_age, 0);
   IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_IMAGE);
-  IS(STARCAT_APP_Data.Camera.focal_length_px, 1234);
-  STARCAT_APP_Data.HasImage = false;
+  IS(SESSION.camera.focal_length_px, 1234);
+  SESSION.image_status = STARCAT_E_CRC;
   Manage(&Config);
   CALLED(starcat_get_camera, 1);
   CALLED(CFE_TBL_Manage, 3);
@@ -99,7 +89,6 @@ static void TestManageNothingNew(void) {
 }
 
 void UtTest_Setup(void) {
-  ADD(TestCheckSettings);
   ADD(TestValidate);
   ADD(TestValidateRanges);
   ADD(TestManage);

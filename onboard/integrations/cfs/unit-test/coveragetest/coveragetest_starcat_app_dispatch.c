@@ -16,16 +16,16 @@ static void Dispatch(CFE_SB_MsgId_Atom_t Mid, CFE_MSG_FcnCode_t Code, size_t Len
 }
 
 /* Once with the right length, once with another one, which is an error. */
-#define CHECK_COMMAND(mid, code, function, type)     \
-  do {                                               \
-    const uint8 Before = HK.CommandErrorCounter;     \
-    Dispatch((mid), (code), sizeof(type));           \
-    CALLED(function, 1);                             \
-    IS(HK.CommandErrorCounter, Before);              \
-    Dispatch((mid), (code), sizeof(type) + 1);       \
-    CALLED(function, 1);                             \
-    IS(HK.CommandErrorCounter, Before + 1);          \
-    IS(LastEvent(), STARCAT_APP_LEN_ERR_EID);        \
+#define CHECK_COMMAND(mid, code, function, type) \
+  do {                                           \
+    const uint8 Before = HK.CommandErrorCounter; \
+    Dispatch((mid), (code), sizeof(type));       \
+    CALLED(function, 1);                         \
+    IS(HK.CommandErrorCounter, Before);          \
+    Dispatch((mid), (code), sizeof(type) + 1);   \
+    CALLED(function, 1);                         \
+    IS(HK.CommandErrorCounter, Before + 1);      \
+    IS(LastEvent(), STARCAT_APP_LEN_ERR_EID);    \
   } while (0)
 
 static void TestCommands(void) {
@@ -41,8 +41,8 @@ static void TestCommands(void) {
                 STARCAT_APP_SwitchImageCmd_t);
   CHECK_COMMAND(STARCAT_APP_CMD_MID, STARCAT_APP_SET_CAMERA_CC, STARCAT_APP_SetCameraCmd,
                 STARCAT_APP_SetCameraCmd_t);
-  CHECK_COMMAND(STARCAT_APP_CMD_MID, STARCAT_APP_ENABLE_TRACKING_CC,
-                STARCAT_APP_EnableTrackingCmd, STARCAT_APP_EnableTrackingCmd_t);
+  CHECK_COMMAND(STARCAT_APP_CMD_MID, STARCAT_APP_ENABLE_TRACKING_CC, STARCAT_APP_EnableTrackingCmd,
+                STARCAT_APP_EnableTrackingCmd_t);
   CHECK_COMMAND(STARCAT_APP_CMD_MID, STARCAT_APP_DISABLE_TRACKING_CC,
                 STARCAT_APP_DisableTrackingCmd, STARCAT_APP_DisableTrackingCmd_t);
   CHECK_COMMAND(STARCAT_APP_CMD_MID, STARCAT_APP_SET_BUDGET_CC, STARCAT_APP_SetBudgetCmd,
@@ -62,7 +62,7 @@ static void TestFrames(void) {
   CALLED(STARCAT_APP_Frame, 1);
   IS(LastEvent(), STARCAT_APP_LEN_ERR_EID);
   IS(HK.FramesIn, 1);
-  IS(HK.FrameErrors, 1);
+  IS(STARCAT_APP_Data.FramesOfWrongLength, 1);
   IS(HK.CommandErrorCounter, 0);
 }
 

@@ -14,11 +14,9 @@ CFE_Status_t STARCAT_APP_ManageConfig(void) {
   return UT_GenStub_GetReturnValue(STARCAT_APP_ManageConfig, CFE_Status_t);
 }
 
-starcat_status STARCAT_APP_CheckSettings(const starcat_camera *Camera,
-                                         const starcat_options *Options) {
-  (void)Camera;
-  (void)Options;
-  return (starcat_status)UT_DEFAULT_IMPL(STARCAT_APP_CheckSettings);
+void STARCAT_APP_SetTracking(uint8 Tracking) {
+  STARCAT_APP_Data.HkTlm.Payload.Tracking = Tracking;
+  (void)UT_DEFAULT_IMPL(STARCAT_APP_SetTracking);
 }
 
 void STARCAT_APP_TakeCamera(const STARCAT_APP_Camera_t *From, starcat_camera *Camera) {

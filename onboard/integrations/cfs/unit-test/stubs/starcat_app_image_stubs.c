@@ -5,11 +5,6 @@ STUB_OF_HANDLER(STARCAT_APP_Wakeup, STARCAT_APP_WakeupCmd_t)
 
 void STARCAT_APP_StartImages(void) { UT_GenStub_Execute(STARCAT_APP_StartImages, Basic, NULL); }
 
-void STARCAT_APP_ImageInUse(starcat_status Status) {
-  UT_GenStub_AddParam(STARCAT_APP_ImageInUse, starcat_status, Status);
-  UT_GenStub_Execute(STARCAT_APP_ImageInUse, Basic, NULL);
-}
-
 CFE_Status_t STARCAT_APP_BeginLoad(const char *Path, uint32 Crc, bool IsPatch) {
   UT_GenStub_SetupReturnBuffer(STARCAT_APP_BeginLoad, CFE_Status_t);
   UT_GenStub_AddParam(STARCAT_APP_BeginLoad, const char *, Path);

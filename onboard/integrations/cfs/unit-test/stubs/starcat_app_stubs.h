@@ -8,10 +8,10 @@
 #include "uttest.h"
 #include "utstubs.h"
 
-#define STUB_OF_HANDLER(name, type)          \
-  void name(const type *Msg) {               \
+#define STUB_OF_HANDLER(name, type)               \
+  void name(const type *Msg) {                    \
     UT_GenStub_AddParam(name, const type *, Msg); \
-    UT_GenStub_Execute(name, Basic, NULL);   \
+    UT_GenStub_Execute(name, Basic, NULL);        \
   }
 
 #endif

@@ -1,4 +1,4 @@
-/* The library: what it returns is a test's choice, as are the numbers that it writes.
+/* The library: what it returns is a test's choice, as is what it does to a session.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -14,87 +14,61 @@ void starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
   (void)UT_DEFAULT_IMPL(starcat_get_camera);
 }
 
-starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
-                             uint32_t *bad_block) {
-  (void)bytes;
-  (void)size;
-  (void)first;
-  (void)count;
-  *bad_block = 7;
-  RETURN(starcat_scrub_image);
+void starcat_prepare_session(starcat_session *session) {
+  (void)session;
+  (void)UT_DEFAULT_IMPL(starcat_prepare_session);
 }
 
-/* The numbers of a result come from a test's buffers, one a call. */
-starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
-                                const starcat_options *options, const starcat_frame *frame,
-                                starcat_workspace *work, starcat_result *result) {
-  (void)image;
-  (void)camera;
-  (void)work;
-  (void)UT_Stub_CopyToLocal(UT_KEY(starcat_identify_frame), result, sizeof *result);
-  return (starcat_status)UT_DEFAULT_IMPL_ARGS(starcat_identify_frame, options->max_steps, frame->count);
+starcat_status starcat_start_session(starcat_session *session) {
+  (void)session;
+  RETURN(starcat_start_session);
 }
 
-starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
-                             const starcat_options *options, const starcat_frame *frame,
-                             const starcat_real q_prior[4], starcat_real uncertainty_rad,
-                             starcat_workspace *work, starcat_result *result) {
-  (void)image;
+starcat_status starcat_check_settings(const starcat_camera *camera,
+                                      const starcat_options *options) {
   (void)camera;
   (void)options;
-  (void)frame;
-  (void)q_prior;
-  (void)uncertainty_rad;
-  (void)work;
-  (void)UT_Stub_CopyToLocal(UT_KEY(starcat_track_frame), result, sizeof *result);
-  RETURN(starcat_track_frame);
+  RETURN(starcat_check_settings);
 }
 
-starcat_status starcat_start_image(starcat_slots *slots, starcat_image *image) {
-  (void)slots;
-  (void)image;
-  RETURN(starcat_start_image);
+/* The numbers of a result come from a test's buffer; a status below 0 is that of a refused frame. */
+starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
+                                    uint64_t time) {
+  (void)UT_Stub_CopyToLocal(UT_KEY(starcat_answer_frame), &session->result, sizeof session->result);
+  session->prior_time = time;
+  const starcat_status status =
+      (starcat_status)UT_DEFAULT_IMPL_ARGS(starcat_answer_frame, frame->count);
+  session->counts.frames_refused += status < STARCAT_OK ? 1u : 0u;
+  return status;
 }
 
-starcat_status starcat_receive_image(starcat_slots *slots, size_t size, uint32_t crc) {
-  (void)slots;
-  (void)size;
+starcat_event starcat_do_idle_work(starcat_session *session) {
+  (void)session;
+  return (starcat_event)UT_DEFAULT_IMPL(starcat_do_idle_work);
+}
+
+starcat_status starcat_begin_load(starcat_session *session, size_t size, uint32_t crc) {
   (void)crc;
-  RETURN(starcat_receive_image);
+  session->load = STARCAT_LOAD_READING;
+  session->load_size = size;
+  RETURN(starcat_begin_load);
 }
 
-starcat_status starcat_put_piece(starcat_slots *slots, size_t offset, const uint8_t *bytes,
-                           size_t count) {
-  (void)slots;
-  (void)offset;
+starcat_status starcat_begin_patch_load(starcat_session *session, size_t size) {
+  session->load = STARCAT_LOAD_READING;
+  session->load_size = size;
+  RETURN(starcat_begin_patch_load);
+}
+
+starcat_status starcat_load_piece(starcat_session *session, const uint8_t *bytes, size_t count) {
   (void)bytes;
-  (void)count;
-  RETURN(starcat_put_piece);
+  session->load_bytes += count;
+  const starcat_status status = (starcat_status)UT_DEFAULT_IMPL(starcat_load_piece);
+  session->load = status == STARCAT_OK ? STARCAT_LOAD_CHECKING : session->load;
+  return status;
 }
 
-starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t first, uint32_t *block) {
-  (void)slots;
-  (void)first;
-  *block = 3;
-  RETURN(starcat_find_missing_block);
-}
-
-starcat_status starcat_apply_patch(starcat_slots *slots, const void *patch, size_t size) {
-  (void)slots;
-  (void)patch;
-  (void)size;
-  RETURN(starcat_apply_patch);
-}
-
-starcat_status starcat_switch_image(starcat_slots *slots, starcat_image *image) {
-  (void)slots;
-  image->n_stars = 4321;
-  RETURN(starcat_switch_image);
-}
-
-starcat_status starcat_mend_image(void *bytes, size_t size, uint32_t *n_mended) {
-  (void)bytes;
-  (void)size;
-  *n_mended = 2;
-  RETURN(starcat_mend_image);
+starcat_status starcat_change_image(starcat_session *session) {
+  (void)session;
+  RETURN(starcat_change_image);
 }

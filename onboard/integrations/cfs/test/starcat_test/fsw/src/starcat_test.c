@@ -393,7 +393,7 @@ static void TestDamagedFiles(void) {
 
 /* Bits of the image in use are turned over, as by radiation, in the app's memory. */
 static void Upset(STARCAT_APP_Data_t *App, size_t Offset) {
-  App->Slots.bytes[App->Slots.active][Offset] ^= 0x10u;
+  App->Session.slots.bytes[App->Session.slots.active][Offset] ^= 0x10u;
 }
 
 static void ScrubUntil(const uint32 *Counter, uint32 Wanted) {
@@ -436,10 +436,10 @@ static void TestUpsets(void) {
                       OS_MODULE_FLAG_LOCAL_SYMBOLS) == OS_SUCCESS);
   CHECK(OS_ModuleSymbolLookup(Module, &Address, "STARCAT_APP_Data") == OS_SUCCESS);
   STARCAT_APP_Data_t *App = (STARCAT_APP_Data_t *)Address;
-  if ((App == NULL) || !App->HasImage) {
+  if ((App == NULL) || (App->Session.image_status != STARCAT_OK)) {
     return;
   }
-  const size_t Blocks = App->Image.data_bytes / BLOCK_BYTES;
+  const size_t Blocks = App->Session.image.data_bytes / BLOCK_BYTES;
   Upset(App, 3 * BLOCK_BYTES + 100);
   ScrubUntil(&Hk.DamageFound, 1);
   CHECK(Hk.BlocksMended == 1);
