@@ -54,6 +54,6 @@ int main(int argc, char **argv) {
     (void)fprintf(stderr, "%s: cannot be written\n", argv[3]);
     return 1;
   }
-  (void)printf("%.96s in place %u\n", image.name, (unsigned)places.active);
+  (void)printf("%.96s in place %u\n", image.name, (unsigned)slots.active);
   return 0;
 }
