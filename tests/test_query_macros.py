@@ -14,6 +14,7 @@ from astropy.coordinates import angular_separation
 from cdshealpix.nested import lonlat_to_healpix
 from mocpy import MOC
 
+from starcat.errors import QueryError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
@@ -94,6 +95,14 @@ def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
     # A place on the line between two cells belongs to either.
     assert (found != expected).sum() <= 4
     assert found.sum() > 0 or cells == "0/"
+
+
+@pytest.mark.parametrize(
+    "cells", ["nonsense", "1e3/2", "3/1.5", "7", "30/1", "0/1" + " 2" * 25_000]
+)
+def test_a_text_that_is_no_moc_is_an_error(session, cells):
+    with pytest.raises(QueryError, match="in_moc"):
+        column(session, f"SELECT in_moc(ra_deg, dec_deg, '{cells}') FROM stars")
 
 
 def test_a_healpix_cell_is_a_quarter_of_one_of_the_order_before(session):

@@ -60,6 +60,17 @@ def test_a_moc_keeps_what_is_in_its_cells_and_all_regions_hold(stars, small_spec
     assert len(found.guide_stars) == inside.sum() > 0
 
 
+def test_a_star_beyond_the_limits_is_rejected_for_them_wherever_it_is(stars, small_spec):
+    content = tomllib.loads(small_spec)
+    content["selection"] = {"faint_limit_mag": 6.0, "region": {"zone": [0.0, 90.0]}}
+    found = select_guide_stars(stars, spec_from_dict(content, "spec.toml").selection)
+    faint = found.rejected.filter(pa.compute.greater(found.rejected["mag"], 6.0))
+    assert set(faint["reason"].to_pylist()) == {"too_faint"}
+    left = [len(step.directions) for step in found.steps]
+    assert left == sorted(left, reverse=True)
+    assert [step.name for step in found.steps][:2] == ["magnitude", "region"]
+
+
 @pytest.mark.parametrize("suffix", ["fits", "json", "txt"])
 def test_a_file_of_a_moc_becomes_its_cells(small_spec, tmp_path, suffix):
     moc = MOC.from_string(CELLS, "ascii")
@@ -79,6 +90,11 @@ def test_a_file_of_a_moc_becomes_its_cells(small_spec, tmp_path, suffix):
         ({"zone": [10.0, -10.0]}, "the smaller first"),
         ({"cone": [0.0, 95.0, 1.0]}, "a declination from -90 to 90"),
         ({"moc": "eight"}, "is not a MOC in ASCII"),
+        ({"moc": "30/1"}, "'30/1' has no order from 0 to 29"),
+        ({"moc": "7"}, "'7' has no order from 0 to 29"),
+        ({"moc": "3/4-1"}, "order 3 has the cells 0 to 767, the lower one first"),
+        ({"moc": "3/768"}, "order 3 has the cells 0 to 767"),
+        ({"moc": "3/"}, "has no cells"),
         ({"moc_file": "/etc/passwd"}, "no file is read here; state moc"),
     ],
 )

@@ -60,6 +60,8 @@ def test_unknown_values_can_be_let_through(stars, small_spec):
         ("ruwe < (SELECT 1)", "not allowed"),
         ("read_text('/etc/passwd') = ''", "there is no function read_text"),
         ("ruwe <", "no expression"),
+        ("- " * 400 + "ruwe < 1", "nested too deep"),
+        ("designation < 3", "cannot be computed"),
     ],
 )
 def test_an_expression_that_is_none_is_refused(small_spec, stars, expression, words):
@@ -68,8 +70,26 @@ def test_an_expression_that_is_none_is_refused(small_spec, stars, expression, wo
 
 
 def test_an_expression_that_is_no_condition_is_refused(small_spec, stars):
-    with pytest.raises(BuildError, match=r"selection\.require\.odd.* gives double; write a cond"):
+    with pytest.raises(ConfigError, match=r"'ruwe \+ 1' gives double; write a condition"):
         selected(small_spec, stars, {"name": "odd", "expression": "ruwe + 1"})
+
+
+def test_a_value_that_no_star_has_is_told_with_those_that_they_have(stars, small_spec):
+    with pytest.raises(BuildError, match=r"no star .* has spectral_type, .* have star_id, "):
+        selected(
+            small_spec,
+            stars.set_column(
+                stars.schema.get_field_index("spectral_type"),
+                stars.schema.field("spectral_type"),
+                pa.nulls(len(stars), pa.string()),
+            ),
+            {"name": "cool", "expression": "spectral_type = 'M'"},
+        )
+
+
+def test_two_conditions_have_two_names(stars, small_spec):
+    with pytest.raises(ConfigError, match="a name is given twice: good-fit, good-fit"):
+        selected(small_spec, stars, FITS_WELL, FITS_WELL)
 
 
 def test_a_spec_without_conditions_is_recorded_as_before(small_spec):

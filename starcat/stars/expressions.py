@@ -61,7 +61,15 @@ def columns_in(
         return (text,), True
     cursor = _database().cursor()
     [(found,)] = cursor.execute("SELECT json_serialize_sql(?)", [_query(text)]).fetchall()
-    tree = json.loads(found)
+    try:
+        return _columns(json.loads(found), text, known, key, where)
+    except RecursionError:
+        raise _refused(key, text, "it is nested too deep", where) from None
+
+
+def _columns(
+    tree: dict[str, Any], text: str, known: Sequence[str], key: str, where: str
+) -> tuple[tuple[str, ...], bool]:
     if tree.get("error"):
         told = str(tree["error_message"]).splitlines()[0]
         several = "Only SELECT" in told

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,13 +18,14 @@ from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.regular_files import check_regular_file
 
-POSITION = 15
+POSITION = 25  # after the limits of magnitude, which an estimate applies first
 STEP = "region"
 COLUMNS = ("ra_deg", "dec_deg", "x", "y", "z")
 OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
 REASONS = (OUTSIDE,)
 
-MAX_MOC_CHARACTERS = 200_000
+MAX_MOC_CHARACTERS = 50_000  # half of the longest text of a spec
+MAX_ORDER = 29
 MAX_MOC_BYTES = 16 << 20
 
 
@@ -45,9 +47,37 @@ def _moc_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
         ) from error
 
 
+_CELLS = re.compile(r"(?:([0-9]{1,2})/)?(?:([0-9]{1,19})(?:-([0-9]{1,19}))?)?")
+
+
+def _check_cells(text: str) -> None:
+    """Check each cell of a MOC; mocpy takes ``30/1`` or ``3/4-1`` for other cells, or for none."""
+    order, has_cells = -1, False
+    for token in text.split():
+        found = _CELLS.fullmatch(token)
+        if found is None:
+            raise ValueError(
+                f"is not a MOC in ASCII: {token[:40]!r} is not a cell; write orders, slashes and "
+                "cells, such as '3/5-7 4/9'"
+            )
+        order = order if found[1] is None else int(found[1])
+        if not 0 <= order <= MAX_ORDER:
+            raise ValueError(f"{token!r} has no order from 0 to {MAX_ORDER} before its cells")
+        if found[2] is None:
+            continue
+        has_cells, count = True, 12 * 4**order
+        if not int(found[2]) <= int(found[3] or found[2]) < count:
+            raise ValueError(
+                f"{token!r}: order {order} has the cells 0 to {count - 1}, the lower one first"
+            )
+    if not has_cells:
+        raise ValueError("has no cells, so that no star is inside")
+
+
 def _moc(text: str) -> Any:
     from mocpy import MOC
 
+    _check_cells(text)
     try:
         return MOC.from_string(text, "ascii")
     except Exception as error:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from starcat.errors import BuildError, ConfigError
+from starcat.arrays import Mask
+from starcat.errors import BuildError
 from starcat.sections import NAME_PATTERN, Section
 from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.expressions import columns_in, evaluate_expression
@@ -20,6 +21,8 @@ UNMET = RuleReason("requirement", "a condition of [[selection.require]] does not
 REASONS = (UNMET,)
 
 MAX_EXPRESSION_CHARACTERS = 1000
+
+_TABLE = "the star table"
 
 
 class Requirement(Section):
@@ -40,12 +43,15 @@ class Requirement(Section):
 
     @field_validator("expression")
     @classmethod
-    def _is_expression(cls, value: str) -> str:
-        known = [column.name for column in product_schema("stars").columns]
-        try:
-            columns_in(value, known, "expression", "the star table")
-        except ConfigError as error:
-            raise ValueError(str(error)) from error
+    def _is_condition(cls, value: str) -> str:
+        none = product_schema("stars").arrow_schema.empty_table()
+        names, _ = columns_in(value, none.column_names, "expression", _TABLE)
+        columns = {name: none[name].combine_chunks() for name in names}
+        kind = evaluate_expression(value, columns, 0, "expression").type
+        if not pa.types.is_boolean(kind):
+            raise ValueError(
+                f"expression: {value!r} gives {kind}; write a condition, such as 'ruwe < 1.4'"
+            )
         return value
 
 
@@ -61,6 +67,13 @@ class Requirements(Section):
         description="conditions that guide stars meet, in [[selection.require]] each",
     )
 
+    @model_validator(mode="after")
+    def _names_differ(self) -> Requirements:
+        names = [each.name for each in self.require]
+        if len(set(names)) != len(names):
+            raise ValueError(f"require: a name is given twice: {', '.join(names)}")
+        return self
+
 
 KEYS = Requirements
 
@@ -69,18 +82,24 @@ def reject(context: Context, keys: Requirements) -> list[Rejection] | None:
     """Reject the stars that do not meet a condition, with its name as the detail."""
     if not keys.require:
         return None
-    found = []
-    for wanted in keys.require:
-        key = f"selection.require.{wanted.name}"
-        names, _ = columns_in(wanted.expression, context.stars.column_names, key, "the star table")
-        columns = {name: context.stars[name].combine_chunks() for name in names}
-        holds = evaluate_expression(wanted.expression, columns, len(context.stars), key)
-        if not pa.types.is_boolean(holds.type):
-            raise BuildError(
-                f"{key}: {wanted.expression!r} gives {holds.type}; write a condition, such as "
-                "'ruwe < 1.4'",
-                fields=(key,),
-            )
-        met = np.asarray(pc.fill_null(holds, False).to_numpy(zero_copy_only=False), dtype=bool)
-        found.append(Rejection(~met, UNMET, f"{wanted.name}: {wanted.expression}"))
-    return found
+    return [
+        Rejection(~_is_met(context.stars, wanted), UNMET, f"{wanted.name}: {wanted.expression}")
+        for wanted in keys.require
+    ]
+
+
+def _is_met(stars: pa.Table, wanted: Requirement) -> Mask:
+    """Return which stars meet a condition; those with an unknown value in it do not."""
+    key, count = f"selection.require.{wanted.name}", len(stars)
+    names, _ = columns_in(wanted.expression, stars.column_names, key, _TABLE)
+    missing = [name for name in names if count and stars[name].null_count == count]
+    if missing:
+        known = [name for name in stars.column_names if stars[name].null_count < count]
+        raise BuildError(
+            f"{key}: no star of the catalogs has {' or '.join(missing)}, which "
+            f"{wanted.expression!r} needs; their stars have {', '.join(known)}",
+            fields=(key,),
+        )
+    columns = {name: stars[name].combine_chunks() for name in names}
+    holds = evaluate_expression(wanted.expression, columns, count, key)
+    return np.asarray(pc.fill_null(holds, False).to_numpy(zero_copy_only=False), dtype=bool)
