@@ -145,9 +145,10 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
 
 /* Note an event and what there is to tell of it. */
 static starcat_event note_event(starcat_session *s, starcat_event event, starcat_status status,
-                                uint32_t block) {
+                                uint32_t block, uint32_t mended) {
   s->event_status = status;
   s->event_block = block;
+  s->event_mended = mended;
   return event;
 }
 
@@ -165,11 +166,11 @@ static starcat_event check_load(starcat_session *s) {
   s->check_block += s->blocks_per_tick;
   if (status != STARCAT_OK) {
     s->load = STARCAT_LOAD_FAILED;
-    return note_event(s, STARCAT_EVENT_REFUSED, status, bad);
+    return note_event(s, STARCAT_EVENT_REFUSED, status, bad, 0);
   }
   if (s->check_block >= blocks) {
     s->load = STARCAT_LOAD_READY;
-    return note_event(s, STARCAT_EVENT_READY, status, 0);
+    return note_event(s, STARCAT_EVENT_READY, status, 0, 0);
   }
   return STARCAT_EVENT_NONE;
 }
@@ -178,22 +179,23 @@ static starcat_event check_load(starcat_session *s) {
 static starcat_event repair_image(starcat_session *s, starcat_status found, uint32_t block) {
   const uint32_t active = s->slots.active;
   starcat_status status = found;
-  s->event_mended = 0;
+  uint32_t mended = 0;
   s->counts.damage_found++;
   if (s->slots.bytes[0] != NULL) {
-    status = starcat_mend_image(s->slots.bytes[active], s->slots.size[active], &s->event_mended);
-    s->counts.blocks_mended += s->event_mended;
+    status = starcat_mend_image(s->slots.bytes[active], s->slots.size[active], &mended);
+    s->counts.blocks_mended += mended;
     if (status == STARCAT_OK) {
-      return note_event(s, STARCAT_EVENT_MENDED, status, block);
+      return note_event(s, STARCAT_EVENT_MENDED, status, block, mended);
     }
     status = starcat_start_image(&s->slots, &s->image);
   }
   (void)note_image(s, status);
   if (status == STARCAT_OK) {
     s->counts.fall_backs++;
-    return note_event(s, STARCAT_EVENT_FELL_BACK, status, block);
+    s->load = STARCAT_LOAD_NONE; /* the other slot is in use now: it must not be loaded into */
+    return note_event(s, STARCAT_EVENT_FELL_BACK, status, block, mended);
   }
-  return note_event(s, STARCAT_EVENT_NO_IMAGE, status, block);
+  return note_event(s, STARCAT_EVENT_NO_IMAGE, status, block, mended);
 }
 
 /* Check some blocks of the image in use; those that were damaged are checked again in the next call. */

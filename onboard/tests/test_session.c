@@ -295,8 +295,11 @@ static void check_scrubbing(void) {
   CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_OK);
   CHECK_IS(load(unit_pyramid.bytes, unit_pyramid.size), STARCAT_OK);
   (void)work_until(STARCAT_EVENT_READY);
+  CHECK_IS(session.event_mended, 0); /* of this event, not of the one before */
   damage(0, 0, blocks); /* more than parity can mend */
   (void)work_until(STARCAT_EVENT_FELL_BACK);
+  CHECK_IS(session.load, STARCAT_LOAD_NONE);
+  CHECK_IS(starcat_load_piece(&session, unit_pyramid.bytes, BLOCK), STARCAT_E_OPTIONS);
   CHECK_IS(session.counts.fall_backs, 1);
   CHECK_IS(session.slots.active, 1);
   CHECK_IS(session.image.method, unit_pyramid.image.method);
