@@ -208,6 +208,12 @@ def test_too_few_stars_are_told_in_the_words_of_the_build(read, small_spec):
     assert str(estimated.value) == str(built.value)
 
 
+def test_sources_are_checked_even_if_the_catalogs_have_been_read_for_another_spec(read, small_spec):
+    wanted = {"crossmatch": {"enabled": True, "catalogs": ["gcvs"]}}
+    with pytest.raises(ConfigError, match="gcvs lists no stars"):
+        choose_stars(read, spec_of(small_spec, products=wanted))
+
+
 def test_fields_that_fall_short_and_memory_are_refusals(read, small_spec):
     spec = spec_of(small_spec, boresights={"count": 200, "min_stars_per_field": 10_000})
     found = estimate_draft(read, choose_stars(read, spec), spec, max_memory_bytes=1)

@@ -139,7 +139,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class Stage:
-    """A step of a build."""
+    """One stage of a build: its function, and what it will do for a spec."""
 
     change: Callable[[Draft], None]  # what it does
     title: str  # in a word or two
@@ -149,17 +149,17 @@ class Stage:
     is_announced: bool  # whether its title is shown as progress when it begins
 
     def __call__(self, draft: Draft) -> None:
-        """Do it, whether or not the spec asks for it."""
+        """Run the stage on a draft, even if the spec does not ask for it."""
         self.change(draft)
 
     @property
     def name(self) -> str:
-        """Name of its function."""
+        """The name of the function."""
         return self.change.__name__
 
     @property
     def summary(self) -> str:
-        """What it does for any spec, in a sentence."""
+        """The first line of the docstring of the function."""
         return (self.change.__doc__ or "").partition("\n")[0]
 
 

@@ -29,6 +29,7 @@ from starcat.pipeline.guide_stars import (
     thin,
     tile,
 )
+from starcat.pipeline.reading import check_sources
 from starcat.pipeline.recipes import field_size
 from starcat.pipeline.stages import READ
 from starcat.products.coverage import (
@@ -109,6 +110,7 @@ def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
     The draft that is returned has none of the stars that were read but those that were chosen or
     rejected: it can be kept without them.
     """
+    check_sources(spec)  # the catalogs may have been read for a spec with other sources
     draft, mag = read.branch(spec), floats_of(read.stars, "mag")
     bright = np.flatnonzero(_is_bright(mag, spec.selection))
     in_limit = int(np.count_nonzero(mag <= spec.selection.faint_limit_mag))

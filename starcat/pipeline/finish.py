@@ -47,7 +47,7 @@ def _products_task(spec: BuildSpec) -> str:
 
 @stage("products", "products", _products_task)
 def make_products(draft: Draft) -> None:
-    """Make the products that need nothing but guide stars and their fields."""
+    """Make the products that need only guide stars and their fields."""
     spec, selected, fields = draft.spec, draft.selected, draft.fields
     rejected = pa.concat_tables([draft.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
@@ -77,7 +77,7 @@ def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:
 
 @stage("write", "write", lambda spec: "write database.h5 and a Parquet file of each product")
 def write_database(draft: Draft) -> None:
-    """Write the products."""
+    """Write the database and a Parquet file of each product."""
     draft.facts = write_products(draft.folder, draft.products, database_facts(draft.spec))
 
 
@@ -102,7 +102,7 @@ def _test_plan(spec: BuildSpec) -> str:
 
 @stage("self-test", "self-test", _test_plan)
 def prove_database(draft: Draft) -> None:
-    """Identify simulated fields with the database as it was written."""
+    """Identify simulated fields with the written database."""
     draft.rates = run_self_test(draft.folder, draft.spec, draft.progress)
 
 
@@ -159,7 +159,7 @@ def describe_database(draft: Draft) -> None:
     is_announced=True,
 )
 def verify_database(draft: Draft) -> None:
-    """Check every file, and that enough simulated fields were identified."""
+    """Check every file, and check that enough simulated fields were identified."""
     check_artifact(draft.folder)
     check_rates(draft.rates, draft.spec, draft.coverage.gap)
 

@@ -48,7 +48,7 @@ def _select_plan(spec: BuildSpec) -> str:
 
 @stage("select", "select", _select_plan)
 def select(draft: Draft) -> None:
-    """Select guide stars by the rules of the spec, which know nothing of fields."""
+    """Select guide stars by the rules of the spec."""
     spec = draft.spec
     pixel_arcsec = spec.camera.camera().pixel_arcsec
     draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
@@ -65,7 +65,7 @@ def _thin_plan(spec: BuildSpec) -> str | None:
 
 @stage("thin", "select", _thin_plan)
 def thin(draft: Draft) -> None:
-    """Keep the stars that fields need."""
+    """Thin the guide stars to an even density, if the spec asks for it."""
     spec, stars = draft.spec, draft.selected.guide_stars
     most = spec.selection.max_stars_per_field
     if spec.selection.thinning != "brightest":
@@ -88,9 +88,9 @@ def tile(draft: Draft) -> None:
         check_fields(draft.fields, draft.spec)
 
 
-@stage("cost", "select", lambda spec: "estimate files, memory and time; end where memory is short")
+@stage("cost", "select", lambda spec: "estimate files, memory and time; stop if memory is short")
 def check_cost(draft: Draft) -> None:
-    """Estimate files, memory and time, and end a build that has not the memory."""
+    """Estimate files, memory and time, and stop the build if memory is short."""
     selected, size = draft.selected, draft.rejected_bytes
     if size is None:
         size = table_bytes(pa.concat_tables([draft.rejected, selected.rejected]))

@@ -76,7 +76,7 @@ def read_catalogs(draft: Draft) -> None:
 
 @stage("merge", "read", _merge_plan, is_announced=True)
 def merge_catalogs(draft: Draft) -> None:
-    """Make the star catalogs one, with a row a star."""
+    """Merge the star catalogs into one table with one row per star."""
     spec = draft.spec
     neighbours = not spec.catalog.motions
     whole = merged_catalog(
@@ -108,7 +108,7 @@ def _flight_plan(spec: BuildSpec) -> str | None:
 
 @stage("flight terms", "read", _flight_plan)
 def apply_flight_terms(draft: Draft) -> None:
-    """Correct magnitudes and limits by what is known of the camera."""
+    """Correct magnitudes by observations in flight, and note what the exposure means."""
     draft.stars = with_observed(draft.stars, draft.spec.selection.observed)
     draft.note("apply_flight_terms", *draft.spec.exposure_notes)
 
@@ -122,18 +122,23 @@ def _span_plan(spec: BuildSpec) -> str:
 
 @stage("span", "read", _span_plan)
 def apply_span(draft: Draft) -> None:
-    """Compute how exact positions are at both ends of the span, and how far stars drift."""
+    """Compute the errors of positions at both ends of the span, and the drift of each star."""
     draft.stars = with_span(draft.stars, draft.spec.span_jyear)
 
 
-def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
-    """Check that every source has what the spec wants of it, and that every input is used."""
+def check_sources(spec: BuildSpec) -> None:
+    """Check that every source supplies what the spec takes from it."""
     for name in spec.catalog.motions:
         check_supplies(name, "motions", "catalog.motions")
     for name in spec.camera.response.photometry:
         check_supplies(name, "stars", "camera.response.photometry")
     for name in spec.products.crossmatch.catalogs if spec.products.crossmatch.enabled else ():
         check_supplies(name, "stars", "products.crossmatch.catalogs")
+
+
+def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
+    """Check the sources of a spec, and that the spec uses every input."""
+    check_sources(spec)
     for name in inputs:
         if name not in spec.sources:
             item = f'inputs["{name}"]'

@@ -58,7 +58,7 @@ def _motions_plan(spec: BuildSpec) -> str | None:
 
 @stage("motions", "read", _motions_plan, lambda spec: spec.catalog.motions)
 def supply_motions(draft: Draft) -> None:
-    """Give stars without a proper motion that of other catalogs, and move them to the epoch."""
+    """Take missing proper motions from other catalogs, and move the stars to the epoch."""
     spec, stars = draft.spec, draft.stars
     found = _Found.of(stars)
     for name in spec.catalog.motions:
@@ -91,7 +91,7 @@ def guide_star_motions(draft: Draft) -> list[Product]:
     lambda spec: "list where each motion is from" if spec.catalog.motions else None,
 )
 def list_motions(draft: Draft) -> None:
-    """List where the motions of guide stars are from, and count the stars of each catalog."""
+    """List the source of each guide star's motion, and count the stars per catalog."""
     (product,) = guide_star_motions(draft)
     draft.products.append(product)
     table = product.table
@@ -128,7 +128,7 @@ def _join_plan(what: str, names: Sequence[str]) -> str | None:
     lambda spec: spec.selection.variables.join,
 )
 def supply_amplitudes(draft: Draft) -> None:
-    """Give stars the amplitudes that other sources know."""
+    """Take the amplitudes of variable stars from other sources."""
     for name in draft.spec.selection.variables.join:
         _join(draft, "supply_amplitudes", read_amplitudes(name, draft.paths[name], draft.progress))
 
@@ -140,7 +140,7 @@ def supply_amplitudes(draft: Draft) -> None:
     lambda spec: spec.selection.doubles.join,
 )
 def supply_doubles(draft: Draft) -> None:
-    """Flag stars with the companions that other sources know."""
+    """Take the companions of double stars from other sources, and flag these stars."""
     for name in draft.spec.selection.doubles.join:
         _join(draft, "supply_doubles", read_wds(draft.paths[name], draft.progress))
 

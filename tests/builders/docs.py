@@ -194,7 +194,7 @@ def stages_page() -> str:
         NOTE + "# The stages of a build\n",
         "A build runs these stages in this order; one that has nothing to do for the spec is",
         "skipped. All work on one `Draft` (`starcat/pipeline/draft.py`). An estimate runs the",
-        "first two lists. `starcat build --explain SPEC` says what each will do for a spec, and",
+        "first two lists. `starcat build --explain SPEC` says what a stage will do for a spec, and",
         "what it reads; it needs no input files.\n",
     ]
     for title, stages in (
