@@ -1,6 +1,6 @@
 """The product ``motions``: where the proper motion of each guide star is from.
 
-The pipeline makes it where a spec joins motions of other catalogs (`starcat.pipeline.motions`).
+The pipeline makes it where a spec joins motions of other catalogs (`starcat.pipeline.supply`).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 `starcat.query.engine` starts it, writes requests to its standard input and reads replies from its
 standard output. It opens no file but those of the views, loads no extension, and its settings are
 locked before the first query. What it may take of the machine is limited by the operating system
-(`starcat.query.confinement`), so that a single call of a function cannot take more either.
+(`starcat.workers.confinement`), so that a single call of a function cannot take more either.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def _moc(text: str) -> Any:
 
 
 class Region(Section):
-    """The region of the sky that guide stars are in; of several, all hold."""
+    """Where guide stars are: in all regions given. Tiling and self-test cover the whole sky."""
 
     is_later = True
 
