@@ -108,7 +108,7 @@ def test_task_a_design_is_shared_by_its_link(page, browser, served):
         other.goto(link)
         settled(other)
         assert other.locator("#toml").input_value() == page.locator("#toml").input_value()
-        assert other.get_by_label("Name", exact=True).input_value() == "gaia-17-5deg"
+        assert other.get_by_label("Name", exact=True).input_value() == "gaia-12deg"
         other.reload()
         settled(other)
         assert other.get_by_label("Field across the width deg", exact=True).input_value() == "17.5"
@@ -166,7 +166,7 @@ def test_task_a_database_of_20_degrees_is_designed_and_built(page):
     assert page.clicks <= 4
     page.locator(".badge:is(.done, .failed)").wait_for(timeout=BUILD_MS)
     assert page.locator(".badge.done").count() == 1, page.locator("main").inner_text()
-    page.goto("/new?camera.fov_x_deg=20.0&name=gaia-20deg")
+    page.goto("/new?camera.fov_x_deg=20.0&name=gaia-12deg")
     settled(page)
     assert "is there already" in page.locator("[id='version-error']").inner_text()
     assert page.get_by_role("button", name="Build").is_disabled()
