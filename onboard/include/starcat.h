@@ -83,6 +83,7 @@ typedef STARCAT_REAL starcat_real;
   STARCAT_JOIN(name, STARCAT_MAX_CENTROIDS, STARCAT_MAX_STARS, STARCAT_REAL)
 #define starcat_get_camera STARCAT_SYMBOL(starcat_get_camera)
 #define starcat_set_default_options STARCAT_SYMBOL(starcat_set_default_options)
+#define starcat_list_neighbours STARCAT_SYMBOL(starcat_list_neighbours)
 #define starcat_open_image STARCAT_SYMBOL(starcat_open_image)
 #define starcat_identify_frame STARCAT_SYMBOL(starcat_identify_frame)
 #define starcat_track_frame STARCAT_SYMBOL(starcat_track_frame)
@@ -131,6 +132,20 @@ typedef enum {
 /* Flags of starcat_open_image. */
 #define STARCAT_SKIP_CRC 1u
 
+/* A neighbour of a star: separation, position angle and magnitude in small units. */
+typedef struct {
+  uint16_t apart;
+  uint8_t turn, magnitude;
+} starcat_neighbour;
+
+/* The neighbours of every star, in memory of the application: see starcat_list_neighbours. */
+typedef struct {
+  starcat_real radius_rad;      /* of the largest separation */
+  uint32_t capacity, n_stars;   /* neighbours that there is memory for; stars that it was made of */
+  uint32_t *first;              /* one more than there are stars */
+  starcat_neighbour *neighbour; /* `capacity` of them */
+} starcat_neighbours;
+
 /* An image in place. Filled by starcat_open_image; its pointers point into the image. */
 typedef struct {
   const uint8_t *bytes;
@@ -147,6 +162,8 @@ typedef struct {
   const uint16_t *radii;          /* null for the method pyramid */
   const char *name;               /* up to 96 bytes, filled with zeros */
   const uint8_t *manifest_sha256; /* 32 bytes */
+  const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
+                                         * votes */
 } starcat_image;
 
 /* A camera with square pixels; Brown's distortion as in OpenCV. Its corners are up to 89.4 degrees
@@ -226,6 +243,13 @@ starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_
  * STARCAT_E_CRC `bad_block` is the first one that is damaged. */
 starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
                                    uint32_t *bad_block);
+
+/* List the neighbours of every star of an image within `radius_rad` of `table`, about half of the
+ * diagonal of the field. If `capacity` is too small that is STARCAT_E_CAPACITY, and first[n_stars]
+ * is the number that is needed; `neighbour` may be null where `capacity` is 0. Set `neighbours` of
+ * the image to the table, and frames that triangles do not solve are solved by votes. */
+starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
+                                       starcat_neighbours *table);
 
 /* Identify the stars of a frame without any prior knowledge. */
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,

@@ -25,6 +25,39 @@
 #define LARGEST_QUATERNION R(1e6)
 #define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
+#define STEPS_BEFORE_VOTES 150000u
+#define STEPS_AFTER_VOTES 6000000u
+
+static void limit_steps(const starcat_call *call, uint32_t most) {
+  call->own->steps_left = call->own->steps_left < most ? call->own->steps_left : most;
+}
+
+/* Look triangles up; where votes can be counted, only the first ones, then the votes, then in a
+ * frame of more centroids than have a vote the triangles again. */
+static void search_sky(starcat_call *call) {
+  const starcat_look_up look_up = call->image->method == STARCAT_TRIANGLE
+                                      ? starcat_look_up_triangle
+                                      : starcat_look_up_pyramid;
+  const starcat_agreement *best = &call->work->best;
+  const uint32_t steps = call->own->steps_left;
+  if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
+    starcat_search_triangles(call, look_up);
+    return;
+  }
+  limit_steps(call, STEPS_BEFORE_VOTES);
+  const uint32_t limit = call->own->steps_left;
+  starcat_search_triangles(call, look_up);
+  const int is_complete = call->own->steps_left > 0u;
+  call->own->steps_left += steps - limit;
+  if (!(best->log_chance <= call->log_certain)) {
+    starcat_search_votes(call);
+    if (!is_complete && (call->own->count > STARCAT_MAX_VOTERS) &&
+        !(best->log_bound <= STARCAT_LOG_LIKELY)) {
+      limit_steps(call, STEPS_AFTER_VOTES);
+      starcat_search_triangles(call, look_up);
+    }
+  }
+}
 
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
                                       const starcat_options *options, const starcat_frame *frame,
@@ -35,8 +68,7 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
   if (status != STARCAT_OK) {
     return status;
   }
-  starcat_search_triangles(&call, image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle
-                                                                    : starcat_look_up_pyramid);
+  search_sky(&call);
   return starcat_end_call(&call, options, result);
 }
 

@@ -247,5 +247,6 @@ starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_
   image->kvector = (const uint32_t *)(const void *)found.at[KVECTOR];
   image->features = found.at[image->method == STARCAT_TRIANGLE ? TRIANGLES : PAIRS];
   image->radii = (const uint16_t *)(const void *)found.at[RADII];
+  image->neighbours = NULL;
   return STARCAT_OK;
 }

@@ -40,6 +40,9 @@ except ImportError:  # the wheel was built without a compiler
 MAX_STEPS = 300_000_000
 """Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
 
+MAX_NEIGHBOURS = 16_000_000
+"""Neighbours of stars, four bytes each, up to which frames are solved by votes."""
+
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
@@ -161,6 +164,8 @@ class CEngine:
                 f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
             )
         own = np.arange(int(self.image.n_stars)) if rows is None else rows
+        self._neighbours = _neighbours(self.image, database.camera.radius_rad)
+        self.image.neighbours = self._neighbours[0]
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
         self.directions = _double_pointer(directions)
         self.database = database
@@ -168,6 +173,22 @@ class CEngine:
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
         """Return what asks the library about frames of a camera."""
         return Search(self, camera, settings, fov_error)
+
+
+def _neighbours(image: Any, radius_rad: float) -> tuple[Any, ...]:
+    """Return the table of the neighbours of an image's stars, and what has to be kept with it."""
+    ffi, lib = _onboard.ffi, _onboard.lib
+    count = int(image.n_stars)
+    first = ffi.new("uint32_t[]", count + 1)
+    table = ffi.new("starcat_neighbours *", [radius_rad, 0, 0, first, ffi.NULL])
+    lib.starcat_list_all_neighbours(image, table)
+    needed = first[count]
+    if not needed or needed > MAX_NEIGHBOURS:
+        return (ffi.NULL,)
+    table.neighbour = neighbour = ffi.new("starcat_neighbour[]", needed)
+    table.capacity = needed
+    lib.starcat_list_all_neighbours(image, table)
+    return table, first, neighbour
 
 
 class Search:

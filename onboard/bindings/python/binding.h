@@ -1,7 +1,18 @@
 /* What Python uses of starcat.h and many.h, for cffi. The compiler checks it against both. */
 typedef struct {
+  uint16_t apart;
+  uint8_t turn, magnitude;
+} starcat_neighbour;
+typedef struct {
+  double radius_rad;
+  uint32_t capacity, n_stars;
+  uint32_t *first;
+  starcat_neighbour *neighbour;
+} starcat_neighbours;
+typedef struct {
   uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
   uint32_t grid_bands, grid_sectors;
+  const starcat_neighbours *neighbours;
   ...;
 } starcat_image;
 typedef struct {
@@ -46,6 +57,7 @@ typedef struct {
 #define STARCAT_MAX_STARS ...
 const char *starcat_version(void);
 int starcat_open_image(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
+int starcat_list_all_neighbours(const starcat_image *image, starcat_neighbours *table);
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
                          const void *magnitudes, const void *sigma_px, const void *q_prior,
                          double uncertainty_rad, starcat_memory *memory);

@@ -4,6 +4,7 @@
  * SPDX-License-Identifier: MIT
  */
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 #include <time.h>
 
@@ -82,6 +83,14 @@ static int identify_copied(const starcat_search *search, uint32_t count, const d
     tell_answer(result, answer);
   }
   return answer->status;
+}
+
+int starcat_list_all_neighbours(const starcat_image *image, starcat_neighbours *table) {
+  starcat_workspace *work = malloc(sizeof *work);
+  const int status =
+      work == NULL ? STARCAT_E_CAPACITY : starcat_list_neighbours(image, work, table);
+  free(work);
+  return status;
 }
 
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,

@@ -43,6 +43,9 @@ typedef struct {
   starcat_result result;
 } starcat_memory;
 
+/* List the neighbours of every star of an image, as starcat_list_neighbours does. */
+int starcat_list_all_neighbours(const starcat_image *image, starcat_neighbours *table);
+
 /* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
  * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
  * the status that the answer in the memory has too. */
