@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
+from starcat.matcher.methods import votes
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import fit_by_weights, focal_length_error_px
@@ -14,6 +16,9 @@ from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
+
+STEPS_BEFORE_VOTES = 2000
+"""Steps of comparing patterns before votes are counted."""
 
 
 def solve(
@@ -54,13 +59,45 @@ def _search(
         if prior is not None:
             search_near(prior, observation, database, best, whole_sky)
             return None
-        for candidates in whole_sky:
-            verify_candidates(candidates, observation, database, best)
-            if best.is_certain:
-                break
+        _search_sky(whole_sky, observation, database, best)
     except BudgetSpentError as spent:
         return spent.limit
     return None
+
+
+def _search_sky(
+    patterns: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
+) -> None:
+    """Try the patterns of the method; where the first ones do not solve a frame, votes."""
+    if not votes.serve(observation, database):
+        _try(patterns, observation, database, best)
+        return
+    if _try(patterns, observation, database, best, STEPS_BEFORE_VOTES):
+        return
+    for reference in range(min(len(observation), votes.MAX_REFERENCES)):
+        if best.is_likely:
+            return
+        proposed = votes.candidates(reference, observation, database)
+        if _try(proposed, observation, database, best):
+            return
+    if len(observation) > votes.MAX_VOTERS and not best.is_likely:
+        _try(patterns, observation, database, best)
+
+
+def _try(
+    proposed: Iterator[Candidates],
+    observation: Observation,
+    database: Database,
+    best: BestOf,
+    steps: float = math.inf,
+) -> bool:
+    """Try candidates until one is certain, or so many steps are taken; return whether one is."""
+    most = observation.budget.steps + steps
+    for candidates in proposed:
+        verify_candidates(candidates, observation, database, best)
+        if best.is_certain or observation.budget.steps >= most:
+            break
+    return best.is_certain
 
 
 def result_of_search(

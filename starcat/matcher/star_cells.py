@@ -53,6 +53,15 @@ class StarCells:
 
     def has_star(self, directions: Directions, reach_rad: float) -> Mask:
         """Return which directions have a star within reach."""
+        found = np.zeros(len(directions), dtype=bool)
+        found[self.near(directions, reach_rad)[0]] = True
+        return found
+
+    def near(self, directions: Directions, reach_rad: float) -> tuple[Rows, Rows]:
+        """Return each pair of a direction and a star within reach, as rows of both.
+
+        The reach is a chord: in units of the sphere's radius.
+        """
         if reach_rad > self.margin:
             raise ValueError(f"reach_rad is {reach_rad}; these cells allow {self.margin}")
         key = _keys(directions, self.side)
@@ -62,9 +71,7 @@ class StarCells:
         query, star = there[run], self.rows[row]
         offset = directions[query] - self.directions[star]
         near = np.einsum("ij,ij->i", offset, offset) <= reach_rad * reach_rad
-        found = np.zeros(len(directions), dtype=bool)
-        found[query[near]] = True
-        return found
+        return query[near], star[near]
 
 
 def cells_for(database: Database, reach_rad: float) -> StarCells:

@@ -72,6 +72,9 @@ FOCAL_MARGIN = 0.02
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
 
+LIKELY = 1e-3
+"""False-match probability below which no other attitude is looked for with votes."""
+
 AT_ONCE = 256
 """Number of candidates whose agreeing centroids are counted together."""
 
@@ -128,6 +131,11 @@ class BestOf:
     def is_certain(self) -> bool:
         """Whether the search is over."""
         return self.found is not None and self.found.false_match_probability <= self.certain
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether the attitude is known, although its stars may not make it certain."""
+        return self.found is not None and self.found.chance <= LIKELY
 
     def offer(self, found: Agreement) -> None:
         """Keep an agreement if it is better than the best one so far."""

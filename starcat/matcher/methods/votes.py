@@ -1,0 +1,271 @@
+"""Votes for how a frame is turned about one of its centroids, for frames that triangles do not solve.
+
+Where centroids are far from their places, or most of them are false, a triangle of centroids is like
+thousands of triangles of stars, and hardly any triangle is of stars alone. The stars around the right
+star of a centroid, the reference, agree on how the frame is turned about it: each of them, with
+a centroid as far away and of like magnitude, votes for the difference of their position angles. The
+stars around another star agree on nothing. Fu et al. 2025 compare such patterns around a star.
+
+``onboard/src/votes.c`` follows the same rules with the same units, so that both propose the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Directions, Rows
+from starcat.geometry.sphere import separation
+from starcat.matcher.database import Database
+from starcat.matcher.observation import MAG_DEVIATIONS, Candidates, Observation
+from starcat.matcher.settings import LOOKUP, TriangleOrder
+from starcat.matcher.star_cells import cells_for, rows_between
+
+MAX_REFERENCES = 12
+"""Centroids that serve as the reference, in the order of the observation."""
+
+MAX_VOTERS = 32
+"""Centroids around a reference, the nearest ones."""
+
+MAX_KEPT = 6
+"""Stars of one reference that are proposed."""
+
+TURN = 256
+"""Units of position angles in a turn."""
+
+BINS = 64
+"""Bins of the turn; a star is judged by two that are side by side."""
+
+PER_BIN = TURN // BINS
+"""Units of position angles in a bin."""
+
+MIN_VOTES = 3
+"""Votes of a star that is proposed."""
+
+MIN_EXPECTED = 0.3
+"""Votes that two bins have by chance at least."""
+
+APART = 65535.0
+"""Units of the largest separation of neighbours."""
+
+PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
+"""Units of a magnitude, the magnitude of the first one, and the unit of an unknown magnitude."""
+
+MAX_NEIGHBOURS = 16_000_000
+"""Neighbours of all stars together, up to which there are votes."""
+
+STARS_OF_LOOKUP = 100
+"""Stars whose votes take the time of looking one pattern up."""
+
+AT_ONCE = 512
+"""Stars whose neighbours are looked for together."""
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The stars around every star of a database, in small units."""
+
+    radius_rad: float
+    offsets: NDArray[np.int64]  # those of star s are from offsets[s] to offsets[s + 1]; shape (N + 1,)
+    star: NDArray[np.int32]  # row of the database; shape (M,)
+    apart: NDArray[np.uint16]  # separation, the radius over `APART`; shape (M,)
+    turn: NDArray[np.uint8]  # position angle, a turn over 256; shape (M,)
+    magnitude: NDArray[np.uint8]  # in units from `BRIGHTEST` on; `UNKNOWN` where it is not known
+
+
+@dataclass(frozen=True)
+class Voters:
+    """The centroids around a reference, the nearest first, in the units of `Neighbours`."""
+
+    centroids: Rows  # rows of the observation; shape (V,)
+    nearest: NDArray[np.int64]  # separations from the reference that their stars may have
+    farthest: NDArray[np.int64]
+    brightest: NDArray[np.int64]  # magnitudes that their stars may have
+    faintest: NDArray[np.int64]
+    turn: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.centroids)
+
+
+VOTING = ("triangle", "pyramid")
+"""Methods whose frames are solved by votes if their own patterns do not solve them soon."""
+
+
+def serve(observation: Observation, database: Database) -> bool:
+    """Return whether votes may be counted: as in C, with the default search, at a known scale."""
+    settings, count = observation.settings, len(database.mag)
+    expected = (count * math.sin(0.5 * database.camera.radius_rad)) ** 2
+    is_own = settings.method in VOTING and settings.selection == TriangleOrder()
+    return is_own and not observation.fov_error and expected <= MAX_NEIGHBOURS
+
+
+def candidates(
+    reference: int, observation: Observation, database: Database
+) -> Iterator[Candidates]:
+    """Propose the stars that have the most votes, each with the centroids that voted for it."""
+    table = database.cached(neighbours, database.camera.radius_rad)
+    voters = voters_of(reference, observation, table.radius_rad)
+    compatible = observation.compatible(database.mag)
+    stars = np.arange(len(database.mag))
+    if compatible is not None:
+        stars = compatible[reference].nonzero()[0]
+    observation.budget.spend(LOOKUP * (1 + len(stars) // STARS_OF_LOOKUP))
+    for star, turn in leaders(stars, voters, table):
+        proposed = _agreeing(reference, star, turn, voters, observation, database, table)
+        if proposed is not None:
+            yield proposed
+
+
+def neighbours(database: Database, radius_rad: float) -> Neighbours:
+    """Return the neighbours of every star within a separation."""
+    u, cells = database.directions, cells_for(database, radius_rad)
+    reach = 2.0 * math.sin(0.5 * radius_rad)
+    counts, stars, aparts, turns = [], [], [], []
+    for first in range(0, len(u), AT_ONCE):
+        centre = u[first : first + AT_ONCE]
+        own, near = cells.near(centre, reach)
+        other = near != own + first
+        own, near = own[other], near[other]
+        counts.append(np.bincount(own, minlength=len(centre)))
+        stars.append(near.astype(np.int32))
+        aparts.append(_apart_units(separation(centre[own], u[near]), radius_rad).astype(np.uint16))
+        turns.append(_turn_units(position_angle(centre[own], u[near])).astype(np.uint8))
+    star = np.concatenate(stars)
+    return Neighbours(
+        radius_rad,
+        np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
+        star,
+        np.concatenate(aparts),
+        np.concatenate(turns),
+        _magnitude_units(np.asarray(database.mag, dtype=np.float64)).astype(np.uint8)[star],
+    )
+
+
+def voters_of(reference: int, observation: Observation, radius_rad: float) -> Voters:
+    """Return the centroids around a reference that are far enough to have a position angle."""
+    error = observation.side_tolerance_rad
+    apart = observation.separation_rad[reference]
+    votes = (apart >= 2.0 * error) & (apart - error <= radius_rad)
+    votes[reference] = False
+    rows = votes.nonzero()[0]
+    rows = rows[np.argsort(apart[rows], kind="stable")][:MAX_VOTERS]
+    bright, faint = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), UNKNOWN - 1)
+    if observation.mag is not None and observation.settings.noise_mag is not None:
+        reach, mag = MAG_DEVIATIONS * observation.settings.noise_mag, observation.mag[rows]
+        known = np.isfinite(mag)
+        bright = np.where(known, _magnitude_units(mag - reach), bright)
+        faint = np.where(known, _magnitude_units(mag + reach), faint)
+    body = observation.body
+    return Voters(
+        rows,
+        _apart_units(apart[rows] - error, radius_rad),
+        _apart_units(apart[rows] + error, radius_rad),
+        bright,
+        faint,
+        _turn_units(position_angle(body[np.full(len(rows), reference)], body[rows])),
+    )
+
+
+def leaders(stars: Rows, voters: Voters, table: Neighbours) -> list[tuple[int, int]]:
+    """Return the stars with more votes than chance would give, and their turns, the best first."""
+    run, entry = rows_between(table.offsets[stars], table.offsets[stars + 1])
+    order = np.argsort(table.apart[entry], kind="stable")
+    run, entry = run[order], entry[order]
+    apart, magnitude = table.apart[entry], table.magnitude[entry]
+    turn = table.turn[entry].astype(np.int64)
+    voted = np.zeros(len(stars) * BINS, dtype=np.uint32)
+    total = np.zeros(len(stars), dtype=np.int64)
+    first = np.searchsorted(apart, voters.nearest, side="left")
+    stop = np.searchsorted(apart, voters.farthest, side="right")
+    for n in range(len(voters)):
+        part = slice(first[n], stop[n])
+        like = (magnitude[part] >= voters.brightest[n]) & (magnitude[part] <= voters.faintest[n])
+        like |= magnitude[part] == UNKNOWN
+        owner = run[part][like]
+        bins = (turn[part][like] - voters.turn[n]) % TURN // PER_BIN
+        voted[owner * BINS + bins] |= np.uint32(1 << n)
+        total += np.bincount(owner, minlength=len(stars))
+    pairs = voted.reshape(len(stars), BINS)
+    pairs = pairs | np.roll(pairs, -1, axis=1)
+    votes = np.bitwise_count(pairs)
+    best = votes.argmax(axis=1)
+    most = votes[np.arange(len(stars)), best].astype(np.float64)
+    expected = 2.0 / BINS * total + MIN_EXPECTED
+    rows = np.flatnonzero((most >= MIN_VOTES) & (most > expected))
+    most, expected = most[rows], expected[rows]
+    weight = most * (np.log(most / expected) - 1.0) + expected
+    rows = rows[np.argsort(-weight, kind="stable")[:MAX_KEPT]]
+    return list(zip(stars[rows].tolist(), (PER_BIN * best[rows]).tolist(), strict=True))
+
+
+def _agreeing(
+    reference: int,
+    star: int,
+    turn: int,
+    voters: Voters,
+    observation: Observation,
+    database: Database,
+    table: Neighbours,
+) -> Candidates | None:
+    """Return a star of the reference with the pairs that voted for it and agree with one of them."""
+    entry = slice(*table.offsets[star : star + 2])
+    apart = table.apart[entry, None]
+    votes = (apart >= voters.nearest) & (apart <= voters.farthest)
+    votes &= (table.turn[entry, None] - voters.turn - turn) % TURN < 2 * PER_BIN
+    near = table.star[entry]
+    compatible = observation.compatible(database.mag[near])
+    if compatible is not None:
+        votes &= compatible[voters.centroids].T
+    place, n = votes.nonzero()
+    if not len(n):
+        return None
+    near, centroids = near[place], voters.centroids[n]
+    body, u = observation.body, database.directions
+    seen = position_angle(np.broadcast_to(body[reference], (len(n), 3)), body[centroids])
+    known = position_angle(np.broadcast_to(u[star], (len(n), 3)), u[near])
+    middle = (turn + PER_BIN - 0.5) / TURN * math.tau
+    own = np.remainder(known - seen - middle + math.pi, math.tau) - math.pi
+    error = observation.side_tolerance_rad / np.sin(observation.separation_rad[reference, centroids])
+    agree = np.abs(own[:, None] - own) <= error[:, None]  # votes in rows, what they agree with
+    best = int(agree.sum(axis=0).argmax())
+    kept = agree[:, best]
+    return Candidates(
+        np.concatenate([[reference], centroids[kept]])[None, :],
+        np.concatenate([[star], near[kept]])[None, :],
+    )
+
+
+def position_angle(centre: Directions, other: Directions) -> Array:
+    """Return the position angles of directions at others, radians, from an axis of the centre's own.
+
+    Both of shape (N, 3). Only differences at one centre have a meaning.
+    """
+    x, y, z = centre.T
+    none = np.zeros(len(centre))
+    polar = z * z > 0.5
+    # The cross products of two axes with the centre; the second one where it is near the first.
+    east = np.where(polar, [z, none, -x], [-y, x, none]).T
+    east /= np.linalg.norm(east, axis=1)[:, None]
+    north = np.cross(centre, east)
+    return np.asarray(
+        np.arctan2(np.einsum("ij,ij->i", east, other), np.einsum("ij,ij->i", north, other))
+    )
+
+
+def _turn_units(angle_rad: Array) -> NDArray[np.int64]:
+    return np.asarray((TURN / math.tau * angle_rad + TURN + 0.5).astype(np.int64) % TURN)
+
+
+def _apart_units(apart_rad: Array, radius_rad: float) -> NDArray[np.int64]:
+    units = np.clip(APART * apart_rad / radius_rad + 0.5, 0.0, APART)
+    return np.asarray(units.astype(np.int64))
+
+
+def _magnitude_units(mag: Array) -> NDArray[np.int64]:
+    units = np.clip(PER_MAGNITUDE * (mag - BRIGHTEST) + 0.5, 0.0, UNKNOWN - 1.0)
+    return np.asarray(np.where(np.isnan(mag), UNKNOWN, np.nan_to_num(units)).astype(np.int64))
