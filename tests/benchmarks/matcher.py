@@ -97,12 +97,21 @@ class Row:
 
 def make_frames(database: Database, count: int, path: Path) -> dict[str, list[SimulatedFrame]]:
     """Simulate both kinds of frames and write what the identifiers get of them."""
-    camera, made, given = database.camera, {}, {}
-    for kind, noise in KINDS.items():
-        u, mags = database.directions, database.mag
-        made[kind] = list(simulate_frames(u, camera, count, noise, SEED, mags))
+    camera, u, mags = database.camera, database.directions, database.mag
+    made = {
+        kind: list(simulate_frames(u, camera, count, noise, SEED, mags))
+        for kind, noise in KINDS.items()
+    }
+    write_frames(database, made, path)
+    return made
+
+
+def write_frames(database: Database, made: dict[str, list[SimulatedFrame]], path: Path) -> None:
+    """Write what the identifiers get of some kinds of frames."""
+    camera, given = database.camera, {}
+    for kind, frames in made.items():
         px, mag = [], []
-        for frame in made[kind]:
+        for frame in frames:
             order = np.argsort(frame.mag, kind="stable")
             px.append(frame.centroids_px[order])
             mag.append(frame.mag[order])
@@ -116,7 +125,7 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Si
                     np.radians(peers.PRIOR_DEG) * generator.uniform() ** (1.0 / 3.0),
                     generator,
                 )
-                for frame in made[kind]
+                for frame in frames
             ]
         ).reshape(-1, 4)
         given[f"{kind}_parts"] = np.random.default_rng(SEED).uniform(-1.0, 1.0, len(px))
@@ -127,7 +136,6 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Si
         camera=[camera.width_px, camera.height_px, camera.fov_x_deg],
         **given,
     )
-    return made
 
 
 def count_answers(found: np.ndarray, truth: np.ndarray) -> list[int]:
@@ -142,16 +150,7 @@ def drive(
     who: str, driver: str, frames: Path, truth: np.ndarray, options: dict[str, Any] | None = None
 ) -> Row:
     """Let one identifier answer in a process of its own."""
-    answers, python = frames.with_name("answers.npz"), sys.executable
-    if driver in peers.REQUIREMENTS:
-        try:
-            python = peers.environment(driver)
-        except (OSError, RuntimeError) as error:
-            raise LackingError(f"{driver} from PyPI: {error}") from error
-    given = str(frames), str(answers), json.dumps(options or {})
-    peers.run([python, peers.__file__, driver, *given])
-    with np.load(answers) as file:
-        found = dict(file)
+    found = answers_of(driver, frames, options)
     counts, milliseconds, inside_us = {}, {}, {}
     for kind in KINDS:
         matrices, ms = found[f"{kind}_matrices"], found[f"{kind}_seconds"] * 1e3
@@ -161,6 +160,22 @@ def drive(
         inside_us[kind] = [float(np.percentile(inside, part)) for part in (50, 95, 99, 100)]
     facts = {key: float(found[key]) for key in ("build_s", "database_mb", "peak_mib")}
     return Row(who, str(found["version"]), counts, milliseconds, inside_us, **facts)
+
+
+def answers_of(
+    driver: str, frames: Path, options: dict[str, Any] | None = None
+) -> dict[str, np.ndarray]:
+    """Return what one identifier writes of frames, in a process of its own."""
+    answers, python = frames.with_name("answers.npz"), sys.executable
+    if driver in peers.REQUIREMENTS:
+        try:
+            python = peers.environment(driver)
+        except (OSError, RuntimeError) as error:
+            raise LackingError(f"{driver} from PyPI: {error}") from error
+    given = str(frames), str(answers), json.dumps(options or {})
+    peers.run([python, peers.__file__, driver, *given])
+    with np.load(answers) as file:
+        return dict(file)
 
 
 def asked() -> dict[str, dict[str, Any]]:

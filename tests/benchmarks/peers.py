@@ -359,7 +359,8 @@ def main(name: str, frames: str, answers: str, options: str) -> None:
     sky = Sky(given["directions"], given["mag"], int(width), int(height), fov_deg)
     driver = DRIVERS[name](sky, **json.loads(options))
     written = {}
-    for kind in KINDS:
+    kinds = [key.removesuffix("_starts") for key in given if key.endswith("_starts")]
+    for kind in kinds:
         written |= solve_frames(driver, given, kind)
     facts = {"build_s": driver.build_s, "database_mb": driver.database_bytes / 1e6}
     own = version(DISTRIBUTIONS.get(name, name))

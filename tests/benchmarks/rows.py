@@ -110,8 +110,8 @@ def need(*packages: str) -> None:
             raise LackingError(f"the package {name}: pip install {name}")
 
 
-def database(name: str, folder: Path) -> Built:
-    """Build a preset from the catalogs in $STARCAT_CATALOGS."""
+def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> Built:
+    """Build a preset, with changes, from the catalogs in $STARCAT_CATALOGS."""
     # Not above: a benchmark that lacks something says so without waiting for them.
     from starcat.pipeline.build import build_database
     from starcat.specs.reading import preset
@@ -120,7 +120,7 @@ def database(name: str, folder: Path) -> Built:
     for path in (path for paths in inputs.values() for path in paths):
         if not path.is_file():
             raise LackingError(f"{path.name} in {path.parent}; set STARCAT_CATALOGS to its folder")
-    return build_database(preset(name), inputs, folder, workers=1)
+    return build_database(preset(name, changes), inputs, folder, workers=1)
 
 
 def fresh(*command: object, variables: Mapping[str, str] | None = None) -> str:
