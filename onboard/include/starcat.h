@@ -158,10 +158,10 @@ typedef struct {
   const int64_t *star_ids;
   const uint32_t *grid;
   const uint32_t *kvector;
-  const void *features;           /* triangles or pairs: rows of uint16_t or uint32_t */
-  const uint16_t *radii;          /* null for the method pyramid */
-  const char *name;               /* up to 96 bytes, filled with zeros */
-  const uint8_t *manifest_sha256; /* 32 bytes */
+  const void *features;                 /* triangles or pairs: rows of uint16_t or uint32_t */
+  const uint16_t *radii;                /* null for the method pyramid */
+  const char *name;                     /* up to 96 bytes, filled with zeros */
+  const uint8_t *manifest_sha256;       /* 32 bytes */
   const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
                                          * votes */
 } starcat_image;

@@ -35,9 +35,8 @@ static void limit_steps(const starcat_call *call, uint32_t most) {
 /* Look triangles up; where votes can be counted, only the first ones, then the votes, then in a
  * frame of more centroids than have a vote the triangles again. */
 static void search_sky(starcat_call *call) {
-  const starcat_look_up look_up = call->image->method == STARCAT_TRIANGLE
-                                      ? starcat_look_up_triangle
-                                      : starcat_look_up_pyramid;
+  const starcat_look_up look_up =
+      call->image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle : starcat_look_up_pyramid;
   const starcat_agreement *best = &call->work->best;
   const uint32_t steps = call->own->steps_left;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {

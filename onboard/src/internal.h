@@ -39,7 +39,8 @@
   R(2.0) /* of the centroids within a smaller reach, over its area's share */
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
-#define STARCAT_LOG_LIKELY R(-6.907755278982137) /* of 1e-3: the attitude is known, if not certain */
+#define STARCAT_LOG_LIKELY \
+  R(-6.907755278982137)               /* of 1e-3: the attitude is known, if not certain */
 #define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less are the same */
 #define STARCAT_RIVAL_REACH R(4.0)    /* how near a rival is to a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */

@@ -26,8 +26,8 @@
 #define BINS 64u
 #define MAX_KEPT 6u /* stars of one reference that are tried */
 #define MIN_VOTES 3u
-#define EXPECTED_AT_LEAST R(0.3)         /* votes of two bins by chance, where there are few */
-#define STEPS_OF_STAR 32u                /* of counting the votes for a star */
+#define EXPECTED_AT_LEAST R(0.3) /* votes of two bins by chance, where there are few */
+#define STEPS_OF_STAR 32u        /* of counting the votes for a star */
 
 /* The units of neighbours: of separations, the largest one over this; of position angles, a turn
  * over 256; of magnitudes, a sixteenth from the brightest one on. */
@@ -44,7 +44,9 @@
 
 /* A centroid around the reference, in the units of neighbours. */
 typedef struct {
-  uint32_t centroid, nearest, farthest, brightest, faintest, turn;
+  uint16_t centroid, nearest, farthest;
+  uint8_t brightest, faintest, turn;
+  real sine; /* of the separation */
 } voter;
 
 typedef struct {
@@ -59,6 +61,12 @@ typedef struct {
   uint32_t row, turn;
   real weight;
 } leader;
+
+static void copy_vector(const real from[3], real to[3]) {
+  to[0] = from[0];
+  to[1] = from[1];
+  to[2] = from[2];
+}
 
 /* Two directions at right angles to a direction and to each other. */
 static void make_axes(const real u[3], real axes[2][3]) {
@@ -170,15 +178,16 @@ static void list_voters(const starcat_call *call, uint32_t reference, surroundin
     }
     apart[at] = own;
     voter *v = s->voters + at;
-    v->centroid = i;
-    v->nearest = find_apart(own - error, radius_rad);
-    v->farthest = find_apart(own + error, radius_rad);
-    v->turn = find_turn(axes, w->body[i]);
+    v->centroid = (uint16_t)i;
+    v->nearest = (uint16_t)find_apart(own - error, radius_rad);
+    v->farthest = (uint16_t)find_apart(own + error, radius_rad);
+    v->turn = (uint8_t)find_turn(axes, w->body[i]);
+    v->sine = STARCAT_SIN(own);
     v->brightest = 0;
     v->faintest = UNKNOWN - 1u;
     if ((call->mag_reach > R(0.0)) && (w->magnitude[i] < STARCAT_UNKNOWN_MAGNITUDE)) {
-      v->brightest = find_magnitude(w->magnitude[i] - call->mag_reach);
-      v->faintest = find_magnitude(w->magnitude[i] + call->mag_reach);
+      v->brightest = (uint8_t)find_magnitude(w->magnitude[i] - call->mag_reach);
+      v->faintest = (uint8_t)find_magnitude(w->magnitude[i] + call->mag_reach);
     }
   }
   for (uint32_t ring = 0; ring < RINGS; ring++) {
@@ -200,7 +209,7 @@ static void list_voters(const starcat_call *call, uint32_t reference, surroundin
 static uint32_t count_bits(uint32_t bits) {
   bits -= bits >> 1 & 0x55555555u;
   bits = (bits & 0x33333333u) + (bits >> 2 & 0x33333333u);
-  return ((bits + (bits >> 4) & 0x0f0f0f0fu) * 0x01010101u) >> 24;
+  return (((bits + (bits >> 4)) & 0x0f0f0f0fu) * 0x01010101u) >> 24;
 }
 
 /* Count the centroids that vote for a star. Returns 0 if the budget is used up. */
@@ -209,7 +218,8 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
   uint32_t voted[BINS] = {0}, total = 0, most = 0; /* a bit for each centroid */
   uint8_t votes[BINS] = {0};
   const uint32_t first = table->first[star->row], stop = table->first[star->row + 1u];
-  if (!starcat_spend_steps(call, STEPS_OF_STAR + (stop > first ? stop - first : 0u) * (1u + s->most / 2u))) {
+  if (!starcat_spend_steps(
+          call, STEPS_OF_STAR + (stop > first ? stop - first : 0u) * (1u + s->most / 2u))) {
     return 0;
   }
   for (uint32_t at = first; (at < stop) && (at < table->capacity); at++) {
@@ -217,7 +227,8 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
     const uint32_t ring = b.apart / PER_RING, end = s->stop[ring];
     for (uint32_t n = s->first[ring]; n < end; n++) {
       const voter *v = s->voters + n;
-      const uint32_t is_near = (uint32_t)(b.apart >= v->nearest) & (uint32_t)(b.apart <= v->farthest);
+      const uint32_t is_near =
+          (uint32_t)(b.apart >= v->nearest) & (uint32_t)(b.apart <= v->farthest);
       const uint32_t is_like =
           ((uint32_t)(b.magnitude >= v->brightest) & (uint32_t)(b.magnitude <= v->faintest)) |
           (uint32_t)(b.magnitude == UNKNOWN);
@@ -246,97 +257,94 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
   return 1;
 }
 
-/* The pairs of a centroid and a star that voted for a star of the reference. */
+/* A pair of a centroid and a star that voted: how the frame is turned by it, and the error of that. */
 typedef struct {
-  uint32_t count;
-  real body[STARCAT_MAX_VOTERS][3], icrs[STARCAT_MAX_VOTERS][3];
-  real turn[STARCAT_MAX_VOTERS], error[STARCAT_MAX_VOTERS]; /* of the frame about the reference, radians */
-} ballot;
+  uint16_t voter, near;
+  real turn_rad, error_rad;
+} vote;
 
-/* List the pairs that voted for a star and its bins. Returns 0 if the budget is used up. */
-static int list_votes(const starcat_call *call, const surroundings *s, const leader *star,
-                      const real centre[3], ballot *votes) {
+/* How a frame is turned about the reference if a centroid is a star, from the middle of two bins. */
+static real measure_turn(real own[2][3], const real body[3], real axes[2][3], const real icrs[3],
+                         uint32_t bin_turn) {
+  const real x = starcat_dot(own[0], body), y = starcat_dot(own[1], body);
+  const real p = starcat_dot(axes[0], icrs), q = starcat_dot(axes[1], icrs);
+  const real middle = ((real)(bin_turn + PER_BIN) - R(0.5)) / TURNS;
+  const real c = STARCAT_COS(middle), t = STARCAT_SIN(middle);
+  const real sine = p * y - q * x, cosine = p * x + q * y;
+  return STARCAT_ATAN2(sine * c - cosine * t, cosine * c + sine * t);
+}
+
+/* List the pairs that voted for a star. Returns their number; 0 if the budget is used up. */
+static uint32_t list_votes(const starcat_call *call, const surroundings *s, const leader *star,
+                           const real centre[3], vote *votes) {
   starcat_workspace *w = call->work;
   const real radius_rad = call->image->neighbours->radius_rad;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   real axes[2][3], own[2][3];
-  const uint32_t near =
+  uint32_t count = 0;
+  const uint32_t n_near =
       starcat_gather_stars(call, centre, STARCAT_COS(radius_rad), STARCAT_SIN(radius_rad),
                            STARCAT_MAX_STARS, w->near_row, w->near_icrs);
-  votes->count = 0;
-  if ((near > STARCAT_MAX_STARS) || !starcat_spend_steps(call, near * s->count)) {
+  if ((n_near > STARCAT_MAX_STARS) || !starcat_spend_steps(call, n_near * (s->count + 1u))) {
     return 0;
   }
   make_axes(centre, axes);
   make_axes(w->body[s->reference], own);
-  for (uint32_t k = 0; k < near; k++) {
-    const uint32_t apart = find_apart(
-        starcat_angle_of_chord(starcat_chord_square(centre, w->near_icrs[k])), radius_rad);
+  for (uint32_t k = 0; k < n_near; k++) {
+    const real chord = starcat_chord_square(centre, w->near_icrs[k]);
+    const uint32_t apart = find_apart(starcat_angle_of_chord(chord), radius_rad);
     const uint32_t turn = find_turn(axes, w->near_icrs[k]);
-    for (uint32_t n = 0; (n < s->count) && (votes->count < STARCAT_MAX_VOTERS); n++) {
+    for (uint32_t n = 0; (n < s->count) && (count < STARCAT_MAX_VOTERS); n++) {
       const voter *v = s->voters + n;
-      if (starcat_is_between((real)apart, (real)v->nearest, (real)v->farthest) &&
+      if ((apart >= v->nearest) && (apart <= v->farthest) &&
           (((turn - v->turn - star->turn) & 255u) < 2u * PER_BIN) &&
           starcat_is_compatible(call, v->centroid, w->near_row[k])) {
-        const real *b = w->body[v->centroid], *a = w->near_icrs[k];
-        const real x = starcat_dot(own[0], b), y = starcat_dot(own[1], b);
-        const real p = starcat_dot(axes[0], a), q = starcat_dot(axes[1], a);
-        /* from the middle of the two bins, so that it is small */
-        const real middle = ((real)star->turn + (real)PER_BIN - R(0.5)) / TURNS;
-        const real c = STARCAT_COS(middle), t = STARCAT_SIN(middle);
-        const real sine = p * y - q * x, cosine = p * x + q * y;
-        for (uint32_t i = 0; i < 3u; i++) {
-          votes->body[votes->count][i] = b[i];
-          votes->icrs[votes->count][i] = a[i];
-        }
-        votes->turn[votes->count] = STARCAT_ATAN2(sine * c - cosine * t, cosine * c + sine * t);
-        votes->error[votes->count] = error / STARCAT_SQRT(x * x + y * y);
-        votes->count++;
+        votes[count].voter = v->centroid;
+        votes[count].near = (uint16_t)k;
+        votes[count].turn_rad =
+            measure_turn(own, w->body[v->centroid], axes, w->near_icrs[k], star->turn);
+        votes[count].error_rad = error / v->sine;
+        count++;
       }
     }
   }
-  return 1;
+  return count;
 }
 
 /* Fit the attitude to the most pairs that voted for a star and agree with one of them, and try it.
  * Returns 1 if the search can end. */
 static int try_star(starcat_call *call, const surroundings *s, const leader *star) {
-  const starcat_workspace *w = call->work;
-  ballot votes;
-  real body[STARCAT_MAX_VOTERS + 1u][3], icrs[STARCAT_MAX_VOTERS + 1u][3], m[9];
-  uint32_t best = 0, most = 0, count = 1;
-  starcat_read_star(call->image, star->row, icrs[0]);
-  if (!list_votes(call, s, star, icrs[0], &votes)) {
-    return call->own->steps_left == 0u;
-  }
-  for (uint32_t k = 0; k < votes.count; k++) {
+  starcat_workspace *w = call->work;
+  vote votes[STARCAT_MAX_VOTERS];
+  real centre[3], m[9];
+  uint32_t best = 0, most = 0, n_pairs = 0;
+  starcat_read_star(call->image, star->row, centre);
+  const uint32_t count = list_votes(call, s, star, centre, votes);
+  for (uint32_t k = 0; k < count; k++) {
     uint32_t agreeing = 0;
-    for (uint32_t n = 0; n < votes.count; n++) {
-      agreeing += (uint32_t)(starcat_absolute(votes.turn[n] - votes.turn[k]) <=
-                             votes.error[n]);
+    for (uint32_t n = 0; n < count; n++) {
+      agreeing +=
+          (uint32_t)(starcat_absolute(votes[n].turn_rad - votes[k].turn_rad) <= votes[n].error_rad);
     }
     if (agreeing > most) {
       most = agreeing;
       best = k;
     }
   }
-  for (uint32_t i = 0; i < 3u; i++) {
-    body[0][i] = w->body[s->reference][i];
+  if ((most == 0u) || !starcat_fit_triad(w->body[s->reference], w->body[votes[best].voter], centre,
+                                         w->near_icrs[votes[best].near], m)) {
+    return call->own->steps_left == 0u;
   }
-  if ((most == 0u) ||
-      !starcat_fit_triad(body[0], votes.body[best], icrs[0], votes.icrs[best], m)) {
-    return 0;
-  }
-  for (uint32_t n = 0; n < votes.count; n++) {
-    if (starcat_absolute(votes.turn[n] - votes.turn[best]) <= votes.error[n]) {
-      for (uint32_t i = 0; i < 3u; i++) {
-        body[count][i] = votes.body[n][i];
-        icrs[count][i] = votes.icrs[n][i];
-      }
-      count++;
+  for (uint32_t n = 0; (n < count) && (n_pairs < STARCAT_MAX_CENTROIDS - 1u); n++) {
+    if (starcat_absolute(votes[n].turn_rad - votes[best].turn_rad) <= votes[n].error_rad) {
+      copy_vector(w->body[votes[n].voter], w->seen_body[n_pairs]);
+      copy_vector(w->near_icrs[votes[n].near], w->seen_icrs[n_pairs]);
+      n_pairs++;
     }
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 2);
+  copy_vector(w->body[s->reference], w->seen_body[n_pairs]);
+  copy_vector(centre, w->seen_icrs[n_pairs]);
+  starcat_refine_attitude(m, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, NULL, n_pairs + 1u, 2);
   return starcat_try_attitude(call, m, R(1.0));
 }
 
