@@ -69,7 +69,7 @@ whole = pytest.mark.parametrize("ground", [WHOLE], indirect=True)
 def ground(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ground:
     if request.param == "small":
         return Ground(request.getfixturevalue("small_artifact"), 60, 0.25, is_whole=False)
-    catalogs = request.getfixturevalue("catalogs")
+    catalogs = request.getfixturevalue("made_catalogs")
     inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
     built = build_database(preset(request.param), inputs, tmp_path_factory.mktemp("sky"))
     return Ground(built.folder, 1000, 0.1, is_whole=True)

@@ -100,10 +100,10 @@ def test_a_second_build_elsewhere_has_the_same_bytes(artifact, spec, catalogs, t
     (tmp_path / "matplotlibrc").write_text(settings)
     program = (
         "import sys, pathlib\n"
-        "from starcat.pipeline.build import build\n"
+        "from starcat.pipeline.build import build_database\n"
         "from starcat.specs.build_spec import BuildSpec\n"
         "spec = BuildSpec.model_validate_json(pathlib.Path('spec.json').read_text())\n"
-        "build(spec, {'sao': [pathlib.Path(sys.argv[1])]}, pathlib.Path('out'))\n"
+        "build_database(spec, {'sao': [pathlib.Path(sys.argv[1])]}, pathlib.Path('out'))\n"
     )
     subprocess.run(
         [sys.executable, "-c", program, catalogs / "sao.dat.gz"],

@@ -160,7 +160,7 @@ def test_an_unfinished_run_is_not_overwritten(damaged, tmp_path):
 def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
     store = tmp_path / "store"
     make(parts, store)
-    with pytest.raises(OutputError, match="--replace"):
+    with pytest.raises(OutputError, match="replace=True"):
         make(parts, store)
     assert make(parts, store, replace=True).outcome == "unchanged"
     assert make(parts, store, replace=True, max_partition_rows=2_000).outcome == "replaced"
@@ -205,7 +205,7 @@ def small_disk(tmp_path):
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
     folder, make_room = small_disk
-    with pytest.raises(OutputError, match=r"No space left on device.*make room.*--resume"):
+    with pytest.raises(OutputError, match=r"No space left on device.*make room.*resume=True"):
         make(parts, folder / "store")
     assert not (folder / "store").exists()
     assert make_room()

@@ -12,8 +12,11 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
+from starcat.catalog.archives import sao, tycho2
 from starcat.catalog.source import RecordFile, data_source
-from starcat.query.names import CATALOGS
+
+COLUMNS = {"sao": sao.COLUMNS, "tycho2": tycho2.COLUMNS}
+"""The columns that starcat reads of an archive, by file."""
 
 BLANKS = [" " * width for width in range(14)]
 
@@ -21,7 +24,7 @@ BLANKS = [" " * width for width in range(14)]
 def numpy_slices(paths: list[Path], source: str) -> int:
     """Slice fixed-width records as bytes and let numpy convert each column."""
     layout = data_source(source).files[0]
-    wanted = [layout.column(name) for name in CATALOGS[source].COLUMNS[layout.name]]
+    wanted = [layout.column(name) for name in COLUMNS[source][layout.name]]
     rows = 0
     for path in paths:
         data = np.frombuffer(read_bytes(path), dtype=np.uint8).reshape(-1, layout.record_bytes + 1)
@@ -60,7 +63,7 @@ def bar_fields(layout: RecordFile) -> tuple[list[str], dict[str, pa.DataType]]:
 
     A field that holds several columns of the table (TYC1-3, HIP and CCDM) stays text.
     """
-    wanted = set(CATALOGS["tycho2"].COLUMNS[layout.name])
+    wanted = set(COLUMNS["tycho2"][layout.name])
     ends = [*sorted(int(place) for place in layout.literals), layout.record_bytes + 1]
     names, kinds, start = [], {}, 1
     for number, end in enumerate(ends):

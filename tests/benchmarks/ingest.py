@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from rows import Options, Rows, ended, fresh
+from rows import Options, Rows, ended, fresh, need_catalogs
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 CHILD = """
@@ -20,12 +20,12 @@ import json, resource, sys, time
 sys.path.insert(0, {here!r})
 from pathlib import Path
 import bare_parsers, pyarrow.parquet
-from starcat.catalog.ingest import ingest, write_star_tables
+from starcat.catalog.ingest import ingest_catalog, write_star_tables
 paths = [Path(p) for p in {paths!r}]
 files = [f for p in paths for f in (sorted(p.iterdir()) if p.is_dir() else [p])]
 start = time.perf_counter()
 if {what!r} == "ingest":
-    read = ingest({source!r}, paths, epoch_jyear=2026.0)
+    read = ingest_catalog({source!r}, paths, epoch_jyear=2026.0)
     rows = read.rows_read
     write_star_tables(read, Path({out!r}))
 else:
@@ -108,6 +108,7 @@ def main(rows: Rows) -> None:
     options.size("--sao", SAO_ROWS, 5_000, "records of SAO")
     options.size("--tycho2", TYCHO2_ROWS, 20_000, "records of Tycho-2")
     given = options.asked()
+    need_catalogs("sao.dat.gz", "tyc2.dat.gz")
     with tempfile.TemporaryDirectory() as folder:
         for files in made(Path(folder), given.sao, given.tycho2):
             with rows.row(files.title):

@@ -110,6 +110,13 @@ def need(*packages: str) -> None:
             raise LackingError(f"the package {name}: pip install {name}")
 
 
+def need_catalogs(*names: str) -> None:
+    """Ask for files of the folder of catalogs."""
+    for path in (catalogs_folder() / name for name in names):
+        if not path.is_file():
+            raise LackingError(f"{path.name} in {path.parent}; set STARCAT_CATALOGS to its folder")
+
+
 def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> Built:
     """Build a preset, with changes, from the catalogs in $STARCAT_CATALOGS."""
     # Not above: a benchmark that lacks something says so without waiting for them.
@@ -117,9 +124,7 @@ def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> 
     from starcat.specs.reading import preset
 
     inputs = {source: [catalogs_folder() / file] for source, file in FILES[name].items()}
-    for path in (path for paths in inputs.values() for path in paths):
-        if not path.is_file():
-            raise LackingError(f"{path.name} in {path.parent}; set STARCAT_CATALOGS to its folder")
+    need_catalogs(*FILES[name].values())
     return build_database(preset(name, changes), inputs, folder, workers=1)
 
 

@@ -165,6 +165,8 @@ def test_every_endpoint_that_takes_a_spec_refuses_every_key_that_names_a_file(
                     continue
                 takes.add((method, path))
                 for key in KEYS:
+                    if name == "camera" and not key.startswith("camera."):
+                        continue  # this request has nothing else of a spec
                     for value in (str(canary), "/etc/passwd"):
                         [*_, (_, again)] = list(shapes(key, value))[: number + 1]
                         answer = client.request(method, path, follow_redirects=False, **again)
