@@ -25,6 +25,7 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.pose import student_widening
 from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
@@ -292,7 +293,7 @@ def test_errors_are_as_the_covariance_of_a_stated_noise_says(sky, camera):
 def test_errors_are_as_the_covariance_of_the_residuals_says(sky):
     squares, count = deviations(sky, CAMERAS["20 deg"], 0.3, is_stated=False)
     freedom = 2 * count - 3
-    expected = 3.0 * freedom / (freedom - 2)  # of three times an F
+    expected = 3.0 * freedom / (freedom - 2) / student_widening(freedom) ** 2  # of three times an F
     assert abs(squares.mean() - expected) < 0.2 * expected
 
 

@@ -142,6 +142,23 @@ def test_a_magnitude_of_no_star_is_as_unknown_as_nan(sky, engine, value):
         assert found.star_index.tolist() == expected.star_index.tolist()
 
 
+@pytest.mark.parametrize("value", [1e308, -1e308, 4e38, 101.0])
+def test_both_engines_take_a_magnitude_of_no_star_alike(sky, value):
+    if len(ENGINES) < 2:
+        pytest.skip("starcat was installed without a C compiler")
+    for frame in frames_of(sky, 20, Noise(0.5, 0.1, 3, noise_mag=0.3), seed=5):
+        mag = frame.mag.copy()
+        mag[::3] = value
+        one, other = (
+            Matcher(sky, engine=engine, noise_mag=0.3).identify(frame.centroids_px, magnitudes=mag)
+            for engine in ENGINES
+        )
+        assert (one.status, one.dropped) == (other.status, other.dropped)
+        assert one.star_index.tolist() == other.star_index.tolist()
+        reasons = [found.refusal and found.refusal.reason for found in (one, other)]
+        assert reasons[0] == reasons[1]
+
+
 def test_an_answer_is_true_if_it_identifies(sky):
     [frame] = frames_of(sky, 1)
     answers = Matcher(sky).identify_many([frame.centroids_px, frame.centroids_px[:3]])

@@ -164,6 +164,10 @@ typedef struct {
   const uint8_t *manifest_sha256;       /* 32 bytes */
   const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
                                          * votes */
+#ifdef STARCAT_GROUND                   /* of Python */
+  const starcat_real *exact; /* directions before they were rounded, which answers are fitted
+                                            with; null: those of the image */
+#endif
 } starcat_image;
 
 /* A camera with square pixels; Brown's distortion as in OpenCV. Its corners are up to 89.4 degrees
@@ -217,8 +221,10 @@ typedef struct {
   starcat_real best_log_chance;        /* its bound */
   starcat_real best_share;             /* and the share of the frame that it explains */
   starcat_real covariance_rad2[9];     /* of small turns about the camera's x, y and z, with the
-                                            stated noise, else with that of the residuals; zeros
-                                            if not identified, or its stars determine no attitude */
+                                            stated noise, else with that of the residuals, widened
+                                            so that three standard errors cover as much (Student's
+                                            t); zeros if not identified, or its stars determine no
+                                            attitude */
   starcat_real reduced_chi_square;     /* squared residuals in the stated noise, a degree of
                                             freedom: above 2 that is too small; 0: not stated */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */

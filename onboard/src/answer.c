@@ -34,10 +34,12 @@ static real find_centroid_noise(const starcat_call *call, uint32_t centroid) {
   return find_noise(call->sigma_px, call->noise_px, starcat_limit_place(row, call->own->given));
 }
 
-/* List the centroids of the best agreement that are stars, with directions of the image or others,
- * and their weights: one over the square of the noise, over the largest. Returns how many. */
-static uint32_t take_stars(const starcat_image *image, const real *directions, const real *sigma_px,
-                           uint32_t count, uint32_t given, starcat_workspace *w) {
+/* List the centroids of the best agreement that are stars, with their directions and weights: one
+ * over the square of the noise, over the largest. Returns how many. */
+static uint32_t take_stars(const starcat_call *call) {
+  const starcat_image *image = call->image;
+  starcat_workspace *w = call->work;
+  const uint32_t count = call->own->count;
   real least = R(0.0);
   uint32_t n = 0;
   for (uint32_t i = 0; i < count; i++) {
@@ -47,9 +49,12 @@ static uint32_t take_stars(const starcat_image *image, const real *directions, c
       starcat_read_star(image, star, icrs);
       for (uint32_t k = 0; k < 3u; k++) {
         w->seen_body[n][k] = w->scaled[i][k];
-        icrs[k] = directions != NULL ? directions[3u * (size_t)star + k] : icrs[k];
+#ifdef STARCAT_GROUND
+        icrs[k] = image->exact != NULL ? image->exact[3u * (size_t)star + k] : icrs[k];
+#endif
       }
-      const real noise = find_noise(sigma_px, R(0.0), starcat_limit_place(w->row[i], given));
+      const real noise =
+          find_noise(call->sigma_px, R(0.0), starcat_limit_place(w->row[i], call->own->given));
       least = (noise > R(0.0)) && ((noise < least) || !(least > R(0.0))) ? noise : least;
       w->weight[n] = noise;
       w->seen[n] = (uint16_t)i;
@@ -68,6 +73,9 @@ static uint32_t take_stars(const starcat_image *image, const real *directions, c
 /* Fit the attitude of the answer to the stars that are listed. */
 static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result *result) {
   real square = R(0.0);
+  /* The directions of an image are rounded, so that their attitude is not quite a rotation. */
+  starcat_make_quaternion(w->best.matrix, result->q_body_from_icrs);
+  starcat_make_matrix(result->q_body_from_icrs, result->matrix);
   starcat_refine_attitude(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
                           count, 4);
   starcat_make_quaternion(result->matrix, result->q_body_from_icrs);
@@ -80,18 +88,7 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
   result->residual_rad = STARCAT_SQRT(square / (real)count);
 }
 
-#ifdef STARCAT_GROUND
-/* Fit the attitude of an answer once more, with other directions than those of the image. */
-void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                        starcat_workspace *work, starcat_result *result) {
-  fit_stars(work,
-            take_stars(image, directions, sigma_px, result->n_usable, STARCAT_MAX_CENTROIDS, work),
-            result);
-}
-#endif
-
-/* Noise of centroids that is not stated: that of the residuals, of whose 2n numbers three went into
- * the attitude. Sums the squared residuals of stated noise, in it, and counts these centroids. */
+/* Sum the squared residuals, and those of stated noise, in it; count the latter's centroids. */
 static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real *chi_square,
                       uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
@@ -109,7 +106,16 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
       (*n_stated)++;
     }
   }
-  return STARCAT_SQRT(square / (real)(2u * n_seen - 3u)); /* there are STARCAT_MIN_STARS at least */
+  return square;
+}
+
+/* Noise of centroids that is not stated: that of the residuals, of whose numbers so many are free,
+ * at least four. It is widened so that three of it have the coverage of three standard deviations:
+ * by the quantile of Student's t (Abramowitz and Stegun 1964, 26.7.5), as in pose.py. */
+static real find_unstated(real square, uint32_t n_free) {
+  const real free = (real)n_free;
+  return STARCAT_SQRT(square / free) *
+         (R(1.0) + (R(2.5) + (R(5.75) + R(10.0625) / free) / free) / free);
 }
 
 /* Tell the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the turns t that the noises of
@@ -119,9 +125,11 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
-  const real unstated = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
+  const real square = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
   const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
-  if (!(unstated <= call->reach_px)) {
+  /* There are STARCAT_MIN_STARS at least. */
+  const real unstated = find_unstated(square, 2u * n_seen - unknowns);
+  if (!(square <= (real)(2u * n_seen - 3u) * call->reach_px * call->reach_px)) {
     return 0;
   }
   if (2u * n_stated > unknowns) {
@@ -170,12 +178,9 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   call->focal = R(0.0); /* so that the directions are worked out again */
   starcat_set_focal(call, w->best.focal);
   const uint32_t count = call->own->count;
-  const uint32_t n_seen = take_stars(call->image, NULL, call->sigma_px, count, call->own->given, w);
+  const uint32_t n_seen = take_stars(call);
   if (n_seen < STARCAT_MIN_STARS) {
     return refuse_frame(call, result);
-  }
-  for (uint32_t k = 0; k < 9u; k++) {
-    result->matrix[k] = w->best.matrix[k];
   }
   fit_stars(w, n_seen, result);
   if (!tell_errors(call, n_seen, result)) {

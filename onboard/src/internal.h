@@ -233,10 +233,6 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
                                   starcat_result *result);
 
 /* answer.c */
-#ifdef STARCAT_GROUND /* of Python, which knows directions before they were rounded */
-void starcat_fit_answer(const starcat_image *image, const real *directions, const real *sigma_px,
-                        starcat_workspace *work, starcat_result *result);
-#endif
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                                 starcat_result *result);
 

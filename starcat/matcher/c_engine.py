@@ -12,11 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib import import_module
+from struct import Struct
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arguments import FLOAT64
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
@@ -25,7 +27,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import MatchResult, Reason, Refusal, Status, no_match
+from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Reason, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
@@ -79,6 +81,14 @@ def library_version() -> str | None:
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
 
 
+_NUMBERS = Struct("@4iq6d")
+"""The numbers that ``starcat_answer`` of ``many.h`` begins with; its arrays follow."""
+
+_IDENTIFIED = 0
+
+_INT32 = np.dtype(np.int32)
+
+
 @lru_cache(maxsize=1)
 def _answer_dtype() -> np.dtype[np.void]:
     """Return the record of numpy that is ``starcat_answer`` of ``many.h``, byte by byte."""
@@ -105,11 +115,12 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 class _Batch:
     """What the library has written for many frames of one camera."""
 
-    # A ``starcat_answer`` a frame, by its names in ``many.h``; attitudes are zeros unless it is
+    # One ``starcat_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
     # identified.
     records: NDArray[np.void]
     # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
     star_index: NDArray[np.int32]
+    star_ids: NDArray[np.int64]
     frames: Frames
     search: Search
 
@@ -128,11 +139,10 @@ class _Batch:
         return BatchResult(status, found["seconds"].copy(), attitudes, self._answer)
 
     def _answer(self, frame: int) -> MatchResult:
-        return MatchResult.later(STATUSES[self.codes[frame]], self._facts, frame)
-
-    def _facts(self, n: int) -> dict[str, Any]:
-        stars = self.star_index[self.frames.starts[n] : self.frames.starts[n + 1]]
-        return self.search.facts(self.records[n], stars, self.frames[n])
+        rows = slice(self.frames.starts[frame], self.frames.starts[frame + 1])
+        parts = self.records[frame], self.star_ids[rows], self.star_index[rows]
+        record = bytearray(b"".join(part.tobytes() for part in parts))
+        return self.search.answer(record, self.frames[frame])
 
 
 def _dropped(star: NDArray[np.int32]) -> Dropped:
@@ -167,7 +177,7 @@ class CEngine:
         self._neighbours = _neighbours(self.image, database.camera.radius_rad)
         self.image.neighbours = self._neighbours[0]
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
-        self.directions = _double_pointer(directions)
+        self._directions = self.image.exact = _double_pointer(directions)
         self.database = database
 
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
@@ -198,10 +208,11 @@ class Search:
         self, engine: CEngine, camera: Camera, settings: Settings, fov_error: float
     ) -> None:
         self.camera, self._settings, self._fov_error = camera, settings, fov_error
+        self._noise_px = settings.noise_px
         self._database = engine.database
         # The library is given addresses: what stands there has to be kept.
         self._kept = engine, _camera(camera), _options(settings, fov_error)
-        addresses = [engine.image, *self._kept[1:], engine.rows, engine.directions]
+        addresses = [engine.image, *self._kept[1:], engine.rows]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
         self._one, self._null = _onboard.lib.starcat_identify_one, _onboard.ffi.NULL
         self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
@@ -215,8 +226,7 @@ class Search:
     ) -> MatchResult | None:
         """Identify the stars of a frame; None where the library does not take it.
 
-        This is what a call costs beside the library: arrays go there and back as bytes, and the
-        answer is put into words when it is looked at.
+        This is what a call costs beside the library: arrays go there and back as bytes.
         """
         count = len(centroids_px)
         if count > self._most:
@@ -235,17 +245,20 @@ class Search:
             0.0 if prior is None else prior.error_rad,
             memory.address,
         )
-        record, stars = memory.answer[:], memory.stars[: 4 * count]
-        q_found = None if prior is None else _onboard.ffi.unpack(memory.q_found, 4)
+        record = bytearray(memory.answer[: IDS_AT + 12 * count])
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        found = MatchResult.later(
-            STATUSES[code], self._facts_of_bytes, record, stars, px, mags, sigma, prior
+        frame = Frame(
+            np.ndarray((count, 2), FLOAT64, px),
+            None if mags is None else np.ndarray(count, FLOAT64, mags),
+            self.camera,
+            None if sigma is None else np.ndarray(count, FLOAT64, sigma),
         )
+        found = self.answer(record, frame, prior)
         if prior is None:
             return found
-        return prior.checked(found, self.camera, self._settings.tolerance_px, q_found)
+        return prior.checked(found, self.camera, self._settings.tolerance_px)
 
     def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
         """Identify the stars of frames; return the answers, and the frames that have none.
@@ -254,6 +267,7 @@ class Search:
         """
         count, starts = len(frames), frames.starts
         records, star_index = np.zeros(count, _answer_dtype()), np.full(starts[-1], -1, np.int32)
+        star_ids = np.full(starts[-1], -1, np.int64)
         ffi = _onboard.ffi
         arrays = (
             ffi.from_buffer("int64_t[]", starts),
@@ -262,6 +276,7 @@ class Search:
             _double_pointer(frames.sigma_px),
             ffi.from_buffer("starcat_answer[]", records),
             ffi.from_buffer("int32_t[]", star_index),
+            ffi.from_buffer("int64_t[]", star_ids),
         )
 
         def run(first: int) -> None:
@@ -277,87 +292,72 @@ class Search:
         else:
             with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
                 list(pool.map(run, parts))
-        batch = _Batch(records, star_index, frames, self)
+        batch = _Batch(records, star_index, star_ids, frames, self)
         return batch.result(), [n for n, code in enumerate(batch.codes) if code not in STATUSES]
 
-    def _facts_of_bytes(
-        self,
-        record: bytes,
-        stars: bytes,
-        px: bytes,
-        mags: bytes | None,
-        sigma: bytes | None,
-        prior: Prior | None,
-    ) -> dict[str, Any]:
-        star = np.frombuffer(stars, np.int32)
-        frame = Frame(
-            np.ndarray((len(star), 2), np.float64, px),
-            None if mags is None else np.frombuffer(mags),
-            self.camera,
-            None if sigma is None else np.frombuffer(sigma),
-        )
-        return self.facts(np.frombuffer(record, _answer_dtype())[0], star, frame, prior)
+    def answer(self, record: bytearray, frame: Frame, prior: Prior | None = None) -> MatchResult:
+        """Return the answer that the library has written.
 
-    def facts(
-        self, record: np.void, star: NDArray[np.int32], frame: Frame, prior: Prior | None = None
-    ) -> dict[str, Any]:
-        """Return the fields of an answer, from a record and stars as `BatchResult` has them."""
-        found: dict[str, Any] = dict(zip(record.dtype.names or (), record.item(), strict=True))
-        has_dropped = found["n_usable"] < len(star)
-        facts = {
-            "dropped": _dropped(star) if has_dropped else (),
-            "origin": "lost_in_space" if prior is None else "tracking",
-            "time_s": found["seconds"],
-            "frame": frame,
-            "database": self._database,
-            "noise_px": self._settings.noise_px,
-        }
-        if STATUSES[found["status"]] != "identified":
-            return vars(no_match(len(star), refusal=_refusal_of(found, prior), **facts))
-        camera, error_px = frame.camera, None
-        if self._fov_error:
-            camera = camera.with_focal_length(found["focal_length_px"])
-            error_px = focal_length_error_px(
-                camera.directions_from_pixels(frame.centroids_px[star >= 0]),
-                camera.focal_length_px,
-                found["residual_rad"],
-                self._settings.noise_px,
+        ``record`` is a ``starcat_answer`` of ``many.h``, the numbers of the stars and their rows.
+        Arrays of the answer are views of it.
+        """
+        (
+            code, reason, n_matched, n_usable, _, time_s,
+            chance, share, focal_length_px, residual_arcsec, chi_square,
+        ) = _NUMBERS.unpack_from(record)  # fmt: skip
+        count = len(frame.centroids_px)
+        star_index = np.ndarray(count, _INT32, record, IDS_AT + 8 * count)
+        if code != _IDENTIFIED:
+            why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
+            content = {**vars(no_match(count, refusal=why))}
+        else:
+            content = {"status": "identified", "star_index": star_index}
+            content["matrix"] = np.ndarray((3, 3), FLOAT64, record, MATRIX_AT)
+            content["_record"] = record
+            content["reduced_chi_square"] = chi_square
+            content["residual_arcsec"] = residual_arcsec
+            content["false_match_probability"] = chance
+            content["camera"] = frame.camera
+        content["time_s"] = time_s
+        content["frame"] = frame
+        content["database"] = self._database
+        content["noise_px"] = self._noise_px
+        if prior is not None:
+            content["origin"] = "tracking"
+        if n_usable < count:
+            content["dropped"] = _dropped(star_index)
+            np.maximum(star_index, -1, out=star_index)
+        if self._fov_error and code == _IDENTIFIED:
+            camera = content["camera"] = frame.camera.with_focal_length(focal_length_px)
+            content["focal_length_error_px"] = focal_length_error_px(
+                camera.directions_from_pixels(frame.centroids_px[star_index >= 0]),
+                focal_length_px,
+                residual_arcsec / ARCSEC,
+                self._noise_px,
             )
-        return facts | {
-            "star_index": np.maximum(star, -1) if has_dropped else star.copy(),
-            "matrix": found["matrix"].copy(),
-            "residual_arcsec": found["residual_rad"] * ARCSEC,
-            "false_match_probability": math.exp(found["log_chance"]),
-            "camera": camera,
-            "focal_length_error_px": error_px,
-            # The library's own, which rounds otherwise than the one that the matrix makes.
-            "_quaternion": found["q_body_from_icrs"].copy(),
-        }
+        return MatchResult.of(content)
 
 
-def _refusal_of(found: dict[str, Any], prior: Prior | None) -> Refusal:
+def _refusal(
+    reason: Reason, n_matched: int, chance: float, share: float, n_usable: int, prior: Prior | None
+) -> Refusal:
     """Return why the library has no answer."""
-    reason = REASONS[found["reason"]]
     if reason == "too_few_stars":
         return Refusal(reason)
-    if prior is not None and (reason == "no_candidate" or not found["log_chance"] < 0.0):
+    if prior is not None and (reason == "no_candidate" or not chance < 1.0):
         return Refusal("prior")
     if reason == "no_candidate":
         return Refusal(reason)
-    return Refusal(
-        reason, found["n_matched"], math.exp(found["log_chance"]), found["share"], found["n_usable"]
-    )
+    return Refusal(reason, n_matched, chance, share, n_usable)
 
 
 class _Memory:
     """The memory that a call works in, half a megabyte, and views of what it leaves there."""
 
     def __init__(self) -> None:
-        ffi = _onboard.ffi
+        ffi, most = _onboard.ffi, int(_onboard.lib.STARCAT_MAX_CENTROIDS)
         self.address = ffi.new("starcat_memory *")
-        self.answer = ffi.buffer(ffi.addressof(self.address, "answer"))
-        self.stars = ffi.buffer(ffi.addressof(self.address, "star"))
-        self.q_found = self.address.answer.q_body_from_icrs
+        self.answer = ffi.buffer(ffi.addressof(self.address, "answer"), IDS_AT + 12 * most)
 
 
 _FREE: list[_Memory] = []

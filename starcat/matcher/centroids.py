@@ -64,18 +64,15 @@ class Brightest:
         Centroids that were not searched have no star. In a frame of so many centroids some lie
         near any star by chance.
         """
-        return MatchResult.later(searched.status, self._facts, searched)
-
-    def _facts(self, searched: MatchResult) -> dict[str, Any]:
         star_index = np.full(len(self.whole), -1, dtype=np.int32)
         star_index[self.rows] = searched.star_index
-        return {
-            **searched.facts(),
-            "star_index": star_index,
-            "dropped": self.dropped,
-            "frame": self.whole,
-            "n_not_searched": len(self.whole) - len(self.rows) - len(self.dropped),
-        }
+        return replace(
+            searched,
+            star_index=star_index,
+            dropped=self.dropped,
+            frame=self.whole,
+            n_not_searched=len(self.whole) - len(self.rows) - len(self.dropped),
+        )
 
 
 def brightest_of(frame: Frame) -> Brightest:

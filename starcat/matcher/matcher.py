@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arguments import HasFolder, database_path, whole_number
@@ -206,7 +207,8 @@ class Matcher(Settings, _WithDatabase):
         ConfigError
             If an array is of another shape, the prior no quaternion, an error missing or too large.
         """
-        if isinstance(centroids_px, str | os.PathLike):
+        # The first test is the faster one, and nearly all calls have an array.
+        if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
             return self._identify_file(Path(centroids_px), camera)
         camera = self._camera(camera)
         px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
@@ -326,21 +328,26 @@ class Matcher(Settings, _WithDatabase):
         return f"{self.database.name} has too many stars or features for an onboard image"
 
     @cached_property
-    def _searches(self) -> dict[tuple[int, float], Search]:
-        """Those asked for last, by the camera's identity, as each holds its own, and its error."""
+    def _searches(self) -> dict[tuple[Camera | int, float], Search]:
+        """Those asked for last, by the camera and its error, and by the identity of the camera.
+
+        Each holds its own camera, so that no other one has its identity. Equal ones share it.
+        """
         return {}
 
     def _in_c(self, camera: Camera, fov_error: float = 0.0) -> Search | None:
         """Return what asks the C library about frames of a camera, where it serves."""
-        key = id(camera), fov_error
-        found = self._searches.get(key)
+        found = self._searches.get((id(camera), fov_error))
+        if found is None:
+            found = self._searches.get((camera, fov_error))
         if found is None:
             engine = self._c_engine
             if engine is None:
                 return None
-            if len(self._searches) >= MAX_CAMERAS:
+            if len(self._searches) >= 2 * MAX_CAMERAS:
                 self._searches.clear()
-            found = self._searches[key] = engine.search(camera, self._settings, fov_error)
+            found = engine.search(camera, self._settings, fov_error)
+            self._searches[id(camera), fov_error] = self._searches[camera, fov_error] = found
         return found
 
     def __getstate__(self) -> dict[str, Any]:

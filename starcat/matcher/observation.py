@@ -31,7 +31,7 @@ magnitudes, of light in any unit, lie far within. ``onboard/bindings/python/many
 limit."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # a frozen one would take three times as long to make
 class Frame:
     """The centroids of a frame as they were given, and the camera that they were given with."""
 
@@ -100,7 +100,7 @@ def as_arrays(
             magnitudes = columns.get("mag") if magnitudes is None else magnitudes
             sigma_px = columns.get("sigma_px") if sigma_px is None else sigma_px
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
-    if given.shape[1:] != (2,):
+    if given.ndim != 2 or given.shape[1] != 2:
         if given.size:
             raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
         given = given.reshape(0, 2)

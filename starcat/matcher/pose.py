@@ -25,8 +25,6 @@ from starcat.matcher.observation import Candidates, Observation
 _SCALINGS = 2
 """Rounds that find the scale of a few stars; a second one, because angles are no tangents."""
 
-_THREE_SIGMA = 3.0
-
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
@@ -148,22 +146,18 @@ def focal_length_error_px(
         sigma_rad = noise_px / focal_length_px
     else:
         free = 2 * len(matched) - 4
-        sigma_rad = residual_rad * math.sqrt(len(matched) / free) * _student(free) / _THREE_SIGMA
+        sigma_rad = residual_rad * math.sqrt(len(matched) / free) * student_widening(free)
     return focal_length_px * sigma_rad * math.sqrt(max(0.0, float(covariance[3, 3])))
 
 
-def _student(free: int) -> float:
-    """Return the quantile of Student's t that three sigma are of the normal distribution.
+def student_widening(free: int) -> float:
+    """Return by how much to widen a standard error of residuals of which so many are free.
 
-    Abramowitz and Stegun 1964, 26.7.5.
+    Three of it then have the coverage of three standard deviations: it is the quantile of Student's
+    t over that of the normal distribution (Abramowitz and Stegun 1964, 26.7.5, at z = 3), within
+    1.5 % from 5 on. ``onboard/src/answer.c`` has the same.
     """
-    z = _THREE_SIGMA
-    return (
-        z
-        + (z**3 + z) / (4.0 * free)
-        + (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * free**2)
-        + (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / (384.0 * free**3)
-    )
+    return 1.0 + (2.5 + (5.75 + 10.0625 / free) / free) / free
 
 
 def explained_fraction(

@@ -8,7 +8,7 @@ verification of what that proposes is that of any other method.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,17 +48,11 @@ class Prior:
     q_body_from_icrs: Array
     error_rad: float
 
-    def checked(
-        self,
-        answer: MatchResult,
-        camera: Camera,
-        tolerance_px: float,
-        q_found: Sequence[float] | None = None,
-    ) -> MatchResult:
-        """Return an answer if its attitude, ``q_found`` if given, is as near as the error says."""
+    def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
+        """Return an answer if its attitude is as near as the error says."""
         if not answer.ok:
             return answer
-        q_found = answer.q_body_from_icrs.tolist() if q_found is None else q_found
+        q_found = answer.q_body_from_icrs.tolist()
         turn_rad = math.hypot(*turn_between(self.q_body_from_icrs.tolist(), q_found))
         if turn_rad <= self.error_rad + turn_of_noise_rad(camera, tolerance_px):
             return answer

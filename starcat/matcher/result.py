@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,6 +180,11 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 Origin = Literal["lost_in_space", "tracking"]
 
 
+Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
+"""Bytes of ``starcat_answer`` (``many.h``) where its arrays begin, and where those of the star
+numbers and star rows of the centroids follow."""
+
+
 @dataclass(frozen=True, eq=False)
 class MatchResult:
     """The answer to one frame of centroids.
@@ -235,40 +239,18 @@ class MatchResult:
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
+    # What the C library has written: the derived properties, which are views of it.
+    _record: ClassVar[bytearray | None] = None
 
     @classmethod
-    def later(
-        cls, status: Status, make: Callable[..., dict[str, Any]], *arguments: Any
-    ) -> MatchResult:
-        """Return an answer whose other fields ``make(*arguments)`` gives when one is asked for."""
+    def of(cls, content: dict[str, Any]) -> MatchResult:
+        """Return an answer with these fields and cached properties; other fields have defaults.
+
+        The constructor of a frozen dataclass would take a tenth of the time of an identification.
+        """
         answer = cls.__new__(cls)
-        content = answer.__dict__
-        content["status"], content["_make"] = status, (make, arguments)
+        object.__setattr__(answer, "__dict__", content)
         return answer
-
-    def _complete(self) -> dict[str, Any]:
-        """Make what is not made yet; return all that there is."""
-        content = vars(self)
-        unmade = content.get("_make")
-        if unmade is not None:
-            make, arguments = unmade
-            # What another thread has made meanwhile stays.
-            content.update(_DEFAULTS | make(*arguments) | content)
-            content.pop("_make", None)
-        return content
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            content = self._complete()
-            if name not in content:
-                raise AttributeError(f"'MatchResult' object has no attribute {name!r}")
-            return content[name]
-
-    def facts(self) -> dict[str, Any]:
-        """Return the fields, and what is kept for `q_body_from_icrs`; without what is derived."""
-        names = {"_quaternion", *(one.name for one in fields(self))}
-        return {name: value for name, value in self._complete().items() if name in names}
 
     @property
     def ok(self) -> bool:
@@ -286,6 +268,8 @@ class MatchResult:
     @cached_property
     def star_ids(self) -> NDArray[np.int64]:
         """Permanent star number of each centroid, shape (N,), -1 where none."""
+        if self._record is not None:
+            return np.ndarray(len(self.star_index), np.int64, self._record, IDS_AT)
         if self.database is None or not self.ok:
             return np.full(len(self.star_index), -1, dtype=np.int64)
         ids = np.take(self.database.star_id, self.star_index, mode="wrap")
@@ -298,8 +282,9 @@ class MatchResult:
 
         ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
         """
-        own = self._complete().get("_quaternion")
-        return quaternion_from_matrix(self.matrix) if own is None else own
+        if self._record is not None:
+            return np.ndarray(4, np.float64, self._record, Q_AT)
+        return quaternion_from_matrix(self.matrix)
 
     @cached_property
     def _angles(self) -> tuple[float, float, float]:
@@ -336,13 +321,16 @@ class MatchResult:
         """Covariance of the attitude, shape (3, 3); NaN unless identified.
 
         Of the small rotations about the axes of the camera frame (x right, y down, z along the
-        boresight), square arcseconds. With the stated noise of a centroid where there is one,
-        else with that of the residuals. The camera is taken as exact.
+        boresight), square arcseconds. With the stated noise of a centroid where there is one, else
+        with that of the residuals, widened so that three standard errors have the coverage of three
+        standard deviations (Student's t). The camera is taken as exact.
         """
+        if self._record is not None:
+            return np.ndarray((3, 3), np.float64, self._record, COVARIANCE_AT)
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera)
+        return attitude_covariance(stars, self.camera, self._unknowns)
 
     @cached_property
     def reduced_chi_square(self) -> float:
@@ -354,8 +342,12 @@ class MatchResult:
         return reduced_chi_square(self.stars, self._free)
 
     @property
+    def _unknowns(self) -> int:
+        return 3 if self.focal_length_error_px is None else 4
+
+    @property
     def _free(self) -> int:
-        return degrees_of_freedom(self.stars, 3 if self.focal_length_error_px is None else 4)
+        return degrees_of_freedom(self.stars, self._unknowns)
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -476,8 +468,8 @@ class MatchResult:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: the stars, not the database they are of."""
-        made = self._complete()
-        content = {**made, "frame": None, "database": None}
+        content = {**vars(self), "frame": None, "database": None, "_record": None}
+        content["q_body_from_icrs"] = self.q_body_from_icrs
         if self.database is not None:
             content["star_ids"] = self.star_ids
             if self.frame is not None and self.camera is not None:
@@ -526,12 +518,6 @@ class MatchResult:
         )
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
-
-_DEFAULTS = {one.name: one.default for one in fields(MatchResult) if one.default is not MISSING}
-
-# A default in the class would hide what is not made yet; the constructor has its own.
-for _name in _DEFAULTS:
-    delattr(MatchResult, _name)
 
 NOTABLE_CHI_SQUARE = 2.0
 """Reduced chi-square above which an answer has a remark, if chance is unlikely to exceed it."""

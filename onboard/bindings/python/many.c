@@ -24,20 +24,29 @@ static double now_s(void) {
 /* Magnitudes that are far from any star's are unknown ones, as in starcat/matcher/observation.py. */
 static const double LARGEST_MAG = 100.0;
 
+static const double ARCSEC = 206264.80624709636; /* in a radian */
+
 /* What the library found, as Python wants it. */
 static void tell_answer(const starcat_result *result, starcat_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
   answer->reason = (int32_t)result->reason;
   if (result->reason != STARCAT_REASON_NONE) {
     answer->n_matched = (int32_t)result->best_n_matched;
-    answer->log_chance = result->best_log_chance;
+    answer->chance = exp(result->best_log_chance);
     answer->share = result->best_share;
     return;
   }
   answer->n_matched = (int32_t)result->n_matched;
+  answer->chance = exp(result->log_chance);
   answer->focal_length_px = result->focal_length_px;
-  answer->residual_rad = result->residual_rad;
-  answer->log_chance = result->log_chance;
+  answer->residual_arcsec = ARCSEC * result->residual_rad;
+  const int is_stated = result->reduced_chi_square > 0.0;
+  answer->reduced_chi_square = is_stated ? result->reduced_chi_square : (double)NAN;
+  const int is_determined = result->covariance_rad2[0] > 0.0;
+  for (uint32_t k = 0; k < 9u; k++) {
+    const double rad2 = is_determined ? result->covariance_rad2[k] : (double)NAN;
+    answer->covariance_arcsec2[k / 3u][k % 3u] = ARCSEC * ARCSEC * rad2;
+  }
   memcpy(answer->matrix, result->matrix, sizeof answer->matrix);
   memcpy(answer->q_body_from_icrs, result->q_body_from_icrs, sizeof answer->q_body_from_icrs);
 }
@@ -45,7 +54,7 @@ static void tell_answer(const starcat_result *result, starcat_answer *answer) {
 static int identify_copied(const starcat_search *search, uint32_t count, const double *pairs_px,
                            const double *magnitudes, const double *sigma_px, const double *q_prior,
                            double uncertainty_rad, starcat_answer *answer, int32_t *star,
-                           starcat_memory *memory) {
+                           void *star_ids, starcat_memory *memory) {
   const starcat_frame frame = {count, memory->x_px, memory->y_px,
                                magnitudes == NULL ? NULL : memory->magnitudes, sigma_px};
   starcat_result *result = &memory->result;
@@ -75,9 +84,8 @@ static int identify_copied(const starcat_search *search, uint32_t count, const d
   for (uint32_t i = 0; i < count; i++) {
     const int32_t row = has_stars ? result->star[i] : STARCAT_NO_STAR;
     star[i] = row < 0 ? row : search->rows[row];
-  }
-  if ((status == STARCAT_IDENTIFIED) && (search->directions != NULL)) {
-    starcat_fit_answer(search->image, search->directions, sigma_px, &memory->work, result);
+    const int64_t id = row < 0 ? -1 : search->image->star_ids[row];
+    memcpy((char *)star_ids + sizeof id * i, &id, sizeof id);
   }
   if (has_stars) {
     tell_answer(result, answer);
@@ -97,18 +105,19 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
                          const void *magnitudes, const void *sigma_px, const void *q_prior,
                          double uncertainty_rad, starcat_memory *memory) {
   return identify_copied(search, count, pairs_px, magnitudes, sigma_px, q_prior, uncertainty_rad,
-                         &memory->answer, memory->star, memory);
+                         &memory->answer, memory->stars + 2u * count, memory->stars, memory);
 }
 
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
                            const double *sigma_px, starcat_answer *answers, int32_t *stars,
-                           starcat_memory *memory) {
+                           void *star_ids, starcat_memory *memory) {
   for (uint32_t n = first; n < stop; n++) {
     const int64_t start = starts[n];
     (void)identify_copied(search, (uint32_t)(starts[n + 1u] - start), pairs_px + 2 * start,
                           magnitudes == NULL ? NULL : magnitudes + start,
                           sigma_px == NULL ? NULL : sigma_px + start, NULL, 0.0, answers + n,
-                          stars + start, memory);
+                          stars + start, (char *)star_ids + sizeof(int64_t) * (size_t)start,
+                          memory);
   }
 }

@@ -12,30 +12,32 @@ typedef struct {
   const starcat_image *image;
   const starcat_camera *camera;
   const starcat_options *options;
-  const int32_t *rows;      /* of the image's stars in the database */
-  const double *directions; /* of the image's stars before they were rounded; null: the image's */
+  const int32_t *rows; /* of the image's stars in the database */
 } starcat_search;
 
-/* The answer to one frame. Python makes its record of these fields by their names. */
+/* The answer to one frame. Python makes its record of these fields by their names, and reads those
+ * of one number in this order. */
 typedef struct {
   int32_t status;
-  int32_t n_matched;
+  int32_t reason;
+  int32_t n_matched; /* if not identified, of the best agreement, as chance and share */
+  int32_t n_usable;
   int64_t steps;
-  double q_body_from_icrs[4];
-  double matrix[3][3];
-  double residual_rad;
-  double log_chance; /* if not identified, of the best agreement */
+  double seconds; /* that the library took */
+  double chance;  /* bound on the probability that chance agrees as well */
   double share;
   double focal_length_px;
-  int32_t reason;
-  int32_t n_usable;
-  double seconds; /* that the library took */
+  double residual_arcsec;
+  double reduced_chi_square; /* NaN if no noise is stated */
+  double q_body_from_icrs[4];
+  double matrix[3][3];
+  double covariance_arcsec2[3][3]; /* NaN if the stars determine no attitude */
 } starcat_answer;
 
 /* Memory of one call at a time: what it works in, and what starcat_identify_one leaves in it. */
 typedef struct {
   starcat_answer answer;
-  int32_t star[STARCAT_MAX_CENTROIDS]; /* row of the database, or a number below 0 of starcat.h */
+  int32_t stars[3 * STARCAT_MAX_CENTROIDS]; /* the star_ids of the frame's centroids, then stars */
   double x_px[STARCAT_MAX_CENTROIDS];
   double y_px[STARCAT_MAX_CENTROIDS];
   double magnitudes[STARCAT_MAX_CENTROIDS];
@@ -53,11 +55,13 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
                          const void *magnitudes, const void *sigma_px, const void *q_prior,
                          double uncertainty_rad, starcat_memory *memory);
 
-/* Identify the stars of frames `first` to `stop` of many: an answer a frame, a star a centroid.
+/* Identify the stars of frames `first` to `stop` of many: one answer per frame, one star per centroid.
+ * A star is a row of the database, or a number below 0 of starcat.h; `star_ids` are the permanent
+ * numbers, int64_t, -1 without a star.
  * The centroids of frame n are those from starts[n] to starts[n + 1]. */
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
                            const double *sigma_px, starcat_answer *answers, int32_t *stars,
-                           starcat_memory *memory);
+                           void *star_ids, starcat_memory *memory);
 
 #endif

@@ -1,0 +1,167 @@
+"""The covariance of an attitude: how far attitudes are from the truth, in its standard errors."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.matcher import c_engine, result
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.pose import student_widening
+from starcat.simulation.simulate import Noise, simulate_frames
+
+needs_c = pytest.mark.skipif(
+    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
+)
+
+log = logging.getLogger(__name__)
+
+ARCSEC = 3600.0 * math.degrees(1.0)
+NOISE_PX = 0.3
+CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
+LENS = Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.3, p1=1e-3))
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions) -> Database:
+    return sky_of(random_directions(1200, 1))
+
+
+def errors_of(sky: Database, count: int, **stated: object) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors about x, y and z in their standard errors, and the free residuals."""
+    matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
+    errors, free = [], []
+    for frame in simulate_frames(sky.directions, CAMERA, count, Noise(NOISE_PX), 8, sky.mag):
+        found = matcher.identify(frame.centroids_px, CAMERA, magnitudes=frame.mag)
+        if found.ok:
+            turn = found.matrix @ frame.matrix.T
+            skew = 0.5 * ARCSEC * (turn - turn.T)
+            angles = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+            errors.append(angles / np.sqrt(found.covariance_arcsec2.diagonal()))
+            free.append(2 * found.n_matched - 3)
+    assert len(errors) > 0.95 * count
+    return np.array(errors), np.array(free)
+
+
+def test_a_standard_error_is_widened_as_the_quantile_of_student():
+    three_sigma = stats.norm.cdf(3.0)
+    for free in (4, 5, 7, 15, 40, 400):
+        expected = stats.t.ppf(three_sigma, free) / 3.0
+        assert student_widening(free) == pytest.approx(expected, rel=0.04 if free < 5 else 0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+def test_errors_of_a_stated_noise_have_a_chi_square_of_1(sky, engine):
+    errors, _ = errors_of(sky, 20_000, engine=engine, noise_px=NOISE_PX)
+    chi_square = np.square(errors).mean(axis=0)
+    log.info("%s, stated: %d attitudes, chi-square %s", engine, len(errors), chi_square.round(3))
+    assert (np.abs(chi_square - 1.0) <= 0.03).all()
+    beyond = (np.abs(errors) > 3.0).mean()
+    assert beyond == pytest.approx(0.0027, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+def test_errors_without_a_stated_noise_follow_student(sky, engine):
+    errors, free = errors_of(sky, 20_000, engine=engine, tolerance_px=4.0 * NOISE_PX)
+    widening = np.array([student_widening(int(one)) for one in free])[:, None]
+    assert np.median(free) < 30
+    beyond = (np.abs(errors) > 3.0).mean()
+    narrow = (np.abs(errors * widening) > 3.0).mean()
+    p_values = [
+        stats.kstest(stats.t.cdf((errors * widening)[:, axis], free), "uniform").pvalue
+        for axis in range(3)
+    ]
+    log.info(
+        "%s, not stated: %d attitudes, %.2f %% beyond three standard errors, %.2f %% if these are "
+        "not widened; Student's t by Kolmogorov and Smirnov: p from %.2g",
+        *(engine, len(errors), 100.0 * beyond, 100.0 * narrow, min(p_values)),
+    )
+    # As many as of a normal distribution; without the widening three times as many.
+    assert beyond == pytest.approx(0.0027, rel=0.2)
+    assert narrow > 0.005
+    assert min(p_values) > 0.01
+
+
+# --- Both engines
+
+
+@needs_c
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("stated", [{}, {"noise_px": NOISE_PX}], ids=["not stated", "stated"])
+@pytest.mark.parametrize("fov_error", [0.0, 0.02])
+def test_what_the_library_writes_is_what_numpy_makes_of_the_answer(sky, camera, stated, fov_error):
+    matcher, compared = Matcher(sky, engine="c", **stated), 0
+    for frame in simulate_frames(sky.directions, camera, 20, Noise(NOISE_PX, 0.1, 2), 4, sky.mag):
+        rng = np.random.default_rng(3)
+        sigma_px = rng.uniform(0.1, 0.6, len(frame.mag))
+        for sigma in (None, sigma_px, np.where(sigma_px > 0.5, np.nan, sigma_px)):
+            given = {"magnitudes": frame.mag, "sigma_px": sigma, "fov_error": fov_error}
+            found = matcher.identify(frame.centroids_px, camera, **given)
+            if not found.ok:
+                continue
+            compared += 1
+            again = replace(found)  # without what the library has written
+            assert again.star_ids.tolist() == found.star_ids.tolist()
+            np.testing.assert_allclose(again.q_body_from_icrs, found.q_body_from_icrs, atol=1e-15)
+            # The library has the derivative of the camera, numpy differences of directions.
+            deviations = np.sqrt(found.covariance_arcsec2.diagonal())
+            scaled = (again.covariance_arcsec2 - found.covariance_arcsec2) / deviations
+            assert np.abs(scaled / deviations[:, None]).max() < 1e-8
+            chi_square = pytest.approx(again.reduced_chi_square, rel=1e-8, nan_ok=True)
+            assert found.reduced_chi_square == chi_square
+    assert compared > 30
+
+
+@needs_c
+def test_arrays_are_where_the_library_writes_them():
+    ffi = c_engine._onboard.ffi
+    for name, at in (
+        ("q_body_from_icrs", result.Q_AT),
+        ("matrix", result.MATRIX_AT),
+        ("covariance_arcsec2", result.COVARIANCE_AT),
+    ):
+        assert ffi.offsetof("starcat_answer", name) == at
+    assert ffi.sizeof("starcat_answer") == ffi.offsetof("starcat_memory", "stars") == result.IDS_AT
+    assert c_engine._NUMBERS.size == result.Q_AT
+
+
+@needs_c
+def test_an_answer_of_the_library_is_an_ordinary_one(sky):
+    [frame] = simulate_frames(sky.directions, CAMERA, 1, Noise(NOISE_PX), 8, sky.mag)
+    found = Matcher(sky, engine="c").identify(frame.centroids_px, CAMERA)
+    assert type(found) is result.MatchResult
+    made = {field.name: getattr(found, field.name) for field in fields(found)}
+    same = result.MatchResult(**made)
+    assert repr(same) == repr(found)
+    for name in ("star_ids", "q_body_from_icrs", "covariance_arcsec2", "matrix", "star_index"):
+        assert getattr(found, name).flags.writeable
+        assert getattr(found, name).dtype == getattr(same, name).dtype
+        assert getattr(found, name).shape == getattr(same, name).shape
+    assert not hasattr(found, "attitude")
+
+
+@needs_c
+def test_equal_cameras_share_a_prepared_search(sky):
+    matcher = Matcher(sky, engine="c")
+    [frame] = simulate_frames(sky.directions, CAMERA, 1, Noise(NOISE_PX), 8, sky.mag)
+    expected = matcher.identify(frame.centroids_px, CAMERA)
+    for _ in range(50):
+        found = matcher.identify(frame.centroids_px, replace(CAMERA))
+        assert found.matrix.tolist() == expected.matrix.tolist()
+        assert found.camera == CAMERA
+    assert len(set(map(id, matcher._searches.values()))) == 1
+    for focal_length_px in np.linspace(2000.0, 3000.0, 50):
+        camera = Camera(1024, 1024, focal_length_px)
+        answer = matcher.identify(frame.centroids_px, camera)
+        assert answer.camera in (None, camera)
+    assert len(matcher._searches) <= 32
