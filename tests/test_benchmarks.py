@@ -11,7 +11,8 @@ FOLDER = Path(__file__).parent / "benchmarks"
 LACKING = 77
 
 BENCHMARKS = [
-    "acquisition", "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines", "false_matches", "fields",
+    "acquisition", "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines",
+    "false_matches", "fields",
     "hostile", "ingest", "instructions", "interrupts",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
     "matcher --of ruststartracker", "pictures", "products", "scale", "service", "service_load",

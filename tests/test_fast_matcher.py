@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frames import assert_same
 from frames import frames_of as frames
 from hypothesis import given
 from hypothesis import strategies as st
@@ -43,21 +44,6 @@ def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matc
         Matcher(sky, method, engine="c", **stated),
         Matcher(sky, method, engine="numpy", **stated),
     )
-
-
-def assert_same(found: MatchResult, expected: MatchResult) -> None:
-    """Check that two matchers say the same of a frame."""
-    assert found.status == expected.status
-    assert found.star_index.tolist() == expected.star_index.tolist()
-    assert found.star_ids.tolist() == expected.star_ids.tolist()
-    assert found.dropped == expected.dropped
-    assert found.n_matched == expected.n_matched
-    close = {"rtol": 1e-9, "atol": 1e-9, "equal_nan": True}
-    np.testing.assert_allclose(found.q_body_from_icrs, expected.q_body_from_icrs, **close)
-    np.testing.assert_allclose(found.residual_arcsec, expected.residual_arcsec, **close)
-    # The directions in an image are rounded; the bound is a power of residuals.
-    chance = np.log([found.false_match_probability, expected.false_match_probability])
-    assert chance[0] == pytest.approx(chance[1], abs=0.02)
 
 
 # --- The same stars

@@ -40,7 +40,7 @@
 #define UNKNOWN 255u
 
 #define MIN_RADIUS_RAD R(1e-4)
-#define MAX_RADIUS_RAD R(1.5)
+#define MAX_RADIUS_RAD R(1.57)
 
 /* A centroid around the reference, in the units of neighbours. */
 typedef struct {

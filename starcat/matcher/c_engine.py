@@ -24,6 +24,7 @@ from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
+from starcat.matcher.methods.votes import has_few_neighbours
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
@@ -41,9 +42,6 @@ except ImportError:  # the wheel was built without a compiler
 
 MAX_STEPS = 300_000_000
 """Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
-
-MAX_NEIGHBOURS = 16_000_000
-"""Neighbours of stars, four bytes each, up to which frames are solved by votes."""
 
 CHUNK = 256
 """Frames that one thread takes at a time."""
@@ -174,7 +172,7 @@ class CEngine:
                 f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
             )
         own = np.arange(int(self.image.n_stars)) if rows is None else rows
-        self._neighbours = _neighbours(self.image, database.camera.radius_rad)
+        self._neighbours = _neighbours(self.image, database)
         self.image.neighbours = self._neighbours[0]
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
         self._directions = self.image.exact = _double_pointer(directions)
@@ -185,20 +183,18 @@ class CEngine:
         return Search(self, camera, settings, fov_error)
 
 
-def _neighbours(image: Any, radius_rad: float) -> tuple[Any, ...]:
-    """Return the table of the neighbours of an image's stars, and what has to be kept with it."""
+def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
+    """Return the neighbours of an image's stars, for votes, and the memory they are in."""
     ffi, lib = _onboard.ffi, _onboard.lib
-    count = int(image.n_stars)
-    first = ffi.new("uint32_t[]", count + 1)
-    table = ffi.new("starcat_neighbours *", [radius_rad, 0, 0, first, ffi.NULL])
-    lib.starcat_list_all_neighbours(image, table)
-    needed = first[count]
-    if not needed or needed > MAX_NEIGHBOURS:
+    if not has_few_neighbours(database):
         return (ffi.NULL,)
-    table.neighbour = neighbour = ffi.new("starcat_neighbour[]", needed)
-    table.capacity = needed
-    lib.starcat_list_all_neighbours(image, table)
-    return table, first, neighbour
+    first = ffi.new("uint32_t[]", int(image.n_stars) + 1)
+    table = ffi.new("starcat_neighbours *", [database.camera.radius_rad, 0, 0, first, ffi.NULL])
+    lib.starcat_list_all_neighbours(image, table)  # how many there are
+    table.capacity = first[int(image.n_stars)]
+    table.neighbour = kept = ffi.new("starcat_neighbour[]", table.capacity)
+    status = lib.starcat_list_all_neighbours(image, table)
+    return (table, first, kept) if status == lib.STARCAT_OK else (ffi.NULL,)
 
 
 class Search:

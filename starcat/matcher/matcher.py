@@ -47,10 +47,6 @@ from starcat.matcher.settings import (
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
-WIDE_PX = 4.0
-"""With a wider tolerance, ``auto`` is ``numpy``, which tries smaller reaches too."""
-
-
 MAX_CAMERAS = 16
 """Cameras that a matcher keeps ready for the C library."""
 
@@ -308,10 +304,7 @@ class Matcher(Settings, _WithDatabase):
     @property
     def _c_engine(self) -> CEngine | None:
         """The C library with this matcher's image, where it serves."""
-        is_wide = self.engine == "auto" and self.tolerance_px > WIDE_PX
         if self.engine == "numpy" or not has_default_search(self):
-            return None
-        if is_wide and self.database.image is None:
             return None
         return c_engine(self.database, self.method, self.engine == "c")
 

@@ -54,21 +54,26 @@ def proposals(observation: Observation, database: Database) -> Iterator[Candidat
 def _search(
     observation: Observation, database: Database, prior: Prior | None, best: BestOf
 ) -> Limit | None:
-    whole_sky = proposals(observation, database)
     try:
         if prior is not None:
+            whole_sky = proposals(observation, database)
             search_near(prior, observation, database, best, whole_sky)
             return None
-        _search_sky(whole_sky, observation, database, best)
+        search_sky(observation, database, best)
     except BudgetSpentError as spent:
         return spent.limit
     return None
 
 
-def _search_sky(
-    patterns: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
-) -> None:
-    """Try the patterns of the method; where the first ones do not solve a frame, votes."""
+def search_sky(observation: Observation, database: Database, best: BestOf) -> None:
+    """Search without a prior attitude: from what is cheap to what is thorough.
+
+    The patterns of the method come first. If the first ones do not solve the frame, votes follow
+    (`starcat.matcher.methods.votes`), and in a frame of more centroids than have a vote the other
+    patterns. The bound on false matches is that of the best agreement: it holds for all attitudes
+    together, however many are tried.
+    """
+    patterns = proposals(observation, database)
     if not votes.serve(observation, database):
         _try(patterns, observation, database, best)
         return

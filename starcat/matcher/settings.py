@@ -140,8 +140,8 @@ class Settings:
         default, which is about a second. Steps of the C library are smaller, 1 to
         5 nanoseconds each; its own limit is about a second too.
     time_limit_s : float
-        Seconds that a frame may take. Infinite by default. Where this, ``min_share``,
-        ``max_steps`` or a tolerance above 4 px is given, ``auto`` is ``numpy``.
+        Seconds that a frame may take. Infinite by default. Where this, ``min_share`` or
+        ``max_steps`` is given, ``auto`` is ``numpy``.
     """
 
     method: str = "triangle"

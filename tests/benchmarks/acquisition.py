@@ -2,10 +2,10 @@
 
     python tests/benchmarks/acquisition.py [--frames 2000] [--peers]
 
-Frames are of ``sao15``, the preset ``sao-12deg`` with a field of 15 deg: the magnitudes have a noise
-of 0.3, each star is missing with a probability, and there are as many false spots as stars would be
-missing on average, with magnitudes that are drawn from the sky. Such frames are those of Fu, Lin and
-Li 2025 (Sensors 25, 4201).
+Frames are of ``sao15``, the preset ``sao-12deg`` with a field of 15 deg. Magnitudes have a noise of
+0.3. Each star is missing with a probability, and there are as many false spots as stars are missing
+on average, with magnitudes that are drawn from the sky. Fu, Lin and Li 2025 (Sensors 25, 4201) use
+such frames.
 
 An answer is right as in ``judging.py``: no place of the frame is off by more than the tolerance and
 five times the error that the noise of the named spots makes. A frame that has no answer is compared
@@ -101,7 +101,9 @@ def why_refused(stars: Database, settings: Settings, frame: SimulatedFrame) -> s
     return found.withheld or "chance"
 
 
-def solve(artifact: Path, kind: Kind, frames: list[SimulatedFrame], stated: dict[str, float]) -> Found:
+def solve(
+    artifact: Path, kind: Kind, frames: list[SimulatedFrame], stated: dict[str, float]
+) -> Found:
     """Identify the frames of a row."""
     matcher, found = Matcher.open(artifact, engine="c", **stated), Found()
     matcher.identify(np.zeros((0, 2)))

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.numpy_engine import proposals, result_of_search
+from starcat.matcher.numpy_engine import result_of_search, search_sky
 from starcat.matcher.observation import as_frame, observe
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH, Budget, BudgetSpentError, Limit, certainty
-from starcat.matcher.verification import Agreement, BestOf, verify_candidates
+from starcat.matcher.verification import Agreement, BestOf
 
 Rows = NDArray[np.integer]
 Verdict = Literal["right", "no sky", "attitude", "names"]
@@ -116,6 +116,11 @@ class AllOf(BestOf):
         """Whether the search is over."""
         return not self.is_endless and super().is_certain
 
+    @property
+    def is_likely(self) -> bool:
+        """Whether the attitude is known."""
+        return not self.is_endless and super().is_likely
+
     def offer(self, found: Agreement) -> None:
         """Keep an agreement."""
         if found.chance < NOTABLE:
@@ -145,10 +150,7 @@ def search(
     best = AllOf(certainty(matcher), is_endless=is_endless)
     limit: Limit | None = None
     try:
-        for candidates in proposals(seen, scene.database):
-            verify_candidates(candidates, seen, scene.database, best)
-            if best.is_certain:
-                break
+        search_sky(seen, scene.database, best)
     except BudgetSpentError as spent:
         limit = spent.limit
     found: dict[Verdict, Notable] = {}

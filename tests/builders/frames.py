@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import pytest
 from numpy.typing import ArrayLike
 
 from starcat.geometry.camera import Camera
 from starcat.matcher import observation
 from starcat.matcher.database import Database
+from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
@@ -42,3 +45,18 @@ def with_selection(seen: observation.Observation, **order: Any) -> observation.O
     """Return an observation whose triangles come in another order."""
     chosen = replace(seen.settings, selection=TriangleOrder(**order))
     return replace(seen, settings=chosen)
+
+
+def assert_same(found: MatchResult, expected: MatchResult, log_error: float = 0.02) -> None:
+    """Check that two matchers say the same of a frame."""
+    assert found.status == expected.status
+    assert found.star_index.tolist() == expected.star_index.tolist()
+    assert found.star_ids.tolist() == expected.star_ids.tolist()
+    assert found.dropped == expected.dropped
+    assert found.n_matched == expected.n_matched
+    close = {"rtol": 1e-9, "atol": 1e-9, "equal_nan": True}
+    np.testing.assert_allclose(found.q_body_from_icrs, expected.q_body_from_icrs, **close)
+    np.testing.assert_allclose(found.residual_arcsec, expected.residual_arcsec, **close)
+    # The directions in an image are rounded; the bound is a power of residuals.
+    chance = np.log([found.false_match_probability, expected.false_match_probability])
+    assert chance[0] == pytest.approx(chance[1], abs=log_error)

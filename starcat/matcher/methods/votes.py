@@ -1,12 +1,13 @@
-"""Votes for how a frame is turned about one of its centroids, for frames that triangles do not solve.
+"""Votes for how a frame is turned about a centroid, for frames that triangles do not solve.
 
-Where centroids are far from their places, or most of them are false, a triangle of centroids is like
-thousands of triangles of stars, and hardly any triangle is of stars alone. The stars around the right
-star of a centroid, the reference, agree on how the frame is turned about it: each of them, with
-a centroid as far away and of like magnitude, votes for the difference of their position angles. The
-stars around another star agree on nothing. Fu et al. 2025 compare such patterns around a star.
+If centroids are far from their places, an observed triangle is like thousands of triangles of
+stars. If most centroids are false, hardly any triangle has three stars. Votes still work then. One
+centroid is the reference, and each star in turn is tried as its star. Every neighbour of that star
+votes with every centroid that is as far from the reference and as bright: for the difference of
+their position angles, which is the turn of the frame. The neighbours of the right star agree on
+one turn; the neighbours of a wrong star do not agree. Fu et al. 2025 compare such patterns.
 
-``onboard/src/votes.c`` follows the same rules with the same units, so that both propose the same.
+``onboard/src/votes.c`` follows the same rules in the same units, so that both propose the same.
 """
 
 from __future__ import annotations
@@ -70,7 +71,8 @@ class Neighbours:
     """The stars around every star of a database, in small units."""
 
     radius_rad: float
-    offsets: NDArray[np.int64]  # those of star s are from offsets[s] to offsets[s + 1]; shape (N + 1,)
+    # The neighbours of star s are those from offsets[s] to offsets[s + 1]; shape (N + 1,).
+    offsets: NDArray[np.int64]
     star: NDArray[np.int32]  # row of the database; shape (M,)
     apart: NDArray[np.uint16]  # separation, the radius over `APART`; shape (M,)
     turn: NDArray[np.uint8]  # position angle, a turn over 256; shape (M,)
@@ -97,11 +99,16 @@ VOTING = ("triangle", "pyramid")
 
 
 def serve(observation: Observation, database: Database) -> bool:
-    """Return whether votes may be counted: as in C, with the default search, at a known scale."""
-    settings, count = observation.settings, len(database.mag)
-    expected = (count * math.sin(0.5 * database.camera.radius_rad)) ** 2
+    """Return whether votes may be counted: with the default search, where the scale is known."""
+    settings = observation.settings
     is_own = settings.method in VOTING and settings.selection == TriangleOrder()
-    return is_own and not observation.fov_error and expected <= MAX_NEIGHBOURS
+    return is_own and not observation.fov_error and has_few_neighbours(database)
+
+
+def has_few_neighbours(database: Database) -> bool:
+    """Return whether a table of the neighbours of all stars is small enough."""
+    pairs = (len(database.mag) * math.sin(0.5 * database.camera.radius_rad)) ** 2
+    return pairs <= MAX_NEIGHBOURS
 
 
 def candidates(
@@ -212,7 +219,7 @@ def _agreeing(
     database: Database,
     table: Neighbours,
 ) -> Candidates | None:
-    """Return a star of the reference with the pairs that voted for it and agree with one of them."""
+    """Return a star with the pairs that voted for it and agree with one of them."""
     entry = slice(*table.offsets[star : star + 2])
     apart = table.apart[entry, None]
     votes = (apart >= voters.nearest) & (apart <= voters.farthest)
@@ -230,7 +237,9 @@ def _agreeing(
     known = position_angle(np.broadcast_to(u[star], (len(n), 3)), u[near])
     middle = (turn + PER_BIN - 0.5) / TURN * math.tau
     own = np.remainder(known - seen - middle + math.pi, math.tau) - math.pi
-    error = observation.side_tolerance_rad / np.sin(observation.separation_rad[reference, centroids])
+    error = observation.side_tolerance_rad / np.sin(
+        observation.separation_rad[reference, centroids]
+    )
     agree = np.abs(own[:, None] - own) <= error[:, None]  # votes in rows, what they agree with
     best = int(agree.sum(axis=0).argmax())
     kept = agree[:, best]
@@ -241,9 +250,10 @@ def _agreeing(
 
 
 def position_angle(centre: Directions, other: Directions) -> Array:
-    """Return the position angles of directions at others, radians, from an axis of the centre's own.
+    """Return the position angles of directions at centres, radians, shape (N,).
 
-    Both of shape (N, 3). Only differences at one centre have a meaning.
+    Both of shape (N, 3). Each centre has an axis of its own, so that only differences at one
+    centre have a meaning.
     """
     x, y, z = centre.T
     none = np.zeros(len(centre))

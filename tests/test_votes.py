@@ -1,0 +1,157 @@
+"""Votes: frames that triangles do not solve, in C and in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from frames import assert_same
+
+from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.matcher import c_engine, numpy_engine
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods import votes
+from starcat.matcher.observation import as_frame, observe
+from starcat.matcher.settings import Settings, TriangleOrder
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+
+CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
+STATED = {"noise_px": 3.0, "noise_mag": 0.3}
+HALF = Noise(3.0, 0.5, 15, noise_mag=0.3)
+"""Half of about 30 stars are missing, and there are as many false spots."""
+
+needs_c = pytest.mark.skipif(
+    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
+)
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions) -> Database:
+    found: Database = sky_of(random_directions(3000, 1))
+    return found
+
+
+@pytest.fixture(scope="module")
+def frames(sky) -> list[SimulatedFrame]:
+    generator = np.random.default_rng(5)
+    points = Sky(sky.directions, sky.mag, np.arange(len(sky.mag), dtype=np.int32))
+    return [
+        simulate_frame(points, CAMERA, matrix, HALF, generator)
+        for matrix in random_attitudes(40, generator)
+    ]
+
+
+def settings(**changes: object) -> Settings:
+    return Settings(engine="numpy", **(STATED | changes))  # type: ignore[arg-type]
+
+
+def test_the_table_lists_each_neighbour_of_each_star_once(sky):
+    radius_rad = 0.1
+    table = votes.neighbours(sky, radius_rad)
+    apart = np.arccos(np.clip(sky.directions @ sky.directions.T, -1.0, 1.0))
+    np.fill_diagonal(apart, np.inf)
+    for star in (0, 17, 2999):
+        entry = slice(*table.offsets[star : star + 2])
+        near = np.flatnonzero(apart[star] <= radius_rad)
+        assert sorted(table.star[entry].tolist()) == near.tolist()
+        units = table.apart[entry] / votes.APART * radius_rad
+        np.testing.assert_allclose(units, apart[star, table.star[entry]], atol=1e-5)
+        mags = table.magnitude[entry] / votes.PER_MAGNITUDE + votes.BRIGHTEST
+        np.testing.assert_allclose(mags, sky.mag[table.star[entry]], atol=0.51 / 16.0)
+
+
+def test_a_turn_of_the_sky_is_a_turn_of_all_position_angles(sky):
+    [matrix] = random_attitudes(1, np.random.default_rng(3))
+    u = sky.directions[:50]
+    centre = np.broadcast_to(u[0], (49, 3))
+    turned = votes.position_angle(centre @ matrix.T, u[1:] @ matrix.T)
+    difference = np.exp(1j * (turned - votes.position_angle(centre, u[1:])))
+    np.testing.assert_allclose(difference, difference[0], atol=1e-9)
+
+
+def test_votes_solve_frames_that_triangles_do_not(sky, frames):
+    """With another order of triangles there are no votes: the same triangles, and all of them."""
+    found = Matcher(sky, engine="numpy", **STATED)
+    alone = Matcher(sky, engine="numpy", selection=TriangleOrder(most_centroids=31), **STATED)
+    right = [0, 0]
+    for frame in frames[:12]:
+        for row, matcher in enumerate((found, alone)):
+            answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            if answer.ok:
+                assert np.degrees(np.arccos(answer.matrix[2] @ frame.matrix[2])) < 0.2
+                right[row] += 1
+    assert right[0] >= right[1]
+    assert right[0] >= 10
+
+
+@needs_c
+@pytest.mark.parametrize("stated", [STATED, {"tolerance_px": 9.0}], ids=["stated", "not stated"])
+@pytest.mark.parametrize("has_magnitudes", [True, False])
+def test_both_engines_say_the_same(sky, frames, stated, has_magnitudes):
+    fast = Matcher(sky, engine="c", **stated)
+    slow = Matcher(sky, engine="numpy", **stated)
+    for frame in frames[:10]:
+        mag = frame.mag if has_magnitudes else None
+        answers = [one.identify(frame.centroids_px, magnitudes=mag) for one in (fast, slow)]
+        if all(answer.ok for answer in answers):
+            # A magnitude that an image rounds may be compatible with one centroid more.
+            assert_same(*answers, log_error=0.1)
+        assert answers[0].status == answers[1].status
+
+
+@needs_c
+def test_c_solves_as_many_and_none_wrongly(sky, frames):
+    matcher, right = Matcher(sky, **STATED), 0
+    assert matcher._c_engine is not None
+    for frame in frames:
+        answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        if answer.ok:
+            assert np.degrees(np.arccos(answer.matrix[2] @ frame.matrix[2])) < 0.2
+            right += 1
+    assert right >= 34
+
+
+def test_votes_are_for_the_default_search_at_a_known_scale(sky, frames):
+    frame = as_frame(frames[0].centroids_px, CAMERA, frames[0].mag)
+    assert votes.serve(observe(frame, settings()), sky)
+    assert votes.serve(observe(frame, settings(method="pyramid")), sky)
+    assert not votes.serve(observe(frame, settings(method="pairs")), sky)
+    assert not votes.serve(observe(frame, settings(selection=TriangleOrder("inradius"))), sky)
+    assert not votes.serve(observe(frame, settings(), fov_error=0.02), sky)
+
+
+def test_a_large_database_has_no_table(sky, monkeypatch, frames):
+    monkeypatch.setattr(votes, "MAX_NEIGHBOURS", 10)
+    frame = as_frame(frames[0].centroids_px, CAMERA, frames[0].mag)
+    assert not votes.serve(observe(frame, settings()), sky)
+
+
+def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):
+    """No reference is tried after the attitude is known, although its stars are too few."""
+    tried = []
+    own = votes.candidates
+    monkeypatch.setattr(numpy_engine, "STEPS_BEFORE_VOTES", 0)
+    monkeypatch.setattr(votes, "candidates", lambda *given: tried.append(given[0]) or own(*given))
+    strict = Matcher(sky, engine="numpy", max_false_match_probability=1e-300, **STATED)
+    answer = strict.identify(frames[0].centroids_px, magnitudes=frames[0].mag)
+    assert not answer.ok
+    assert answer.refusal.reason == "chance"
+    assert 0 < len(tried) < votes.MAX_REFERENCES
+
+
+def test_one_bright_centroid_may_be_few_stars(sky):
+    """The leaders of a reference are among the stars of its magnitude, the right one first."""
+    generator = np.random.default_rng(11)
+    points = Sky(sky.directions, sky.mag, np.arange(len(sky.mag), dtype=np.int32))
+    [matrix] = random_attitudes(1, generator)
+    frame = simulate_frame(points, CAMERA, matrix, Noise(0.5, noise_mag=0.1), generator)
+    seen = observe(as_frame(frame.centroids_px, CAMERA, frame.mag), settings(noise_px=0.5))
+    table = votes.neighbours(sky, CAMERA.radius_rad)
+    voters = votes.voters_of(0, seen, table.radius_rad)
+    compatible = seen.compatible(sky.mag)
+    assert compatible is not None
+    stars = compatible[0].nonzero()[0]
+    assert len(stars) < len(sky.mag)
+    best, _ = votes.leaders(stars, voters, table)[0]
+    assert best == frame.star_index[seen.rows[0]]
