@@ -192,6 +192,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   call->own->given = frame->count;
   call->own->count = 0;
   call->own->n_tried = 0;
+  call->own->n_looked_up = 0;
   call->own->steps_left = options->max_steps;
   work->best.log_chance = R(0.0);
   work->best.log_bound = R(0.0);

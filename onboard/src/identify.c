@@ -26,34 +26,34 @@
 #define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
 #define STEPS_BEFORE_VOTES 150000u
-#define STEPS_AFTER_VOTES 6000000u
+#define STEPS_AFTER_VOTES 200000u
+#define STEPS_OF_CROWDED 6000000u /* after votes, of more centroids than have a vote */
 
-static void limit_steps(const starcat_call *call, uint32_t most) {
-  call->own->steps_left = call->own->steps_left < most ? call->own->steps_left : most;
+/* Look triangles up, with a part of the steps that are left. Returns whether that was all of them. */
+static int search_some(starcat_call *call, uint32_t most) {
+  const uint32_t kept = call->own->steps_left > most ? call->own->steps_left - most : 0u;
+  call->own->steps_left -= kept;
+  starcat_search_triangles(call, call->image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle
+                                                                         : starcat_look_up_pyramid);
+  const int is_complete = call->own->steps_left > 0u;
+  call->own->steps_left += kept;
+  return is_complete;
 }
 
-/* Look triangles up; where votes can be counted, only the first ones, then the votes, then in a
- * frame of more centroids than have a vote the triangles again. */
+/* Look triangles up; where votes can be counted, only the first ones, then the votes, then the next
+ * triangles: more of them in a frame of more centroids than have a vote. */
 static void search_sky(starcat_call *call) {
-  const starcat_look_up look_up =
-      call->image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle : starcat_look_up_pyramid;
   const starcat_agreement *best = &call->work->best;
-  const uint32_t steps = call->own->steps_left;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
-    starcat_search_triangles(call, look_up);
+    (void)search_some(call, UINT32_MAX);
     return;
   }
-  limit_steps(call, STEPS_BEFORE_VOTES);
-  const uint32_t limit = call->own->steps_left;
-  starcat_search_triangles(call, look_up);
-  const int is_complete = call->own->steps_left > 0u;
-  call->own->steps_left += steps - limit;
+  const int is_complete = search_some(call, STEPS_BEFORE_VOTES);
   if (!(best->log_chance <= call->log_certain)) {
     starcat_search_votes(call);
-    if (!is_complete && (call->own->count > STARCAT_MAX_VOTERS) &&
-        !(best->log_bound <= STARCAT_LOG_LIKELY)) {
-      limit_steps(call, STEPS_AFTER_VOTES);
-      starcat_search_triangles(call, look_up);
+    if (!is_complete && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
+      const int is_crowded = call->own->count > STARCAT_MAX_VOTERS;
+      (void)search_some(call, is_crowded ? STEPS_OF_CROWDED : STEPS_AFTER_VOTES);
     }
   }
 }

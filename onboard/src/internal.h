@@ -92,6 +92,7 @@ typedef struct {
   uint32_t is_crowded;       /* whether separations of pairs are not listed */
   uint32_t n_near, n_within; /* stars around the field of an attitude; those within reach of it */
   uint32_t steps_left, n_tried;
+  uint32_t n_looked_up; /* triangles, which a search that goes on leaves out */
 } starcat_counters;
 
 /* One call. Where the focal length is fitted, the camera and the directions of the centroids are

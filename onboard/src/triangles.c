@@ -42,7 +42,7 @@ typedef struct {
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
   int poor;      /* in the second round, those that the first has left out */
-  uint32_t left; /* triangles that may still be looked up */
+  uint32_t done; /* triangles that a search before this one has looked up */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -89,10 +89,14 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
   if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, STARCAT_COS_LEAST_ANGLE)) {
     return 0;
   }
-  if (s->left == 0u) {
+  if (s->done > 0u) {
+    s->done--;
+    return 0;
+  }
+  if (call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) {
     return 1;
   }
-  s->left--;
+  call->own->n_looked_up++;
   return s->look_up(call, triple, sides);
 }
 
@@ -272,7 +276,7 @@ static int search_by_neighbours(starcat_call *call, search *s) {
 }
 
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
-  search s = {look_up, call->own->count, R(0.0), R(0.0), 0, STARCAT_MOST_TRIANGLES};
+  search s = {look_up, call->own->count, R(0.0), R(0.0), 0, call->own->n_looked_up};
   s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
   s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   call->own->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (call->own->has_magnitudes == 0u);

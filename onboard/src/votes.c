@@ -371,7 +371,7 @@ void starcat_search_votes(starcat_call *call) {
   }
   for (uint32_t r = 0; (r < call->own->count) && (r < MAX_REFERENCES); r++) {
     uint32_t count = 0;
-    if (call->work->best.log_bound <= STARCAT_LOG_LIKELY) {
+    if (call->work->best.log_chance <= STARCAT_LOG_LIKELY) {
       return; /* this is the attitude, and no other search makes it certain */
     }
     list_voters(call, r, &s);

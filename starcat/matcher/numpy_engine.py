@@ -20,6 +20,9 @@ from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 STEPS_BEFORE_VOTES = 2000
 """Steps of comparing patterns before votes are counted."""
 
+STEPS_AFTER_VOTES = 5000
+"""Steps of comparing patterns after that, in a frame whose centroids all have a vote."""
+
 
 def solve(
     settings: Settings,
@@ -85,8 +88,10 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
         proposed = votes.candidates(reference, observation, database)
         if _try(proposed, observation, database, best):
             return
-    if len(observation) > votes.MAX_VOTERS and not best.is_likely:
-        _try(patterns, observation, database, best)
+    if not best.is_likely:
+        is_crowded = len(observation) > votes.MAX_VOTERS
+        steps = math.inf if is_crowded else STEPS_AFTER_VOTES
+        _try(patterns, observation, database, best, steps)
 
 
 def _try(

@@ -135,7 +135,7 @@ class BestOf:
     @property
     def is_likely(self) -> bool:
         """Whether the attitude is known, although its stars may not make it certain."""
-        return self.found is not None and self.found.chance <= LIKELY
+        return self.found is not None and self.found.false_match_probability <= LIKELY
 
     def offer(self, found: Agreement) -> None:
         """Keep an agreement if it is better than the best one so far."""

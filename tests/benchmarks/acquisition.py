@@ -29,7 +29,7 @@ from judging import judge_answer
 from matcher import answers_of, count_answers, write_frames
 from rows import Options, Rows, database, ended
 
-from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes
+from starcat.geometry.attitude import random_attitudes
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import as_frame, observe
@@ -148,9 +148,7 @@ def ask_peers(stars: Database, made: dict[str, list[SimulatedFrame]], rows: Rows
                 answers = answers_of(peer, path)
                 for kind in KINDS:
                     matrices = answers[f"{kind.name}_matrices"]
-                    truth = np.array(
-                        [quaternion_from_matrix(frame.matrix) for frame in made[kind.name]]
-                    )[: len(matrices)]
+                    truth = np.array([frame.matrix for frame in made[kind.name]][: len(matrices)])
                     right, wrong, none = count_answers(matrices, truth)
                     found = Found(Counter(right=right, wrong=wrong, none=none))
                     found.milliseconds = (1e3 * answers[f"{kind.name}_seconds"]).tolist()
