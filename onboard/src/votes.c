@@ -368,11 +368,12 @@ static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   return count < MAX_KEPT ? count + 1u : count;
 }
 
+/* Search with the table of the image, which must not be null. */
 void starcat_search_votes(starcat_call *call) {
   const starcat_neighbours *table = call->image->neighbours;
   surroundings s;
   leader kept[MAX_KEPT + 1u], star = {0, 0, R(0.0)};
-  if ((table == NULL) || (table->n_stars != call->image->n_stars)) {
+  if (table->n_stars != call->image->n_stars) {
     return;
   }
   for (uint32_t r = 0; (r < call->own->count) && (r < MAX_REFERENCES); r++) {
