@@ -10,7 +10,7 @@
 #include "unit.h"
 
 #define RADIUS_RAD 0.475 /* half of the diagonal of the field */
-#define MOST_NEIGHBOURS 60000u
+#define MOST_NEIGHBOURS 160000u
 #define STEPS_BEFORE_VOTES 150000u
 #define OUTSIDE 0x5au
 
@@ -447,6 +447,22 @@ static void check_extremes(void) {
   starcat_set_default_options(&sky.options);
 }
 
+/* Stars so many, and a tolerance so large, that more pairs vote for a star than are listed. */
+static void check_crowded(void) {
+  uint64_t state = 17;
+  list(&unit_crowded, RADIUS_RAD);
+  unit_crowded.options.tolerance_px = (starcat_real)40.0;
+  for (uint32_t n = 0; n < 4u; n++) {
+    sky_look(&unit_crowded.image, &unit_crowded.camera, &state, 0.5, 64, 24, &truth);
+    begin(&unit_crowded, 0);
+    call.own->steps_left = 4000000;
+    starcat_search_votes(&call);
+    CHECK(call.own->n_tried > 0u);
+  }
+  unit_crowded.image.neighbours = NULL;
+  starcat_set_default_options(&unit_crowded.options);
+}
+
 #ifndef STARCAT_SINGLE
 /* Two stars within a hundredth of an arcsecond, too near for an attitude, which have the most votes. */
 static void check_too_near(void) {
@@ -510,6 +526,7 @@ void test_votes(void) {
   check_budgets();
   check_damaged();
   check_extremes();
+  check_crowded();
 #ifndef STARCAT_SINGLE
   check_too_near();
 #endif
