@@ -251,9 +251,11 @@ starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t firs
                                    uint32_t *bad_block);
 
 /* List the neighbours of every star of an image within `radius_rad` of `table`, about half of the
- * diagonal of the field. If `capacity` is too small that is STARCAT_E_CAPACITY, and first[n_stars]
- * is the number that is needed; `neighbour` may be null where `capacity` is 0. Set `neighbours` of
- * the image to the table, and frames that triangles do not solve are solved by votes. */
+ * diagonal of the field: 1e-4 to 1.5. The application sets all fields of `table` but `n_stars`. If
+ * `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the number of
+ * neighbours that is needed; that number is 0 if a star has more than STARCAT_MAX_STARS of them.
+ * `neighbour` can be null if `capacity` is 0. Set `neighbours` of the image to the table, and frames
+ * that triangles do not solve are solved by votes. */
 starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
                                        starcat_neighbours *table);
 

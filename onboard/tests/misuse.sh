@@ -18,6 +18,7 @@ int main(void) {
   (void)starcat_open_image(&image, 0, 0, 0);
   starcat_get_camera(&image, &camera);
   starcat_set_default_options(&options);
+  (void)starcat_list_neighbours(&image, &work, 0);
   (void)starcat_track_frame(&image, &camera, &options, &frame, q, (starcat_real)0.01, &work, &result);
   return (int)starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
 }
@@ -32,7 +33,7 @@ for wrong in "-DSTARCAT_SINGLE 64_192_float" "-DSTARCAT_MAX_CENTROIDS=128 128_19
   "-DSTARCAT_MAX_STARS=400 64_400_double"; do
   set -- $wrong
   ! links "$1" || fail "a caller with $1 links"
-  for name in open_image get_camera set_default_options identify_frame track_frame; do
+  for name in open_image get_camera set_default_options list_neighbours identify_frame track_frame; do
     grep -q "undefined.*starcat_${name}_$2" "$out/said" || fail "$1: starcat_${name}_$2 is not missed"
   done
 done

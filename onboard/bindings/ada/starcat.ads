@@ -53,7 +53,23 @@ package Starcat is
    type Numbers is array (1 .. 6) of Unsigned_32 with Convention => C;
    type Addresses is array (1 .. 6) of System.Address with Convention => C;
 
-   --  An image in place, filled in by Open.
+   --  A neighbour of a star, and the neighbours of all stars: the addresses of
+   --  N_Stars + 1 numbers of Unsigned_32, and of Capacity neighbours.
+   type Neighbour is record
+      Apart           : Unsigned_16;
+      Turn, Magnitude : Unsigned_8;
+   end record with Convention => C;
+
+   type Neighbours is record
+      Radius_Rad        : Real;
+      Capacity, N_Stars : Unsigned_32;
+      First             : System.Address;
+      Neighbour         : System.Address;
+   end record with Convention => C;
+
+   --  An image in place, filled in by Open_Image. Neighbours_Of is Null_Address
+   --  then; with the address of a table that List_Neighbours has filled in,
+   --  frames that triangles do not solve are solved by votes.
    type Image is record
       Bytes                    : System.Address;
       Total_Bytes, Data_Bytes  : Unsigned_32;
@@ -63,6 +79,7 @@ package Starcat is
       Directions, Magnitudes   : System.Address;
       Star_Ids                 : System.Address;  --  Integer_64, by row
       Tables                   : Addresses;
+      Neighbours_Of            : System.Address;
    end record with Convention => C;
 
    type Camera is record
@@ -138,6 +155,13 @@ package Starcat is
    procedure Set_Default_Options (Given : out Options)
      with Import, Convention => C,
           External_Name => "starcat_set_default_options" & Suffix;
+
+   function List_Neighbours
+     (Opened : Image;
+      Work   : in out Workspace;
+      Table  : in out Neighbours) return Status
+     with Import, Convention => C,
+          External_Name => "starcat_list_neighbours" & Suffix;
 
    function Identify_Frame
      (Opened : Image;

@@ -42,6 +42,11 @@ procedure Test_Starcat is
      with Import, Convention => C, External_Name => "size_of_result";
    Size_Of_Image : constant size_t
      with Import, Convention => C, External_Name => "size_of_image";
+   Size_Of_Neighbours : constant size_t
+     with Import, Convention => C, External_Name => "size_of_neighbours";
+
+   type Rows_Of_Stars is array (0 .. 300) of Unsigned_32 with Convention => C;
+   type Memory is array (1 .. 10_000) of Neighbour with Convention => C;
 
    type Words is array (1 .. 75_000) of Unsigned_64;
 
@@ -56,6 +61,9 @@ procedure Test_Starcat is
    State   : Unsigned_64 := 4;
    Good    : Natural := 0;
    Bad     : Unsigned_32 := 9;
+   First   : Rows_Of_Stars := (others => 0);
+   Around  : Memory;
+   Table   : Neighbours;
 
    procedure Check (Holds : Boolean; What : String) is
    begin
@@ -69,6 +77,8 @@ begin
    Check (Workspace'Size / 8 >= Size_Of_Workspace, "room for the workspace");
    Check (Result'Size / 8 = Size_Of_Result, "size of a result");
    Check (Image'Size / 8 = Size_Of_Image, "size of an image");
+   Check (Neighbours'Size / 8 = Size_Of_Neighbours, "size of a table");
+   Check (Neighbour'Size = 32, "size of a neighbour");
    Check (Version_Number >= 200, "the version");
    Check (Open_Image (Opened, Bytes'Address, 512) = E_Magic, "zeros are no image");
 
@@ -77,6 +87,14 @@ begin
    Check (Opened.N_Stars = 300, "it has 300 stars");
    Check (Scrub_Image (Bytes'Address, Size, 0, 2, Bad) = Ok and Bad = 0,
           "it is sound");
+   Table := (0.475, 0, 0, First'Address, Null_Address);
+   Check (List_Neighbours (Opened, Work, Table) = E_Capacity, "no memory");
+   Check (First (300) in 300 .. Around'Length, "how many neighbours");
+   Table.Capacity := First (300);
+   Table.Neighbour := Around'Address;
+   Check (List_Neighbours (Opened, Work, Table) = Ok, "a table");
+   Check (Opened.Neighbours_Of = Null_Address, "no table yet");
+   Opened.Neighbours_Of := Table'Address;
    Get_Camera (Opened, Lens);
    Set_Default_Options (Given);
    Given.Noise_Px := 0.3;

@@ -71,6 +71,17 @@ class image {
     starcat_get_camera(&image_, &made);
     return made;
   }
+  // List the neighbours of every star, so that frames that triangles do not solve are solved by votes:
+  // starcat_list_neighbours says what the table has to have. The table has to outlive the image. If
+  // this fails, frames are solved without votes.
+  starcat_status list_neighbours(starcat_neighbours &table, starcat_workspace &work) noexcept {
+    image_.neighbours = nullptr;
+    const starcat_status listed = starcat_list_neighbours(&image_, &work, &table);
+    if (listed == STARCAT_OK) {
+      image_.neighbours = &table;
+    }
+    return listed;
+  }
   // Check blocks `first` to `first + count`, in idle time.
   starcat_status scrub(std::uint32_t first, std::uint32_t count,
                        std::uint32_t &bad_block) const noexcept {

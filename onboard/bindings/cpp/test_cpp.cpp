@@ -26,7 +26,7 @@ static std::uint64_t words[SKY_MOST_BYTES / 8u];
 int main() {
   const sky_recipe recipe = {1, 2, SKY_STARS, 0.42, 8};
   const std::size_t size = sky_image(&recipe, reinterpret_cast<std::uint8_t *>(words));
-  static const starcat::image image(starcat::span<const std::uint64_t>(words, size / 8u));
+  static starcat::image image(starcat::span<const std::uint64_t>(words, size / 8u));
   CHECK(bool(image));
   CHECK(image.name() == "sky-1.0.0");
   CHECK(image.star_ids().size() == SKY_STARS);
@@ -60,6 +60,20 @@ int main() {
   CHECK(matcher.identify({few, few}) == STARCAT_TOO_FEW_STARS);
   const std::vector<starcat::real> many(STARCAT_MAX_CENTROIDS + 1);
   CHECK(matcher.identify({many, many}) == STARCAT_E_TOO_MANY_CENTROIDS);
+
+  // The table of neighbours: too little memory, then enough; the same answer.
+  static std::uint32_t first[SKY_STARS + 1];
+  static starcat_workspace work;
+  starcat_neighbours table = {starcat::real(0.475), 0, 0, first, nullptr};
+  CHECK(image.list_neighbours(table, work) == STARCAT_E_CAPACITY);
+  CHECK(image.get()->neighbours == nullptr && first[SKY_STARS] > SKY_STARS);
+  std::vector<starcat_neighbour> neighbours(first[SKY_STARS]);
+  table.capacity = first[SKY_STARS];
+  table.neighbour = neighbours.data();
+  CHECK(image.list_neighbours(table, work) == STARCAT_OK);
+  CHECK(image.get()->neighbours == &table && table.n_stars == SKY_STARS);
+  CHECK(matcher.identify({x, y}) == STARCAT_IDENTIFIED);
+  CHECK(matcher.result().n_matched == truth.count);
 
   const starcat::image none(starcat::span<const std::uint64_t>(words + 1, size / 8u - 1u));
   static starcat::matcher idle(none);

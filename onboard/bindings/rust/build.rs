@@ -77,9 +77,9 @@ fn main() {
     let sizes = out.join("sizes.c");
     fs::write(
         &sizes,
-        "#include \"starcat.h\"\nconst uint32_t starcat_crate_sizes[6] = {sizeof(starcat_image), \
+        "#include \"starcat.h\"\nconst uint32_t starcat_crate_sizes[7] = {sizeof(starcat_image), \
          sizeof(starcat_camera), sizeof(starcat_options), sizeof(starcat_frame), \
-         sizeof(starcat_result), sizeof(starcat_workspace)};\n",
+         sizeof(starcat_result), sizeof(starcat_workspace), sizeof(starcat_neighbours)};\n",
     )
     .unwrap();
     archive(&out, "starcat", &[folder.join("starcat.c"), sizes], &flags);

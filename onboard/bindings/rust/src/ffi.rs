@@ -7,6 +7,7 @@ pub const MAX_STARS: usize = 1000002;
 pub const OK: i32 = 0;
 pub const IDENTIFIED: i32 = 0;
 pub const E_CRC: i32 = -8;
+pub const E_CAPACITY: i32 = -9;
 
 #[cfg(feature = "single")]
 pub type Real = f32;
@@ -21,6 +22,25 @@ pub struct Image {
     pub numbers: [u32; 8],
     pub scales: [Real; 8],
     pub sections: [*const u8; 9],
+    pub neighbours: *const Neighbours,
+}
+
+/// A neighbour of a star, in small units; `starcat_neighbour` of C.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Neighbour {
+    apart: u16,
+    turn: u8,
+    magnitude: u8,
+}
+
+#[repr(C)]
+pub struct Neighbours {
+    pub radius_rad: Real,
+    pub capacity: u32,
+    pub n_stars: u32,
+    pub first: *mut u32,
+    pub neighbour: *mut Neighbour,
 }
 
 /// A camera with square pixels; Brown's distortion as in OpenCV.
@@ -98,7 +118,7 @@ const WORKSPACE: usize = 6_400
 pub const WORDS: usize = WORKSPACE / 8 + 1;
 
 extern "C" {
-    pub static starcat_crate_sizes: [u32; 6];
+    pub static starcat_crate_sizes: [u32; 7];
     pub fn starcat_version_number() -> u32;
     pub fn starcat_scrub_image(bytes: *const u8, size: usize, first: u32, count: u32, bad: *mut u32) -> i32;
     #[link_name = "starcat_open_image@SUFFIX@"]
@@ -107,6 +127,8 @@ extern "C" {
     pub fn starcat_get_camera(image: *const Image, camera: *mut Camera);
     #[link_name = "starcat_set_default_options@SUFFIX@"]
     pub fn starcat_set_default_options(options: *mut Options);
+    #[link_name = "starcat_list_neighbours@SUFFIX@"]
+    pub fn starcat_list_neighbours(image: *const Image, work: *mut u64, table: *mut Neighbours) -> i32;
     #[link_name = "starcat_identify_frame@SUFFIX@"]
     pub fn starcat_identify_frame(
         image: *const Image,

@@ -33,7 +33,7 @@ use core::marker::PhantomData;
 use core::mem::{size_of, size_of_val, MaybeUninit};
 use core::ptr;
 
-pub use ffi::{Camera, Options, Real, MAX_CENTROIDS, MAX_STARS};
+pub use ffi::{Camera, Neighbour, Options, Real, MAX_CENTROIDS, MAX_STARS};
 
 /// Why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,6 +186,7 @@ impl<'a> Image<'a> {
             size_of::<ffi::Found>(),
         ];
         let is_same = expected.iter().zip(sizes).all(|(ours, theirs)| *ours == theirs as usize);
+        let is_same = is_same && size_of::<ffi::Neighbours>() == sizes[6] as usize;
         if !is_same || size_of::<Workspace>() < sizes[5] as usize {
             return Err(Error::Configuration);
         }
@@ -228,6 +229,76 @@ impl<'a> Image<'a> {
         // SAFETY: both are sound.
         unsafe { ffi::starcat_get_camera(&self.raw, &mut camera) };
         camera
+    }
+}
+
+/// The neighbours of every star of an image, in memory of the caller. With them frames that
+/// triangles do not solve are solved by votes: [`Matcher::with_neighbours`].
+pub struct Neighbours<'a> {
+    raw: ffi::Neighbours,
+    memory: PhantomData<&'a mut [Neighbour]>,
+}
+
+// SAFETY: it is never changed after it was made, and it alone has the memory.
+unsafe impl Send for Neighbours<'_> {}
+// SAFETY: the same.
+unsafe impl Sync for Neighbours<'_> {}
+
+impl<'a> Neighbours<'a> {
+    /// The number of neighbours that [`Neighbours::list`] needs memory for. `first` needs one number
+    /// more than the image has stars.
+    pub fn count(
+        image: &Image<'_>,
+        radius_rad: Real,
+        first: &mut [u32],
+        work: &mut Workspace,
+    ) -> Result<usize, Error> {
+        let stop = image.n_stars();
+        match Self::fill(image, radius_rad, first, &mut [], work) {
+            Ok(_) => Ok(0),
+            Err(Error::Capacity) if first[stop] > 0 => Ok(first[stop] as usize),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// List the neighbours of every star within a radius, about half of the diagonal of the field.
+    pub fn list(
+        image: &Image<'_>,
+        radius_rad: Real,
+        first: &'a mut [u32],
+        memory: &'a mut [Neighbour],
+        work: &mut Workspace,
+    ) -> Result<Self, Error> {
+        let raw = Self::fill(image, radius_rad, first, memory, work)?;
+        Ok(Neighbours { raw, memory: PhantomData })
+    }
+
+    fn fill(
+        image: &Image<'_>,
+        radius_rad: Real,
+        first: &mut [u32],
+        memory: &mut [Neighbour],
+        work: &mut Workspace,
+    ) -> Result<ffi::Neighbours, Error> {
+        if first.len() <= image.n_stars() {
+            return Err(Error::Lengths);
+        }
+        let mut raw = ffi::Neighbours {
+            radius_rad,
+            capacity: u32::try_from(memory.len()).unwrap_or(u32::MAX),
+            n_stars: 0,
+            first: first.as_mut_ptr(),
+            neighbour: memory.as_mut_ptr(),
+        };
+        // SAFETY: `first` is long enough, `memory` has `capacity` neighbours, and Workspace is large
+        // enough, which Image::open has checked.
+        let status =
+            unsafe { ffi::starcat_list_neighbours(&image.raw, work.0.as_mut_ptr(), &mut raw) };
+        match status {
+            ffi::OK => Ok(raw),
+            ffi::E_CAPACITY => Err(Error::Capacity),
+            _ => Err(failed(status, 0)),
+        }
     }
 }
 
@@ -300,7 +371,8 @@ impl<'f> Frame<'f> {
 
 /// What identifies frames with an image. Change camera and options at will.
 pub struct Matcher<'a> {
-    image: &'a Image<'a>,
+    raw: ffi::Image, // of the caller's image, with its neighbours
+    image: PhantomData<&'a Image<'a>>,
     work: &'a mut Workspace,
     found: ffi::Found,
     /// The camera: at first the one that the image was built for.
@@ -314,7 +386,16 @@ impl<'a> Matcher<'a> {
     pub fn new(image: &'a Image<'a>, work: &'a mut Workspace) -> Self {
         // SAFETY: numbers, for all of which zero is a value.
         let found = unsafe { MaybeUninit::zeroed().assume_init() };
-        Matcher { image, work, found, camera: image.camera(), options: Options::default() }
+        let (raw, camera, options) = (image.raw.clone(), image.camera(), Options::default());
+        Matcher { raw, image: PhantomData, work, found, camera, options }
+    }
+
+    /// The same matcher, which solves frames by votes if triangles do not solve them. Neighbours of an
+    /// image with another number of stars are not used.
+    #[must_use]
+    pub fn with_neighbours(mut self, neighbours: &'a Neighbours<'a>) -> Self {
+        self.raw.neighbours = &neighbours.raw;
+        self
     }
 
     /// Identify the stars of a frame without any prior knowledge.
@@ -324,7 +405,7 @@ impl<'a> Matcher<'a> {
         // checked, and aligned by 8.
         let status = unsafe {
             ffi::starcat_identify_frame(
-                &self.image.raw,
+                &self.raw,
                 &self.camera,
                 &self.options,
                 &raw,
@@ -346,7 +427,7 @@ impl<'a> Matcher<'a> {
         // SAFETY: as above.
         let status = unsafe {
             ffi::starcat_track_frame(
-                &self.image.raw,
+                &self.raw,
                 &self.camera,
                 &self.options,
                 &raw,

@@ -1,6 +1,8 @@
 //! Frames of the made-up sky that the unit test of C looks at, too.
 
-use starcat_onboard::{Camera, Error, Frame, Image, Matcher, Real, Workspace, MAX_CENTROIDS};
+use starcat_onboard::{
+    Camera, Error, Frame, Image, Matcher, Neighbour, Neighbours, Real, Workspace, MAX_CENTROIDS,
+};
 
 #[repr(C)]
 struct Recipe {
@@ -82,6 +84,33 @@ fn frames_are_identified_and_tracked() {
         }
         assert!(found >= 48, "{found}");
     }
+}
+
+#[test]
+fn neighbours_are_listed() {
+    let words = sky(1);
+    let image = Image::open(&words).unwrap();
+    let mut work = Workspace::new();
+    let mut first = [0; 301];
+    let short = Neighbours::count(&image, 0.475, &mut first[..300], &mut work);
+    assert_eq!(short.err(), Some(Error::Lengths));
+    let wide = Neighbours::count(&image, 2.0, &mut first, &mut work);
+    assert_eq!(wide.err(), Some(Error::Options));
+    let count = Neighbours::count(&image, 0.475, &mut first, &mut work).unwrap();
+    assert!((3_000..10_000).contains(&count), "{count}");
+    let mut memory = vec![Neighbour::default(); count];
+    let less = Neighbours::list(&image, 0.475, &mut first, &mut memory[1..], &mut work);
+    assert_eq!(less.err(), Some(Error::Capacity));
+    let table = Neighbours::list(&image, 0.475, &mut first, &mut memory, &mut work).unwrap();
+    let mut matcher = Matcher::new(&image, &mut work).with_neighbours(&table);
+    let truth = look(&image, &matcher.camera, 4);
+    let count = truth.count as usize;
+    let answer = matcher.identify(&Frame::new(&truth.x[..count], &truth.y[..count])).unwrap();
+    assert_eq!(answer.rows(), &truth.star[..count]);
+    // Spots that are no stars: voted on, and refused.
+    let x: Vec<Real> = (0..20).map(|n| (37 * n % 511) as Real).collect();
+    let y: Vec<Real> = (0..20).map(|n| (101 * n % 509) as Real).collect();
+    assert!(matcher.identify(&Frame::new(&x, &y)).is_err());
 }
 
 #[test]
