@@ -204,7 +204,7 @@ static void check_capacity(void) {
 static void check_refused(void) {
   const starcat_neighbours good = {(starcat_real)RADIUS_RAD, MOST_NEIGHBOURS, 0, first, memory};
   const starcat_real radii[7] = {(starcat_real)0.0,      (starcat_real)-0.1, (starcat_real)9e-5,
-                                 (starcat_real)1.51,     (starcat_real)NAN,  (starcat_real)INFINITY,
+                                 (starcat_real)1.58,     (starcat_real)NAN,  (starcat_real)INFINITY,
                                  -(starcat_real)INFINITY};
   table = good;
   CHECK_IS(starcat_list_neighbours(NULL, &unit_work, &table), STARCAT_E_NULL);
