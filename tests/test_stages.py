@@ -1,6 +1,7 @@
 """The stages of a build: their order, what they say that they will do, and what they share."""
 
 import json
+from pathlib import Path
 
 import pytest
 from drafts import chosen
@@ -35,9 +36,11 @@ def test_stages_read_the_sources_of_a_spec(name):
         assert each.does is not None or not each.reads
 
 
-def test_every_stage_has_something_to_do_for_some_spec():
+def test_every_stage_has_something_to_do_for_some_spec(monkeypatch, tmp_path):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
     spec = preset("gaia-12deg", EVERYTHING)
-    stages = explain(spec, {"gcvs": ["there/gcvs.tsv"]})
+    stages = explain(spec, {"gcvs": [Path("there/gcvs.tsv")]})
     assert [each.name for each in stages if each.does is None] == []
     read = {source: files for each in stages for source, files in each.reads.items()}
     assert list(read) == ["gaia", "hipparcos", "gcvs", "wds", "2mass", "sao"]
@@ -52,6 +55,7 @@ def test_stages_have_names_titles_and_summaries_of_their_own():
 
 def test_a_build_is_explained_without_files(starcat, monkeypatch, tmp_path):
     monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
     asked = ["build", "--preset", "sao-12deg", "--explain", "--input", "sao=/nowhere/sao.dat"]
     shown = starcat(asked)
     assert shown.code == 0, shown.err
@@ -60,10 +64,18 @@ def test_a_build_is_explained_without_files(starcat, monkeypatch, tmp_path):
     assert len([line for line in lines if line.startswith(tuple(s.title for s in BUILD))]) == 20
     assert any("amplitudes of variable stars from hipparcos" in line for line in lines)
     assert any(line.endswith("sao sao.dat") for line in lines)
+    assert any(line.endswith("hipparcos (not found)") for line in lines)
     told = json.loads(starcat([*asked, "--json"]).out)
     assert [one["name"] for one in told] == [each.name for each in BUILD]
     assert told[0]["reads"] == {"sao": ["/nowhere/sao.dat"]}
     assert {one["title"]: one["does"] for one in told}["motions"] is None
+
+
+def test_files_that_a_build_finds_are_named(monkeypatch, catalogs):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(catalogs))
+    stages = explain(preset("sao-12deg"), {})
+    read = {source: files for each in stages for source, files in each.reads.items()}
+    assert read == {"sao": (str(catalogs),), "hipparcos": (str(catalogs),)}
 
 
 def test_an_input_that_no_stage_reads_is_refused():

@@ -115,8 +115,9 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
 
 
 def _given(reads: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:
-    """Return each source with the names of the files that were given for it."""
-    return [(name, *(Path(path).name or path for path in paths)) for name, paths in reads.items()]
+    """Return each source with the names of the files and folders that are read of it."""
+    named = {name: [Path(path).name or path for path in paths] for name, paths in reads.items()}
+    return [(name, *(files or ["(not found)"])) for name, files in named.items()]
 
 
 def _build_remotely(

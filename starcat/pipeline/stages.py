@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
+from starcat.catalog.source_files import locate
+from starcat.errors import SourceMissing
 from starcat.pipeline.counterparts import find_counterparts
 from starcat.pipeline.draft import Inputs, Stage
 from starcat.pipeline.finish import (
@@ -64,7 +67,8 @@ class PlannedStage:
     name: str  # of the stage's function
     title: str  # in a word or two
     does: str | None  # None where it does nothing for the spec
-    reads: Mapping[str, tuple[str, ...]]  # what was given of each source that it reads, by name
+    # Files and folders that it would read of each source, by name; none where none was found.
+    reads: Mapping[str, tuple[str, ...]]
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -72,11 +76,18 @@ class PlannedStage:
 
 
 def explain(spec: BuildSpec, inputs: Inputs) -> tuple[PlannedStage, ...]:
-    """Return what each stage of a build will do; no source is looked for or read."""
+    """Return what each stage of a build will do, and where it finds its sources; none is read."""
     check_inputs(spec, inputs)
     return tuple(_planned(each, spec, inputs) for each in BUILD)
 
 
 def _planned(each: Stage, spec: BuildSpec, inputs: Inputs) -> PlannedStage:
-    reads = {name: tuple(map(str, inputs.get(name, ()))) for name in each.reads(spec)}
+    reads = {name: tuple(map(str, _found(name, inputs))) for name in each.reads(spec)}
     return PlannedStage(each.name, each.title, each.plan(spec), reads)
+
+
+def _found(source: str, inputs: Inputs) -> Sequence[Path]:
+    try:
+        return locate(source, inputs)
+    except SourceMissing:
+        return ()
