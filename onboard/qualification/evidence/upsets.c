@@ -1,11 +1,12 @@
-/* Single-event upsets: flips one random bit of the image or of the workspace while a call runs, and
- * counts what comes of it.
+/* Single-event upsets: flips one random bit of the image, of the workspace or of the table of
+ * neighbours while a call runs, and counts what comes of it.
  *
  *   upsets FLIPS SEED
  *
  * The library is compiled with -fsanitize-coverage=trace-pc, so that each basic block of it calls
  * the function below: the n-th one flips the bit, every n of a call being as likely. Half of the
- * flips are in the image, half in the workspace. Each chunk runs in a process of its own, so that
+ * flips are in the workspace, half in the image, or of frames that are solved by votes a quarter in
+ * the image and a quarter in the table. Each chunk runs in a process of its own, so that
  * one that dies is counted and the rest goes on. The same seed flips the same bits.
  *
  * SPDX-License-Identifier: MIT
@@ -22,10 +23,13 @@
 
 #include "random_sky.h"
 
+#define N_SKIES 3u /* triangles; pairs; triangles and votes */
+#define VOTES 2u
 #define N_FRAMES 16u
 #define N_WAYS 8u /* triangle or pyramid, identify or track, noise stated or not */
 #define MAX_STEPS 100000u
-#define MOST_BLOCKS (64u * (uint64_t)MAX_STEPS + 4000000u) /* of a call that ends */
+#define STEPS_OF_VOTES 300000u
+#define MOST_BLOCKS (64u * (uint64_t)STEPS_OF_VOTES + 4000000u) /* of a call that ends */
 #define REACHES 2.0 /* of a match, which a corner of the detector may be off */
 #define REACH 1.5   /* in tolerances */
 #define NOISE_PX 0.3
@@ -79,16 +83,20 @@ static const struct {
               FIELD(seen_icrs),
               FIELD(weight)};
 #define N_FIELDS (sizeof FIELDS / sizeof FIELDS[0])
-static const char *const SECTIONS[] = {"header",  "directions", "magnitudes", "star_ids", "grid",
-                                       "kvector", "triangles",  "radii",      "pairs",    "checks"};
+static const char *const SECTIONS[] = {"header", "directions", "magnitudes", "star_ids",
+                                       "grid",   "kvector",    "triangles",  "radii",
+                                       "pairs",  "checks",     "first",      "neighbour"};
 #define N_SECTIONS 10u
-#define N_PARTS (N_FIELDS + N_SECTIONS)
+#define TABLE (N_FIELDS + N_SECTIONS)
+#define N_PARTS (TABLE + 2u)
 
 typedef struct {
   uint8_t *bytes;
   size_t size;
   starcat_image image;
   starcat_camera camera;
+  starcat_neighbours table; /* of the sky whose frames are solved by votes */
+  size_t table_size;        /* of its memory, from table.first on */
 } sky;
 
 typedef struct {
@@ -108,9 +116,9 @@ typedef struct {
   double largest; /* error of a corner, in reaches */
 } tally;
 
-static sky skies[2];
-static sky_frame frames[N_FRAMES];
-static answer expected[2][N_FRAMES][N_WAYS];
+static sky skies[N_SKIES];
+static sky_frame frames[N_SKIES][N_FRAMES]; /* the first two skies have the same ones */
+static answer expected[N_SKIES][N_FRAMES][N_WAYS];
 static starcat_workspace *work;
 static uint64_t blocks, due, limit;
 static uint8_t *flipped, mask;
@@ -129,7 +137,7 @@ void __sanitizer_cov_trace_pc(void) {
 /* Identify or track a frame; at a block above 0 the bit is flipped. */
 static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) {
   const sky *s = &skies[which];
-  const sky_frame *f = &frames[n];
+  const sky_frame *f = &frames[which][n];
   const starcat_frame frame = {f->count, f->x, f->y, (way & 2u) != 0u ? f->magnitudes : NULL, NULL};
   const starcat_camera camera = s->camera;
   starcat_options options;
@@ -137,7 +145,7 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   memset(work, 0, sizeof *work);
   memset(&a.result, 0, sizeof a.result);
   starcat_set_default_options(&options);
-  options.max_steps = MAX_STEPS;
+  options.max_steps = which == VOTES ? STEPS_OF_VOTES : MAX_STEPS;
   if ((way & 4u) != 0u) {
     options.noise_px = (starcat_real)NOISE_PX;
     options.noise_mag = (starcat_real)0.3;
@@ -212,33 +220,45 @@ static const char *name_of(uint32_t part) {
   return part < N_FIELDS ? FIELDS[part].name : SECTIONS[part - N_FIELDS];
 }
 
+static const char *memory_of(uint32_t part) {
+  return part < N_FIELDS ? "workspace" : part < TABLE ? "image" : "table";
+}
+
 static void tell(const char *what, uint64_t index, const tally *t) {
   (void)fprintf(stderr, "%s: flip %llu, in %s of the %s\n", what, (unsigned long long)index,
-                name_of(t->part), t->part < N_FIELDS ? "workspace" : "image");
+                name_of(t->part), memory_of(t->part));
 }
 
 static void flip(uint64_t index, uint64_t seed, tally *t) {
   uint64_t state = seed * 0x9e3779b97f4a7c15u + index * 0xd1342543de82ef95u;
   (void)sky_uniform(&state);
-  const uint32_t which = (uint32_t)(2.0 * sky_uniform(&state));
+  const uint32_t which = (uint32_t)((double)N_SKIES * sky_uniform(&state));
   const uint32_t n = (uint32_t)((double)N_FRAMES * sky_uniform(&state));
   const uint32_t way = (uint32_t)((double)N_WAYS * sky_uniform(&state));
   const sky *s = &skies[which];
   const answer *golden = &expected[which][n][way];
-  const int in_image = (index & 1u) != 0u;
-  const size_t size = in_image ? s->size : sizeof(starcat_workspace);
+  const int in_table = (which == VOTES) && ((index & 3u) == 1u);
+  const int in_image = ((index & 1u) != 0u) && !in_table;
+  const size_t size = in_table ? s->table_size : in_image ? s->size : sizeof(starcat_workspace);
   const size_t at = (size_t)((double)size * sky_uniform(&state));
   uint32_t bad = 0;
   mask = (uint8_t)(1u << (unsigned)(8.0 * sky_uniform(&state)));
-  flipped = in_image ? s->bytes + at : (uint8_t *)work + at;
+  flipped = in_table   ? (uint8_t *)s->table.first + at
+            : in_image ? s->bytes + at
+                       : (uint8_t *)work + at;
   const uint64_t at_block = 1u + (uint64_t)((double)golden->blocks * sky_uniform(&state));
-  t->part = in_image ? section_of(s, at) : field_of(at);
+  const size_t first_bytes = (s->image.n_stars + 1u) * sizeof *s->table.first;
+  t->part = in_table   ? (uint32_t)TABLE + (uint32_t)(at >= first_bytes)
+            : in_image ? section_of(s, at)
+                       : field_of(at);
   (void)feclearexcept(FE_ALL_EXCEPT);
   const answer a = call(which, n, way, at_block);
   if (in_image) {
     const uint32_t block = (uint32_t)(at / 4096u);
     t->missed +=
         (uint64_t)((starcat_scrub_image(s->bytes, s->size, block, 1, &bad) >= 0) || (bad != block));
+  }
+  if (in_image || in_table) {
     *flipped = (uint8_t)(*flipped ^ mask);
   }
   t->traps += (uint64_t)(fetestexcept(FE_INVALID | FE_DIVBYZERO | FE_OVERFLOW) != 0);
@@ -246,7 +266,7 @@ static void flip(uint64_t index, uint64_t seed, tally *t) {
   int outcome = NONE;
   if (!is_as(a, *golden)) {
     const double error = a.status == STARCAT_IDENTIFIED
-                             ? error_of(&s->camera, &a.result, frames[n].matrix, way)
+                             ? error_of(&s->camera, &a.result, frames[which][n].matrix, way)
                              : 0.0;
     outcome = a.status != STARCAT_IDENTIFIED ? CAUGHT : error <= REACHES ? RIGHT : WRONG;
     t->largest = fmax(t->largest, error);
@@ -257,12 +277,64 @@ static void flip(uint64_t index, uint64_t seed, tally *t) {
   t->counts[t->part][outcome]++;
 }
 
+/* List the neighbours of the stars of a sky, in one piece of memory and no byte more. */
+static void list_neighbours(sky *s) {
+  const size_t rows = s->image.n_stars + 1u;
+  uint32_t *first = malloc(rows * sizeof *first);
+  s->table.radius_rad = (starcat_real)0.475;
+  s->table.first = first;
+  if (starcat_list_neighbours(&s->image, work, &s->table) != STARCAT_E_CAPACITY) {
+    abort();
+  }
+  s->table.capacity = first[s->image.n_stars];
+  s->table_size = rows * sizeof *first + s->table.capacity * sizeof *s->table.neighbour;
+  free(first);
+  s->table.first = malloc(s->table_size);
+  s->table.neighbour = (starcat_neighbour *)(void *)(s->table.first + rows);
+  if (starcat_list_neighbours(&s->image, work, &s->table) != STARCAT_OK) {
+    abort();
+  }
+  s->image.neighbours = &s->table;
+}
+
+/* A frame of at least seven stars and up to two false spots. */
+static void look(sky_frame *frame, uint32_t n_false, uint64_t *state) {
+  do {
+    sky_look(&skies[0].image, &skies[0].camera, state, 0.2, SKY_SPOTS, n_false, frame);
+  } while (frame->count < 7u + n_false);
+}
+
+/* A frame of half of the stars and as many false spots, which votes identify and triangles do not. */
+static void look_for_votes(uint32_t n, uint64_t *state) {
+  sky *s = &skies[VOTES];
+  sky_frame *f = &frames[VOTES][n];
+  starcat_status by_triangles = STARCAT_OK, by_votes = STARCAT_NO_MATCH;
+  while ((by_triangles == STARCAT_IDENTIFIED) || (by_votes != STARCAT_IDENTIFIED)) {
+    uint32_t count = 0;
+    sky_look(&s->image, &s->camera, state, NOISE_PX, 24, 8, f);
+    for (uint32_t i = 0; i < f->count; i++) {
+      if ((f->star[i] < 0) || (sky_uniform(state) < 0.5)) {
+        f->x[count] = f->x[i];
+        f->y[count] = f->y[i];
+        f->magnitudes[count] = f->magnitudes[i];
+        f->star[count++] = f->star[i];
+      }
+    }
+    f->count = count;
+    s->image.neighbours = NULL;
+    by_triangles = call(VOTES, n, 6, 0).status;
+    s->image.neighbours = &s->table;
+    by_votes = call(VOTES, n, 6, 0).status;
+  }
+}
+
 static void prepare(void) {
-  static const sky_recipe recipes[2] = {{1, 2, SKY_STARS, 0.42, 8}, {2, 4, SKY_STARS, 0.698, 8}};
+  static const sky_recipe recipes[N_SKIES] = {
+      {1, 2, SKY_STARS, 0.42, 8}, {2, 4, SKY_STARS, 0.698, 8}, {1, 2, 700, 0.17, 8}};
   uint64_t state = 3;
   limit = UINT64_MAX;
   work = malloc(sizeof *work);
-  for (uint32_t which = 0; which < 2u; which++) {
+  for (uint32_t which = 0; which < N_SKIES; which++) {
     sky *s = &skies[which];
     static uint64_t words[SKY_MOST_BYTES / 8u];
     s->size = sky_image(&recipes[which], (uint8_t *)words);
@@ -273,18 +345,17 @@ static void prepare(void) {
     }
     starcat_get_camera(&s->image, &s->camera);
   }
+  list_neighbours(&skies[VOTES]);
   for (uint32_t n = 0; n < N_FRAMES; n++) {
-    uint32_t right = 0;
-    do { /* frames of at least seven stars */
-      sky_look(&skies[0].image, &skies[0].camera, &state, 0.2, SKY_SPOTS, n % 3u, &frames[n]);
-      right = frames[n].count;
-    } while (right < 7u + n % 3u);
-    for (uint32_t which = 0; which < 2u; which++) {
+    look(&frames[0][n], n % 3u, &state);
+    frames[1][n] = frames[0][n];
+    look_for_votes(n, &state);
+    for (uint32_t which = 0; which < N_SKIES; which++) {
       for (uint32_t way = 0; way < N_WAYS; way++) {
         answer *a = &expected[which][n][way];
         *a = call(which, n, way, 0);
         if ((a->status == STARCAT_IDENTIFIED) &&
-            !(error_of(&skies[which].camera, &a->result, frames[n].matrix, way) < REACHES)) {
+            !(error_of(&skies[which].camera, &a->result, frames[which][n].matrix, way) < REACHES)) {
           abort();
         }
       }
@@ -319,7 +390,7 @@ int main(int argc, char **argv) {
     }
   }
   for (uint32_t part = 0; part < N_PARTS; part++) {
-    (void)printf("%s,%s", part < N_FIELDS ? "workspace" : "image", name_of(part));
+    (void)printf("%s,%s", memory_of(part), name_of(part));
     for (uint32_t k = 0; k < N_OUTCOMES; k++) {
       (void)printf(",%llu", (unsigned long long)t->counts[part][k]);
     }

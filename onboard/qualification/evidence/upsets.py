@@ -1,4 +1,4 @@
-"""Flip bits of image and workspace while calls use them, and count what comes of it.
+"""Flip bits of image, workspace and table of neighbours during calls, and count what comes of it.
 
     upsets.py FOLDER FLIPS SEED [ASAN_CLANG]
 
@@ -64,7 +64,7 @@ def run(program: Path, flips: int, seed: int, counts: Counts) -> dict[str, float
 
 
 def in_all(counts: Counts, where: str) -> list[str]:
-    """Return the sums of the image or of the workspace."""
+    """Return the sums of one memory: image, workspace or table."""
     total = sum((count for (place, _), count in counts.items() if place == where), Counter())
     return [str(total[name]) for name in OUTCOMES]
 
@@ -104,7 +104,7 @@ def main(folder: Path, flips: int, seed: int, clang: str) -> int:
         f"make upsets SEU_FLIPS={flips} SEU_SEED={seed}</p>",
         pages.table(
             ["memory", *OUTCOMES],
-            [[where, *in_all(counts, where)] for where in ("image", "workspace")],
+            [[where, *in_all(counts, where)] for where in ("image", "workspace", "table")],
         ),
         pages.table(["memory", "part", *OUTCOMES], rows),
     )
