@@ -2,12 +2,15 @@
  *
  *   identify IMAGE FRAME
  *
+ * Frames that triangles do not solve are solved by votes, with a table of the neighbours of every star.
+ *
  * IMAGE is a file of `starcat export --to onboard`; FRAME has a line "x y magnitude" a centroid.
  * With an image linked in (`starcat export --to c`) the reading of it falls away:
  * starcat_open_image(&image, starcat_sao_12deg_1_0_0, sizeof starcat_sao_12deg_1_0_0, 0).
  *
  * SPDX-License-Identifier: MIT
  */
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 
@@ -54,11 +57,29 @@ static uint32_t read_frame(const char *path, starcat_real (*columns)[STARCAT_MAX
   return count;
 }
 
+/* List the neighbours of every star within half of the diagonal of the field. The first call tells how
+ * many there are. If there is no memory for them, the image stays as it is. */
+static void list_neighbours(starcat_image *image, const starcat_camera *camera,
+                            starcat_neighbours *table) {
+  const double diagonal_px = hypot((double)camera->width_px, (double)camera->height_px);
+  table->radius_rad = (starcat_real)atan(0.5 * diagonal_px / (double)camera->focal_length_px);
+  table->first = malloc(((size_t)image->n_stars + 1u) * sizeof *table->first);
+  if ((starcat_list_neighbours(image, &work, table) == STARCAT_E_CAPACITY) &&
+      (table->first[image->n_stars] > 0u)) {
+    table->capacity = table->first[image->n_stars];
+    table->neighbour = malloc((size_t)table->capacity * sizeof *table->neighbour);
+    if (starcat_list_neighbours(image, &work, table) == STARCAT_OK) {
+      image->neighbours = table;
+    }
+  }
+}
+
 int main(int argc, char **argv) {
   static starcat_real columns[3][STARCAT_MAX_CENTROIDS];
   starcat_image image;
   starcat_camera camera;
   starcat_options options;
+  starcat_neighbours table = {0};
   size_t size = 0;
   if (argc != 3) {
     (void)fprintf(stderr, "identify IMAGE FRAME\n");
@@ -73,6 +94,7 @@ int main(int argc, char **argv) {
   }
   starcat_get_camera(&image, &camera);
   starcat_set_default_options(&options);
+  list_neighbours(&image, &camera, &table);
   const uint32_t count = read_frame(argv[2], columns);
   const starcat_frame frame = {count, columns[0], columns[1], columns[2], NULL};
   status = starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
@@ -89,6 +111,8 @@ int main(int argc, char **argv) {
       (void)printf("centroid %u: %ld\n", (unsigned)i, found);
     }
   }
+  free(table.first);
+  free(table.neighbour);
   free(bytes);
   return status == STARCAT_IDENTIFIED ? 0 : 1;
 }

@@ -62,6 +62,23 @@ static uint8_t *make_image(fuzz_bytes *bytes, size_t *size) {
   return image;
 }
 
+/* The neighbours of the stars of whatever opened, in memory of exactly their number. */
+static void list_neighbours(starcat_image *image, starcat_neighbours *table) {
+  memset(table, 0, sizeof *table);
+  table->radius_rad = (starcat_real)0.475;
+  table->first = malloc(((size_t)image->n_stars + 1u) * sizeof *table->first);
+  if ((starcat_list_neighbours(image, &work, table) == STARCAT_E_CAPACITY) &&
+      (table->first[image->n_stars] > 0u)) {
+    table->capacity = table->first[image->n_stars];
+    table->neighbour = malloc(table->capacity * sizeof *table->neighbour);
+    if ((table->neighbour != NULL) &&
+        (starcat_list_neighbours(image, &work, table) != STARCAT_OK)) {
+      abort();
+    }
+  }
+  image->neighbours = table;
+}
+
 static void use(const starcat_image *image, const starcat_camera *camera) {
   starcat_options options;
   starcat_set_default_options(&options);
@@ -83,6 +100,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   fuzz_bytes bytes = {data, size};
   starcat_image image;
   starcat_camera camera;
+  starcat_neighbours table;
   uint32_t bad;
   traps_on();
   uint8_t *made = make_image(&bytes, &size);
@@ -93,6 +111,11 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
       starcat_get_camera(&image, &camera);
       use(&image, &camera);
       use(&image, &camera_of_sound);
+      list_neighbours(&image, &table);
+      use(&image, &camera);
+      use(&image, &camera_of_sound);
+      free(table.first);
+      free(table.neighbour);
     }
   }
   free(made);

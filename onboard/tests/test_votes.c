@@ -195,6 +195,7 @@ static void check_capacity(void) {
     CHECK_IS(memory[table.capacity].magnitude, OUTSIDE);
   }
   table.capacity = MOST_NEIGHBOURS;
+  first[unit_crowded.image.n_stars] = 1;
   table.radius_rad = (starcat_real)1.5; /* more stars than a call has room for */
   CHECK_IS(starcat_list_neighbours(&unit_crowded.image, &unit_work, &table), STARCAT_E_CAPACITY);
   CHECK_IS(first[unit_crowded.image.n_stars], 0);
@@ -271,6 +272,21 @@ static void check_missing(unit_sky *of, int has_magnitudes, uint32_t n_spots, ui
   CHECK(lost <= 2u);
   of->image.neighbours = NULL;
   starcat_set_default_options(&of->options);
+}
+
+/* Stars of unknown magnitude vote for every centroid that is as far away. */
+static void check_unknown_magnitudes(void) {
+  uint32_t at;
+  unit_copy(&sky);
+  memcpy(&at, unit_scratch.bytes + 256u + 16u + 4u, 4);
+  for (uint32_t n = 0; n < sky.image.n_stars; n++) {
+    const int16_t unknown = INT16_MIN;
+    memcpy(unit_scratch.bytes + at + 2u * (size_t)n, &unknown, 2);
+  }
+  check_missing(&unit_scratch, 1, 24, 8, 0.3, 3);
+  for (uint32_t k = 0; k < first[table.n_stars]; k++) {
+    CHECK_IS(memory[k].magnitude, 255);
+  }
 }
 
 /* Whether a frame gets the same answer with the table and without it. */
@@ -401,8 +417,10 @@ static void check_damaged(void) {
     const double share = n % 8u < 4u ? 0.01 : 1.0;
     for (uint32_t k = 0; k <= n_stars; k++) {
       if ((n % 4u > 0u) && (sky_uniform(&state) < share)) {
-        const double any = n % 4u == 1u ? 4294967296.0 : (double)count + 50.0;
-        exact.first[k] = n % 4u == 3u ? UINT32_MAX : (uint32_t)(any * sky_uniform(&state));
+        const double any = sky_uniform(&state);
+        exact.first[k] = n % 4u == 1u   ? (uint32_t)(4294967296.0 * any)
+                         : n % 4u == 2u ? count - 50u + (uint32_t)(100.0 * any)
+                                        : UINT32_MAX;
       }
     }
     for (uint32_t k = 0; (k < count) && (n % 3u > 0u); k++) {
@@ -520,6 +538,7 @@ void test_votes(void) {
   check_missing(&sky, 0, 24, 8, 0.3, 3);
   unit_copy(&unit_pyramid);
   check_missing(&unit_scratch, 1, 24, 8, 0.5, 0);
+  check_unknown_magnitudes();
   check_others();
   check_many();
   check_likely();

@@ -88,7 +88,7 @@ def main(folder: Path, flips: int, seed: int, clang: str) -> int:
     with (folder / "upsets.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([["memory", "part", *OUTCOMES], *rows])
     figure = (
-        f"{flips:,} flips: {', '.join(f'{total[name]:,} {name}' for name in OUTCOMES)}; "
+        f"{sum(total.values()):,} flips: {', '.join(f'{total[name]:,} {name}' for name in OUTCOMES)}; "
         f"largest error {max(n['largest'] for n in numbers):.2f} reaches"
     )
     runs = sum(sum(count.values()) for count in again.values())

@@ -49,6 +49,8 @@ CROWDED = (
     "is_earlier",
     "starcat_measure_side>starcat_angle_of_chord",
 )
+VOTES = ("starcat_search_votes", "list_voters", "count_votes", "list_votes", "try_star", "keep_star")
+"""Functions that run only if there is a table of neighbours, for which there is no bound."""
 LENS = ("undistort_point", "distort_point", "differentiate_distortion", "apply_distortion")
 LONGEST = ("search_by_longest_side", "search_with_longest_side", "sift_heap")
 MAGNITUDES = ("sum_polynomials", "count_compatible")
@@ -80,6 +82,7 @@ class Case:
     def excluded(self) -> set[str]:
         """Functions, or one inlined in another, that do not run."""
         left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_look_up_pyramid",))
+        left_out |= set(VOTES)
         left_out |= set() if self.is_crowded else set(CROWDED)
         left_out |= set(LONGEST if self.has_magnitudes else ("search_by_brightness", *MAGNITUDES))
         left_out |= set(LONGEST) if self.is_crowded else set()
