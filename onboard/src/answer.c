@@ -176,7 +176,9 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
     return refuse_frame(call, result);
   }
   call->focal = R(0.0); /* so that the directions are worked out again */
-  starcat_set_focal(call, w->best.focal);
+  if (!starcat_set_focal(call, w->best.focal)) {
+    return refuse_frame(call, result); /* a flipped bit has put a centroid where nothing is seen */
+  }
   const uint32_t count = call->own->count;
   const uint32_t n_seen = take_stars(call);
   if (n_seen < STARCAT_MIN_STARS) {

@@ -202,11 +202,13 @@ static int scale_camera(starcat_call *call, real focal) {
 }
 
 /* Use another focal length from now on, a multiple of the given one; the given one itself where the
- * lens forms no image with the other. */
-void starcat_set_focal(starcat_call *call, real focal) {
-  if ((focal != call->focal) && !scale_camera(call, focal)) {
-    (void)scale_camera(call, R(1.0));
+ * lens forms no image with the other, and then 0 is returned. */
+int starcat_set_focal(starcat_call *call, real focal) {
+  if ((focal == call->focal) || (scale_camera(call, focal) != 0)) {
+    return 1;
   }
+  (void)scale_camera(call, R(1.0));
+  return 0;
 }
 
 /* Fit the focal length too from now on, where its error may be above 0. */

@@ -199,7 +199,7 @@ void starcat_make_matrix(const real q[4], real m[9]);
 
 /* camera.c */
 starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera);
-void starcat_set_focal(starcat_call *call, real focal);
+int starcat_set_focal(starcat_call *call, real focal);
 void starcat_allow_scales(starcat_call *call, real fov_error);
 int starcat_find_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
 int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);

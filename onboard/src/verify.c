@@ -146,7 +146,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
     real focal = call->focal * starcat_exponential(step);
     const real shortest = R(1.0) - call->fov_error;
     focal = focal < shortest ? shortest : focal;
-    starcat_set_focal(call, focal * shortest > R(1.0) ? R(1.0) / shortest : focal);
+    (void)starcat_set_focal(call, focal * shortest > R(1.0) ? R(1.0) / shortest : focal);
   }
   for (uint32_t i = 0; i < n; i++) {
     body[i][0] = call->body[of[i]][0];
@@ -347,7 +347,7 @@ static void restore_agreement(starcat_call *call, const starcat_agreement *from,
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = from->matrix[k];
   }
-  starcat_set_focal(call, from->focal);
+  (void)starcat_set_focal(call, from->focal);
 }
 
 /* A false spot beside a star far from the others can turn the attitude so that it is the nearest
@@ -423,7 +423,7 @@ static void try_other_scales(starcat_call *call) {
   judge_fit(call, m, fit_matches(call, m, &ROUGH), R(1.0), &w->wider);
   starcat_allow_scales(call, R(0.0));
   const real moved = corner_px * (call->focal - R(1.0));
-  starcat_set_focal(call, R(1.0));
+  (void)starcat_set_focal(call, R(1.0));
   if ((w->wider.log_bound < w->found.log_bound) &&
       ((moved > call->tolerance_px) || (-moved > call->tolerance_px))) {
     withhold_agreement(&w->found, STARCAT_REASON_SCALE);
@@ -446,7 +446,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   if (!starcat_spend_steps(call, STEPS_OF_TRY)) {
     return 1;
   }
-  starcat_set_focal(call, focal);
+  (void)starcat_set_focal(call, focal);
   judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0),
             found);
   const uint32_t count = found->n_matched;

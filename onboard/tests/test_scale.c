@@ -60,10 +60,10 @@ static void check_lens(void) {
   }
   CHECK(found >= 19u);
   CHECK_IS(begin(&unit_scratch), STARCAT_OK);
-  starcat_set_focal(&call, (starcat_real)1.05);
+  (void)starcat_set_focal(&call, (starcat_real)1.05);
   CHECK(call.focal == (starcat_real)1.05);
   CHECK(call.body == unit_work.scaled);
-  starcat_set_focal(&call, (starcat_real)0.8);
+  (void)starcat_set_focal(&call, (starcat_real)0.8);
   CHECK(call.focal == (starcat_real)1.0);
   CHECK(call.body == unit_work.body);
   CHECK(call.camera.given.focal_length_px == unit_scratch.camera.focal_length_px);
