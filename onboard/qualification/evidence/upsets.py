@@ -87,8 +87,9 @@ def main(folder: Path, flips: int, seed: int, clang: str) -> int:
     rows = [[*key, *(str(count[name]) for name in OUTCOMES)] for key, count in counts.items()]
     with (folder / "upsets.csv").open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([["memory", "part", *OUTCOMES], *rows])
+    came_to = ", ".join(f"{total[name]:,} {name}" for name in OUTCOMES)
     figure = (
-        f"{sum(total.values()):,} flips: {', '.join(f'{total[name]:,} {name}' for name in OUTCOMES)}; "
+        f"{sum(total.values()):,} flips: {came_to}; "
         f"largest error {max(n['largest'] for n in numbers):.2f} reaches"
     )
     runs = sum(sum(count.values()) for count in again.values())

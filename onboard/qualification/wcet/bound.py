@@ -49,7 +49,14 @@ CROWDED = (
     "is_earlier",
     "starcat_measure_side>starcat_angle_of_chord",
 )
-VOTES = ("starcat_search_votes", "list_voters", "count_votes", "list_votes", "try_star", "keep_star")
+VOTES = (
+    "starcat_search_votes",
+    "list_voters",
+    "count_votes",
+    "list_votes",
+    "try_star",
+    "keep_star",
+)
 """Functions that run only if there is a table of neighbours, for which there is no bound."""
 LENS = ("undistort_point", "distort_point", "differentiate_distortion", "apply_distortion")
 LONGEST = ("search_by_longest_side", "search_with_longest_side", "sift_heap")
