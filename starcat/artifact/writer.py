@@ -26,6 +26,7 @@ from starcat.artifact.manifest import (
     software_versions,
 )
 from starcat.products.index import Index
+from starcat.products.table import PRODUCTS
 from starcat.specs.epoch import middle_of
 from starcat.storage.atomic import file_sha256, json_bytes
 from starcat.storage.parquet import write_parquet
@@ -39,7 +40,11 @@ class Product:
     name: str  # name of the product, which is that of its schema
     table: pa.Table  # with the columns of the schema, in the schema's order of rows
     index: Index = field(default_factory=Index)  # what a matcher needs beside the columns
-    in_database: bool = True  # whether the matcher's HDF5 file holds it
+
+    @property
+    def in_database(self) -> bool:
+        """Whether the matcher's HDF5 file has the product."""
+        return PRODUCTS[self.name].in_database
 
 
 def write_products(

@@ -149,7 +149,7 @@ def find_counterparts(draft: Draft) -> None:
         draft.sources[-1] = replace(draft.sources[-1], joined=joined)
     order = product_schema("crossmatch").order
     table = sort_rows(pa.concat_tables(tables), order).combine_chunks()
-    draft.products.append(Product("crossmatch", table, in_database=False))
+    draft.products.append(Product("crossmatch", table))
 
 
 def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Table:

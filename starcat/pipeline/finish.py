@@ -54,7 +54,7 @@ def make_products(draft: Draft) -> None:
     draft.sources = [_with_guide_stars(facts, draft) for facts in draft.sources]
     draft.products += [
         Product("stars", selected.guide_stars),
-        Product("rejected", sort_rows(rejected, order), in_database=False),
+        Product("rejected", sort_rows(rejected, order)),
     ]
     given = product_inputs(selected.guide_stars, fields, spec)
     for name in recipe_names(given):

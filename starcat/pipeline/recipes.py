@@ -66,7 +66,7 @@ def make_product(name: str, inputs: ProductInputs) -> Product:
     kind = PRODUCTS[name]
     assert kind.make is not None
     made = kind.make(inputs, inputs.wanted.get(name))
-    return Product(name, table_from_result(made, kind.schema), made.index, kind.in_database)
+    return Product(name, table_from_result(made, kind.schema), made.index)
 
 
 def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:

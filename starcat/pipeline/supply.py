@@ -82,7 +82,7 @@ def guide_star_motions(draft: Draft) -> list[Product]:
     rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
     table = draft.motions.take(pa.array(rows)).combine_chunks()
     own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
-    return [Product("motions", table.set_column(0, table.schema.field(0), own), in_database=False)]
+    return [Product("motions", table.set_column(0, table.schema.field(0), own))]
 
 
 @stage(
