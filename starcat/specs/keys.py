@@ -151,9 +151,12 @@ def spec_toml(spec: BuildSpec) -> str:
             # A header without keys would keep another text from being appended with this header.
             is_empty = all(_is_default(key, values[key.name]) for key in section.keys)
             lines.append(f"{'# ' if is_empty else ''}[{'.'.join(section.path)}]")
-        for key in section.keys:
+        plain = [key for key in section.keys if not _is_tables(values[key.name])]
+        for key in plain:
             lines += _lines(key, values[key.name])
         parts.append("\n".join(lines))
+        # A table ends the keys of the section around it, so lists of tables follow them.
+        parts += [_tables(key, values[key.name]) for key in section.keys if key not in plain]
     return "\n\n".join(parts) + "\n"
 
 
@@ -184,6 +187,19 @@ def _lines(key: SpecKey, value: Any) -> list[str]:
     shown = key.example if value is None else value
     set_to = f"{key.name} = {'...' if shown is None else toml_value(shown)}"
     return [*_comment(told), f"# {set_to}" + ("" if value is None else "    # the default")]
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(one, dict) for one in value)
+
+
+def _tables(key: SpecKey, tables: list[dict[str, Any]]) -> str:
+    """Return a key whose value is a list of tables."""
+    parts = [
+        "\n".join([f"[[{key.path}]]", *(f"{name} = {toml_value(one[name])}" for name in one)])
+        for one in tables
+    ]
+    return "\n".join([*_comment(key.description), "\n\n".join(parts)])
 
 
 def _is_default(key: SpecKey, value: Any) -> bool:
