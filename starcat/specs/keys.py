@@ -11,7 +11,9 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from starcat.specs.build_spec import BuildSpec
 
@@ -132,6 +134,27 @@ def _range(value: dict[str, Any]) -> str:
 
 def _plain(number: float) -> str:
     return f"{int(number):,}" if number == int(number) else f"{number:g}"
+
+
+@dataclass(frozen=True)
+class CheckedSpec:
+    """A spec that can be built."""
+
+    name: Annotated[str, Field(examples=["gaia-12deg"])]
+    version: Annotated[str, Field(examples=["1.0.0"])]
+    description: Annotated[str, Field(description="Purpose.")]
+    sources: Annotated[list[str], Field(description="Catalogs that it reads.", examples=[["gaia"]])]
+    spec: Annotated[
+        dict[str, Any], Field(description="All keys, with those that are as by default.")
+    ]
+    toml: Annotated[str, Field(description="The same as a file in which every key is explained.")]
+
+    @classmethod
+    def of(cls, spec: BuildSpec) -> CheckedSpec:
+        """Return what is said of a spec."""
+        content = spec.model_dump(mode="json")
+        names = (spec.name, spec.version, spec.description)
+        return cls(*names, list(spec.sources), content, spec_toml(spec))
 
 
 _WIDTH = 96
