@@ -315,5 +315,5 @@ def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, tmp_path
     built = starcat(["build", *arguments[1:], "-o", tmp_path / "dist"])
     assert built.code == 0
     stars = read_parquet(tmp_path / "dist" / "small-1.0.0" / "stars.parquet")
-    assert said["stars"] == len(stars)
+    assert said["guide_stars"] == said["filters"][-1]["stars"] == len(stars)
     assert said["total_bytes"] == sum(said["files"].values())

@@ -334,7 +334,7 @@ def test_init_writes_a_spec_for_a_range(starcat, tmp_path):
     file = tmp_path / "range.toml"
     run = starcat(["init", file, "--size", "1024x768", "--fov-range", "15:30", "--json"])
     assert run.code == 0, run.err
-    spec = json.loads(run.out)["spec"]
+    spec = json.loads(run.out)["checked"]["spec"]
     assert spec["camera"]["fov_x_deg"] == 15.0
     assert spec["products"]["levels"]["enabled"]
     assert spec["products"]["levels"]["widest_fov_x_deg"] == 30.0

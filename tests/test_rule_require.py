@@ -13,6 +13,7 @@ import pytest
 from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import BuildError, ConfigError
 from starcat.selection.selecting import Selected, select_guide_stars
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import with_columns
 
@@ -95,3 +96,14 @@ def test_two_conditions_have_two_names(stars, small_spec):
 def test_a_spec_without_conditions_is_recorded_as_before(small_spec):
     spec = spec_from_dict(tomllib.loads(small_spec), "spec.toml")
     assert "require" not in spec.recorded()["selection"]
+
+
+def test_conditions_are_written_as_tables(small_spec):
+    other = {"name": "near", "expression": "parallax_mas > 5", "description": ""}
+    content = tomllib.loads(small_spec)
+    content["selection"] |= {"require": [FITS_WELL, other]}
+    spec = spec_from_dict(content, "spec.toml")
+    text = spec_toml(spec)
+    assert text.count("\n[[selection.require]]\n") == 2
+    assert "{" not in text
+    assert spec_from_dict(tomllib.loads(text), "written.toml") == spec

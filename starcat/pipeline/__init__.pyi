@@ -3,6 +3,7 @@ from starcat.pipeline.cost import Cost as Cost
 from starcat.pipeline.draft import Draft as Draft
 from starcat.pipeline.draft import Inputs as Inputs
 from starcat.pipeline.estimate import Estimate as Estimate
+from starcat.pipeline.estimate import EstimateFigures as EstimateFigures
 from starcat.pipeline.estimate import choose_stars as choose_stars
 from starcat.pipeline.estimate import chosen_bytes as chosen_bytes
 from starcat.pipeline.estimate import estimate_draft as estimate_draft
@@ -15,6 +16,6 @@ from starcat.pipeline.starter import MANY_FIELDS as MANY_FIELDS
 from starcat.pipeline.starter import STARS_A_FIELD as STARS_A_FIELD
 from starcat.pipeline.starter import LimitRow as LimitRow
 from starcat.pipeline.starter import Starter as Starter
-from starcat.pipeline.starter import advice as advice
+from starcat.pipeline.starter import StarterFigures as StarterFigures
 from starcat.pipeline.starter import enough_limit as enough_limit
 from starcat.pipeline.starter import starter_spec as starter_spec

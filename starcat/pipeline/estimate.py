@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
+from pydantic import Field
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.ingest import count_by_reason
@@ -35,6 +36,7 @@ from starcat.pipeline.stages import READ
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
     CoverageSummary,
+    Spread,
     TilingGap,
     field_coverage,
     summarise_coverage,
@@ -168,6 +170,69 @@ def _check_fields_of_products(stars: int, spec: BuildSpec) -> None:
 
 
 @dataclass(frozen=True)
+class WorstField:
+    """The field with the fewest stars."""
+
+    boresight: int
+    ra_deg: float
+    dec_deg: float
+    stars: int
+
+
+@dataclass(frozen=True)
+class FieldFigures:
+    """Guide stars in the fields of the tiling."""
+
+    count: Annotated[int, Field(description="Boresights.")]
+    stars: Spread
+    enough_share: Annotated[float, Field(description="Share of the fields with at least 4 stars.")]
+    full_share: Annotated[
+        float,
+        Field(
+            description="Share of fields with ``boresights.brightest`` stars, the number for "
+            "triangles."
+        ),
+    ]
+    worst: WorstField
+
+
+@dataclass(frozen=True)
+class FilterFigures:
+    """What a filter leaves."""
+
+    filter: Annotated[str, Field(examples=["doubles"])]
+    stars: Annotated[int, Field(description="Stars of the whole sky that are left.")]
+
+
+@dataclass(frozen=True)
+class EstimateFigures:
+    """What a spec will give, as REST, the page and ``--json`` show it."""
+
+    guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6682])]
+    fields: FieldFigures
+    filters: list[FilterFigures]
+    rejected: Annotated[dict[str, int], Field(description="All other records, by reason.")]
+    rows: Annotated[
+        dict[str, int], Field(description="Rows of each product that is made from them.")
+    ]
+    files: Annotated[
+        dict[str, int],
+        Field(description="Bytes of each file; ``report`` is that folder and the manifest."),
+    ]
+    total_bytes: Annotated[int, Field(description="Of all files.")]
+    memory_bytes: Annotated[int, Field(description="Most memory that the build will hold.")]
+    read_seconds: Annotated[float, Field(description="Time to read the catalogs.")]
+    build_seconds: Annotated[
+        float, Field(description="Time of the whole build, on one quiet processor.")
+    ]
+    refusals: Annotated[
+        list[str], Field(description="Why the build will be refused; empty if it will not.")
+    ]
+    warnings: Annotated[list[str], Field(description="Warnings.")]
+    in_words: Annotated[str, Field(description="The line that 'starcat build' prints.")]
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What a spec will give."""
 
@@ -194,6 +259,33 @@ class Estimate:
     def total_bytes(self) -> int:
         """Size of the database."""
         return sum(self.cost.files.values())
+
+    @property
+    def figures(self) -> EstimateFigures:
+        """What is shown of it."""
+        cost, coverage = self.cost, self.coverage
+        worst = WorstField(
+            coverage.worst_boresight,
+            round(coverage.worst_ra_deg, 6),
+            round(coverage.worst_dec_deg, 6),
+            coverage.stars.minimum,
+        )
+        shares = round(self.enough_share, 6), round(self.full_share, 6)
+        return EstimateFigures(
+            guide_stars=cost.stars,
+            fields=FieldFigures(cost.fields, coverage.stars, *shares, worst),
+            filters=[FilterFigures(*each) for each in self.filters],
+            rejected=dict(self.rejected),
+            rows=dict(cost.rows),
+            files=dict(cost.files),
+            total_bytes=self.total_bytes,
+            memory_bytes=cost.memory_bytes,
+            read_seconds=round(self.read_seconds, 2),
+            build_seconds=round(self.build_seconds, 2),
+            refusals=list(map(str, self.refusals)),
+            warnings=list(self.warnings),
+            in_words=cost.in_words,
+        )
 
     @property
     def files(self) -> list[tuple[str, int | None, int]]:

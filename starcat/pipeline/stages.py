@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from starcat.catalog.source_files import locate
+from starcat.catalog.source import data_source
+from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.counterparts import find_counterparts
 from starcat.pipeline.draft import Inputs, Stage
@@ -67,27 +67,30 @@ class PlannedStage:
     name: str  # of the stage's function
     title: str  # in a word or two
     does: str | None  # None where it does nothing for the spec
-    # Files and folders that it would read of each source, by name; none where none was found.
+    # By source: what was given of it, or else the files that the build finds
     reads: Mapping[str, tuple[str, ...]]
+    missing: Mapping[str, SourceMissing]  # by source: why the build finds no files
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
-        return asdict(self)
+        missing = {name: str(error) for name, error in self.missing.items()}
+        return {**vars(self), "missing": missing}
 
 
 def explain(spec: BuildSpec, inputs: Inputs) -> tuple[PlannedStage, ...]:
-    """Return what each stage of a build will do, and where it finds its sources; none is read."""
+    """Return what each stage of a build will do; sources are looked for, and not read."""
     check_inputs(spec, inputs)
     return tuple(_planned(each, spec, inputs) for each in BUILD)
 
 
 def _planned(each: Stage, spec: BuildSpec, inputs: Inputs) -> PlannedStage:
-    reads = {name: tuple(map(str, _found(name, inputs))) for name in each.reads(spec)}
-    return PlannedStage(each.name, each.title, each.plan(spec), reads)
-
-
-def _found(source: str, inputs: Inputs) -> Sequence[Path]:
-    try:
-        return locate(source, inputs)
-    except SourceMissing:
-        return ()
+    reads, missing = {}, {}
+    for name in each.reads(spec):
+        reads[name] = tuple(map(str, inputs.get(name, ())))
+        if not reads[name]:
+            try:
+                found = SourceFiles.find(data_source(name), locate(name, inputs)).files
+                reads[name] = tuple(str(file.path) for file in found)
+            except SourceMissing as error:
+                missing[name] = error
+    return PlannedStage(each.name, each.title, each.plan(spec), reads, missing)

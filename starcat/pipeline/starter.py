@@ -33,7 +33,7 @@ from starcat.progress import Progress, no_progress
 from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
-from starcat.specs.keys import spec_toml
+from starcat.specs.keys import CheckedSpec, spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
@@ -92,6 +92,18 @@ class LimitRow:
 
 
 @dataclass(frozen=True)
+class StarterFigures:
+    """A first spec for a camera, as 'starcat init' writes it."""
+
+    checked: CheckedSpec
+    limits: Annotated[list[LimitRow], Field(description="Its own limit, and some around it.")]
+    thinned: Annotated[LimitRow, Field(description="Faintest magnitude left after thinning.")]
+    estimate: Annotated[Cost, Field(description="What the build will cost.")]
+    advice: Annotated[list[str], Field(description="Remarks on the limit.")]
+    in_words: Annotated[str, Field(description="Size, memory and time of the build, in one line.")]
+
+
+@dataclass(frozen=True)
 class Starter:
     """A first spec, and what it and its neighbours give."""
 
@@ -100,6 +112,13 @@ class Starter:
     deepest_mag: float  # faintest star of the catalog; fainter limits add none
     thinned: LimitRow  # what the spec's thinning leaves at its own limit
     cost: Cost  # what the build will cost, by estimate
+
+    @property
+    def figures(self) -> StarterFigures:
+        """What REST, the page and ``--json`` show of it."""
+        checked, told = CheckedSpec.of(self.spec), list(advice(self))
+        limits, words = list(self.limits), self.cost.in_words
+        return StarterFigures(checked, limits, self.thinned, self.cost, told, words)
 
     @property
     def band(self) -> str:

@@ -45,7 +45,7 @@ class FormField:
     """How the form of the service shows a key of a rule."""
 
     label: str
-    kind: Literal["slide", "number", "choice"]
+    kind: Literal["slide", "number", "choice", "text"]
     group: Literal["limits", "sensor"] = "sensor"  # the card that it stands in
     hint: str = ""
     placeholder: str = ""

@@ -5,9 +5,9 @@ from starcat.specs.camera_file import parse_camera as parse_camera
 from starcat.specs.camera_file import read_camera as read_camera
 from starcat.specs.camera_sensor import MAX_ROWS as MAX_ROWS
 from starcat.specs.keys import REQUIRED as REQUIRED
+from starcat.specs.keys import CheckedSpec as CheckedSpec
 from starcat.specs.keys import SpecKey as SpecKey
 from starcat.specs.keys import spec_sections as spec_sections
-from starcat.specs.keys import spec_toml as spec_toml
 from starcat.specs.keys import unit_of as unit_of
 from starcat.specs.reading import MAX_CHARACTERS as MAX_CHARACTERS
 from starcat.specs.reading import all_that_is_wrong as all_that_is_wrong

@@ -11,7 +11,9 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from starcat.specs.build_spec import BuildSpec
 
@@ -134,6 +136,27 @@ def _plain(number: float) -> str:
     return f"{int(number):,}" if number == int(number) else f"{number:g}"
 
 
+@dataclass(frozen=True)
+class CheckedSpec:
+    """A spec that can be built."""
+
+    name: Annotated[str, Field(examples=["gaia-12deg"])]
+    version: Annotated[str, Field(examples=["1.0.0"])]
+    description: Annotated[str, Field(description="Purpose.")]
+    sources: Annotated[list[str], Field(description="Catalogs that it reads.", examples=[["gaia"]])]
+    spec: Annotated[
+        dict[str, Any], Field(description="All keys, with those that are as by default.")
+    ]
+    toml: Annotated[str, Field(description="The same as a file in which every key is explained.")]
+
+    @classmethod
+    def of(cls, spec: BuildSpec) -> CheckedSpec:
+        """Return what is said of a spec."""
+        content = spec.model_dump(mode="json")
+        names = (spec.name, spec.version, spec.description)
+        return cls(*names, list(spec.sources), content, spec_toml(spec))
+
+
 _WIDTH = 96
 _NUMBERS_A_LINE = 10
 
@@ -151,9 +174,12 @@ def spec_toml(spec: BuildSpec) -> str:
             # A header without keys would keep another text from being appended with this header.
             is_empty = all(_is_default(key, values[key.name]) for key in section.keys)
             lines.append(f"{'# ' if is_empty else ''}[{'.'.join(section.path)}]")
-        for key in section.keys:
+        plain = [key for key in section.keys if not _is_tables(values[key.name])]
+        for key in plain:
             lines += _lines(key, values[key.name])
         parts.append("\n".join(lines))
+        # A table ends the keys of the section around it, so lists of tables follow them.
+        parts += [_tables(key, values[key.name]) for key in section.keys if key not in plain]
     return "\n\n".join(parts) + "\n"
 
 
@@ -184,6 +210,19 @@ def _lines(key: SpecKey, value: Any) -> list[str]:
     shown = key.example if value is None else value
     set_to = f"{key.name} = {'...' if shown is None else toml_value(shown)}"
     return [*_comment(told), f"# {set_to}" + ("" if value is None else "    # the default")]
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(one, dict) for one in value)
+
+
+def _tables(key: SpecKey, tables: list[dict[str, Any]]) -> str:
+    """Return a key whose value is a list of tables."""
+    parts = [
+        "\n".join([f"[[{key.path}]]", *(f"{name} = {toml_value(one[name])}" for name in one)])
+        for one in tables
+    ]
+    return "\n".join([*_comment(key.description), "\n\n".join(parts)])
 
 
 def _is_default(key: SpecKey, value: Any) -> bool:

@@ -195,7 +195,7 @@ def stages_page() -> str:
         "A build runs these stages in this order; one that has nothing to do for the spec is",
         "skipped. All work on one `Draft` (`starcat/pipeline/draft.py`). An estimate runs the",
         "first two lists. `starcat build --explain SPEC` says what a stage will do for a spec, and",
-        "what it reads; it needs no input files.\n",
+        "which files it reads. It looks for files as the build does, and reads none of them.\n",
     ]
     for title, stages in (
         ("Read", READ), ("Choose", CHOOSE), ("Make products", PRODUCTS), ("Finish", FINISH)
@@ -205,10 +205,11 @@ def stages_page() -> str:
             module = each.change.__module__.rpartition(".")[2]
             page.append(f"| {each.title} | {each.summary} | `{module}.{each.name}` |")
         page.append("")
-    runner = CliRunner(env={"COLUMNS": "96", "TERMINAL_WIDTH": "96"})
+    nowhere = {"STARCAT_CATALOGS": "", "STARCAT_CACHE": "/nowhere"}
+    runner = CliRunner(env={"COLUMNS": "96", "TERMINAL_WIDTH": "96", **nowhere})
     arguments = ["build", "--preset", EXPLAINED, "--explain"]
     done = runner.invoke(app, arguments, prog_name="starcat")
-    body = "\n".join(line.rstrip() for line in done.output.strip().splitlines())
+    body = "\n".join(line.rstrip() for line in done.stdout.strip().splitlines())
     page.append(f"## An example\n\n```text\n$ starcat {' '.join(arguments)}\n{body}\n```")
     return "\n".join(page)
 

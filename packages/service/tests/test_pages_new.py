@@ -374,3 +374,23 @@ def test_designs_differ_by_their_keys():
         ("selection.faint_limit_mag", "4.5", "5"),
         ("boresights.count", "300", "400"),
     ]
+
+
+def test_a_region_is_typed_as_numbers_and_shown_as_they_were_typed():
+    typed = {"cone": "266.4, -29, 20", "zone": "[-30, 30]", "moc": "0/0-3"}
+    form = {f"selection.region.{name}": text for name, text in typed.items()}
+    draft = draft_of_form({"toml": SPEC, "toml-before": SPEC, **form})
+    assert draft.spec is not None, draft.errors
+    region = draft.spec.selection.region
+    assert (region.cone, region.zone, region.moc) == ((266.4, -29, 20), (-30, 30), "0/0-3")
+    assert draft.values["selection.region.cone"] == "266.4, -29, 20"
+    same = {**draft.values, "toml": draft.text, "toml-before": draft.text}
+    assert draft_of_form(same).text == draft.text
+    emptied = draft_of_form({**same, **dict.fromkeys(form, "")})
+    assert emptied.spec == draft_of_text(SPEC).spec
+
+
+@pytest.mark.parametrize("text", ["somewhere", "1, 2", "10, 95, 3", "1,,2"])
+def test_what_is_wrong_with_a_region_is_said_beside_its_field(text):
+    form = {"toml": SPEC, "toml-before": SPEC, "selection.region.cone": text}
+    assert list(draft_of_form(form).errors) == ["selection.region.cone"]

@@ -14,7 +14,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.local_files import LocalFile
 from starcat.sections import Section
-from starcat.selection.rule import Context, Rejection, RuleReason
+from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.regular_files import check_regular_file
 
@@ -23,6 +23,17 @@ STEP = "region"
 COLUMNS = ("ra_deg", "dec_deg", "x", "y", "z")
 OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
 REASONS = (OUTSIDE,)
+FORM = {
+    "cone": FormField(
+        "Cone",
+        "text",
+        "limits",
+        "right ascension, declination and radius, degrees",
+        "266.4, -29, 20",
+    ),
+    "zone": FormField("Zone of declination", "text", "limits", "from and to, degrees", "-30, 30"),
+    "moc": FormField("MOC in ASCII", "text", "limits", "orders and HEALPix cells", "0/0-3"),
+}
 
 MAX_MOC_CHARACTERS = 50_000  # half of the longest text of a spec
 MAX_ORDER = 29

@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.geometry import radec_from_directions
-from starcat.pipeline import Estimate, LimitRow, Starter, advice
-from starcat.products import Spread
-from starcat.specs import BuildSpec, CameraSpec, preset, spec_toml
+from starcat.pipeline import Estimate
+from starcat.specs import CameraSpec, preset
 
 MAX_FIELDS = 50_000  # fields that are listed one by one at the most
-
-
-class CheckedSpec(BaseModel):
-    """A spec that can be built."""
-
-    name: str = Field(examples=["gaia-12deg"])
-    version: str = Field(examples=["1.0.0"])
-    description: str = Field(description="Purpose.")
-    sources: list[str] = Field(description="Catalogs that it reads.", examples=[["gaia"]])
-    spec: dict[str, Any] = Field(description="All keys, with those that are as by default.")
-    toml: str = Field(description="The same as a file in which every key is explained.")
 
 
 class PresetFacts(BaseModel):
@@ -39,54 +25,6 @@ class Presets(BaseModel):
     """The specs that ship with starcat, the default first."""
 
     presets: list[PresetFacts]
-
-
-class WorstField(BaseModel):
-    """The field with the fewest stars."""
-
-    boresight: int
-    ra_deg: float
-    dec_deg: float
-    stars: int
-
-
-class FieldFigures(BaseModel):
-    """Guide stars in the fields of the tiling."""
-
-    count: int = Field(description="Boresights.")
-    stars: Spread
-    enough_share: float = Field(description="Share of the fields with at least 4 stars.")
-    full_share: float = Field(
-        description="Share of fields with ``boresights.brightest`` stars, the number for triangles."
-    )
-    worst: WorstField
-
-
-class FilterFigures(BaseModel):
-    """What a filter leaves."""
-
-    filter: str = Field(examples=["doubles"])
-    stars: int = Field(description="Stars of the whole sky that are left.")
-
-
-class EstimateAnswer(BaseModel):
-    """What a spec will give."""
-
-    guide_stars: int = Field(description="Exact number of guide stars.", examples=[6682])
-    fields: FieldFigures
-    filters: list[FilterFigures]
-    rejected: dict[str, int] = Field(description="All other records, by reason.")
-    rows: dict[str, int] = Field(description="Rows of each product that is made from them.")
-    files: dict[str, int] = Field(
-        description="Bytes of each file; ``report`` is that folder and the manifest."
-    )
-    total_bytes: int = Field(description="Of all files.")
-    memory_bytes: int = Field(description="Most memory that the build will hold.")
-    read_seconds: float = Field(description="Time to read the catalogs.")
-    build_seconds: float = Field(description="Time of the whole build, on one quiet processor.")
-    refusals: list[str] = Field(description="Why the build will be refused; empty if it will not.")
-    warnings: list[str] = Field(description="Warnings.")
-    in_words: str = Field(description="The line that 'starcat build' prints.")
 
 
 class CoverageMap(BaseModel):
@@ -133,28 +71,6 @@ class StarterRequest(BaseModel):
     )
 
 
-class StarterAnswer(BaseModel):
-    """A first spec for a camera, as 'starcat init' writes it."""
-
-    checked: CheckedSpec
-    limits: list[LimitRow] = Field(description="Its own limit, and some around it.")
-    thinned: LimitRow = Field(description="Faintest magnitude left after thinning.")
-    advice: list[str] = Field(description="Remarks on the limit.")
-    in_words: str = Field(description="Size, memory and time of the build, in one line.")
-
-
-def checked_spec(spec: BuildSpec) -> CheckedSpec:
-    """Return what is said of a spec that was checked."""
-    return CheckedSpec(
-        name=spec.name,
-        version=spec.version,
-        description=spec.description,
-        sources=list(spec.sources),
-        spec=spec.model_dump(mode="json"),
-        toml=spec_toml(spec),
-    )
-
-
 def preset_facts(name: str) -> PresetFacts:
     """Return what is said of a preset."""
     spec = preset(name)
@@ -163,48 +79,6 @@ def preset_facts(name: str) -> PresetFacts:
         version=spec.version,
         source=spec.catalog.source,
         description=spec.description,
-    )
-
-
-def estimate_answer(found: Estimate) -> EstimateAnswer:
-    """Return what is said of an estimate."""
-    cost, coverage = found.cost, found.coverage
-    return EstimateAnswer(
-        guide_stars=cost.stars,
-        fields=FieldFigures(
-            count=cost.fields,
-            stars=coverage.stars,
-            enough_share=round(found.enough_share, 6),
-            full_share=round(found.full_share, 6),
-            worst=WorstField(
-                boresight=coverage.worst_boresight,
-                ra_deg=round(coverage.worst_ra_deg, 6),
-                dec_deg=round(coverage.worst_dec_deg, 6),
-                stars=coverage.stars.minimum,
-            ),
-        ),
-        filters=[FilterFigures(filter=name, stars=stars) for name, stars in found.filters],
-        rejected=dict(found.rejected),
-        rows=dict(cost.rows),
-        files=dict(cost.files),
-        total_bytes=found.total_bytes,
-        memory_bytes=cost.memory_bytes,
-        read_seconds=round(found.read_seconds, 2),
-        build_seconds=round(found.build_seconds, 2),
-        refusals=list(map(str, found.refusals)),
-        warnings=list(found.warnings),
-        in_words=cost.in_words,
-    )
-
-
-def starter_answer(starter: Starter) -> StarterAnswer:
-    """Return what is said of a first spec."""
-    return StarterAnswer(
-        checked=checked_spec(starter.spec),
-        limits=list(starter.limits),
-        thinned=starter.thinned,
-        advice=list(advice(starter)),
-        in_words=starter.cost.in_words,
     )
 
 

@@ -12,9 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from starcat.errors import ConfigError
 from starcat.failures import validation_message
+from starcat.pipeline import EstimateFigures, StarterFigures
 from starcat.specs import (
     MAX_CHARACTERS,
     BuildSpec,
+    CheckedSpec,
     changed,
     content_of_toml,
     preset,
@@ -23,17 +25,11 @@ from starcat.specs import (
 )
 from starcat_service.access import Reader
 from starcat_service.api.spec_models import (
-    CheckedSpec,
     CoverageMap,
-    EstimateAnswer,
     Presets,
-    StarterAnswer,
     StarterRequest,
-    checked_spec,
     coverage_answer,
-    estimate_answer,
     preset_facts,
-    starter_answer,
 )
 from starcat_service.problems import Problem, refusals
 from starcat_service.service import TheService
@@ -172,13 +168,13 @@ def one_preset(
     name: Annotated[str, Path(max_length=100, examples=["gaia-12deg"])], reader: Reader
 ) -> CheckedSpec:
     """Return a spec that ships with starcat: its keys, and the text that explains each."""
-    return checked_spec(preset(name))
+    return CheckedSpec.of(preset(name))
 
 
 @router.post("/validate", summary="Check a spec", openapi_extra=SPEC_BODY, responses=KIND)
 def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
     """Check a spec; what is wrong is told in the words of the command line, with the key."""
-    return checked_spec(spec)
+    return CheckedSpec.of(spec)
 
 
 @router.post(
@@ -187,12 +183,12 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
     openapi_extra=SPEC_BODY,
     responses={**KIND, **BUSY},
 )
-def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateAnswer:
+def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
     """Return guide stars, to the last one, and fields, files, time and memory by estimate.
 
     The first estimate from a catalog waits until it has been read.
     """
-    return estimate_answer(service.catalogs.estimate(spec))
+    return service.catalogs.estimate(spec).figures
 
 
 @router.post(
@@ -204,9 +200,8 @@ def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> Covera
 
 
 @router.post("/starter", summary="A first spec for a camera", responses=BUSY)
-def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterAnswer:
+def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterFigures:
     """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
-    found = service.catalogs.starter(
+    return service.catalogs.starter(
         wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
-    )
-    return starter_answer(found)
+    ).figures

@@ -121,7 +121,7 @@ class SpecForm:
         return next((name for name in self.values if f"{name}.".startswith(f"{key}.")), None)
 
     def _beside(self, error: ConfigError) -> dict[str, str]:
-        key = error.key or ""
+        key = re.sub(r"(\.|\[)\d+\]?$", "", error.key or "")  # of a list: that of its item
         named = [name for name in (*self.values, FILE) if name == key]
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
         words = str(error).removeprefix(f"{ORIGIN}: ")
@@ -247,9 +247,15 @@ def _shown(key: str, content: Mapping[str, Any]) -> str:
     if key == "selection.bright_limit_mag" and value == _KEYS[key].default:
         return ""  # No star is that bright: there is no limit.
     if key == "epoch_jyear" and isinstance(value, list) and len(value) == 2:
-        value = "-".join(f"{one:.12g}" if isinstance(one, float) else str(one) for one in value)
+        value = "-".join(map(_number_text, value))
+    if _KEYS[key].kind == "list" and isinstance(value, list):
+        return ", ".join(map(_number_text, value))
     if isinstance(value, int) and value.bit_length() > 1000:  # more digits than Python writes
         return hex(value)[:40]
+    return _number_text(value)
+
+
+def _number_text(value: Any) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -353,6 +359,8 @@ def _typed(key: str, text: str) -> Any:
     try:
         if text and kind in ("whole number", "number"):
             return int(text) if kind == "whole number" else float(text)
+        if text and kind == "list":
+            return [float(part) for part in text.strip("[] ").split(",")]
     except ValueError:
         return text[:200]
     return text or None

@@ -13,7 +13,6 @@ from starlette.datastructures import UploadFile
 
 from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
-from starcat.pipeline import advice
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs import CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
@@ -206,7 +205,7 @@ def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:
         f"{selection.max_stars_per_field} brightest of each field, "
         f"{count_text(boresights.count)} boresights."
     )
-    return draft_with(draft, changes), [told, *(f"{one}." for one in advice(starter))]
+    return draft_with(draft, changes), [told, *(f"{one}." for one in starter.figures.advice)]
 
 
 def _shown(
@@ -350,10 +349,10 @@ def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | N
         return f"Cannot be built: {wrong[0]}"
     if seen.verdict.will_fail:
         return f"Not to be built: {seen.verdict.words}"
-    found = seen.estimate
-    stars = found.coverage.stars
+    found = seen.figures
+    stars = found.fields.stars
     return (
-        f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "
+        f"{count_text(found.guide_stars)} guide stars, {count_text(stars.median)} in the middle "
         f"field ({stars.minimum} to {stars.maximum}), {size_text(found.total_bytes)}, built in "
         f"about {duration_text(max(1.0, found.build_seconds))}"
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.geometry import radec_from_directions, saff_kuijlaars
-from starcat.pipeline import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD, Estimate
+from starcat.pipeline import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD, Estimate, EstimateFigures
 from starcat.report import (
     BLIND_SHARE,
     FIXED_BINS,
@@ -56,6 +56,7 @@ class Preview:
     """What a spec would give."""
 
     estimate: Estimate
+    figures: EstimateFigures
     verdict: Verdict
     files: list[tuple[str, int | None, int]]  # name, rows of a product, bytes; the largest first
     bars: list[Bar]
@@ -73,6 +74,7 @@ def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
     is_mapped = len(counts) <= MAX_MAPPED
     return Preview(
         estimate,
+        estimate.figures,
         verdict_of(estimate, catalogs),
         sorted(estimate.files, key=lambda file: (-file[2], file[0])),
         _bars(counts),
