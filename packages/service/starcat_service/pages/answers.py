@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from starcat.images import WIDE_FOV_ERROR, picture_name
-from starcat_service.pages.sky import star_names_of
+from starcat_service.pages.sky import SkyStar, star_names_of
 
 MAX_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
 COLUMNS = (
@@ -142,18 +142,18 @@ def csv_of(contents: Sequence[Mapping[str, Any]]) -> str:
     return file.getvalue()
 
 
-def marks_of(frame: ShownFrame) -> list[dict[str, Any]]:
+def marks_of(frame: ShownFrame) -> list[SkyStar]:
     """Return the stars of a frame for the view of the sky."""
     return [
-        {
-            "id": one["star_id"],
-            "label": one["star"],
-            "name": one["name"],
-            "mag": one["mag"],
-            "ra_deg": one["ra_deg"],
-            "dec_deg": one["dec_deg"],
-            "reason": f"matched, {one['separation_arcsec']:.1f} arcsec off",
-        }
+        SkyStar(
+            label=one["star"],
+            ra_deg=one["ra_deg"],
+            dec_deg=one["dec_deg"],
+            mag=one["mag"],
+            id=one["star_id"],
+            name=one["name"],
+            reason=f"matched, {one['separation_arcsec']:.1f} arcsec off",
+        )
         for one in frame.stars
     ]
 

@@ -20,7 +20,7 @@ from starcat_service.library import ListedDatabase
 from starcat_service.pages.facts import database_rows, products_of
 from starcat_service.pages.notebook import Notebook, query_code
 from starcat_service.pages.rendering import page_router, page_url, render
-from starcat_service.pages.sky import around, sky_view
+from starcat_service.pages.sky import SkyStar, around, in_words, sky_view
 from starcat_service.problems import Problem, ProblemDetails, problem_of
 from starcat_service.service import Service, TheService
 
@@ -187,10 +187,11 @@ def _view(database: ListedDatabase, answer: ResultTable) -> dict[str, Any] | Non
         said = {name: None if k is None else row[k] for name, k in known.items()}
         mag = said["mag"] if isinstance(said["mag"], int | float) else None
         label = str(said["designation"] or f"{answer.columns[0].name} {row[0]}")
-        reason = None if said["reason"] is None else str(said["reason"]).replace("_", " ")
-        one = {"label": label, "ra_deg": ra, "dec_deg": dec, "mag": mag, "reason": reason}
-        marks.append(one if said["star_id"] is None else {**one, "id": str(said["star_id"])})
-    return sky_view(database, marks=marks, at=around(marks)) if marks else None
+        star_id = None if said["star_id"] is None else str(said["star_id"])
+        marks.append(SkyStar(label, ra, dec, mag, star_id, reason=in_words(said["reason"])))
+    if not marks:
+        return None
+    return sky_view(database, marks=marks, at=around([vars(one) for one in marks]))
 
 
 def _chosen(name: str) -> NamedQuery | None:

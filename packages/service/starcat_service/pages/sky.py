@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -42,6 +43,29 @@ _KINDS = (
 """Kind of a star, its product, where its reason is, and which of the rows it is."""
 
 
+@dataclass(frozen=True)
+class SkyStar:
+    """A star in the view of the sky."""
+
+    label: str  # designation
+    ra_deg: float
+    dec_deg: float
+    mag: float | None
+    id: str | None = None  # its ``star_id``
+    name: str | None = None  # that people know it by
+    reason: str | None = None  # in words: why it was rejected, or why it is marked
+    kind: str = "mark"  # or the first of a row of `_KINDS`
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what is known of it as the script reads it."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+def in_words(reason: object) -> str | None:
+    """Return a reason without underscores; None if there is none."""
+    return None if reason is None else str(reason).replace("_", " ")
+
+
 @router.get("/databases/{database_id}/sky.json")
 async def stars_of_view(
     service: TheService,
@@ -56,12 +80,12 @@ async def stars_of_view(
     found = await service.query_pool.run(
         _stars, service, service.library.database(database_id), (ra, dec, radius), faint
     )
-    return JSONResponse({"stars": found}, headers=CACHED)
+    return JSONResponse({"stars": [one.as_dict() for one in found]}, headers=CACHED)
 
 
 def _stars(
     service: Service, database: ListedDatabase, where: tuple[float, float, float], faint: bool
-) -> list[dict[str, Any]]:
+) -> list[SkyStar]:
     is_all = where[2] >= 90.0
     parts = [
         _PART.format(
@@ -88,17 +112,16 @@ def _stars(
     return _named(stars, float(database.manifest["epoch_jyear"]))
 
 
-def _star(row: Mapping[str, Any]) -> dict[str, Any]:
-    star = {
-        "kind": row["kind"],
-        "id": str(row["star_id"]),
-        "label": row["designation"] or f"star {row['star_id']}",
-        "mag": round(row["mag"], 4),
-        "ra_deg": round(row["ra_deg"], 6),
-        "dec_deg": round(row["dec_deg"], 6),
-    }
-    reason = row["reason"]
-    return star if reason is None else {**star, "reason": str(reason).replace("_", " ")}
+def _star(row: Mapping[str, Any]) -> SkyStar:
+    return SkyStar(
+        label=row["designation"] or f"star {row['star_id']}",
+        ra_deg=round(row["ra_deg"], 6),
+        dec_deg=round(row["dec_deg"], 6),
+        mag=round(row["mag"], 4),
+        id=str(row["star_id"]),
+        reason=in_words(row["reason"]),
+        kind=row["kind"],
+    )
 
 
 def _cds_catalog(source: str) -> str:
@@ -115,12 +138,11 @@ def _cds_catalog(source: str) -> str:
 NAMED_TO_MAG = 8.5  # stars fainter than this have no name of their own
 
 
-def _named(stars: list[dict[str, Any]], epoch_jyear: float) -> list[dict[str, Any]]:
-    bright = [one for one in stars if one["mag"] <= NAMED_TO_MAG]
-    for one, name in zip(bright, star_names_of(bright, epoch_jyear), strict=True):
-        if name:
-            one["name"] = name
-    return stars
+def _named(stars: list[SkyStar], epoch_jyear: float) -> list[SkyStar]:
+    bright = [one for one in stars if one.mag is not None and one.mag <= NAMED_TO_MAG]
+    names = star_names_of([vars(one) for one in bright], epoch_jyear)
+    known = {one.id: name for one, name in zip(bright, names, strict=True)}
+    return [replace(one, name=known.get(one.id)) for one in stars]
 
 
 def star_names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
@@ -145,8 +167,13 @@ def outline_of(camera: Camera) -> list[list[float]]:
     return [[round(value, 8) for value in row] for row in edge.tolist()]
 
 
-def sky_view(database: ListedDatabase, camera: Camera | None = None, **more: Any) -> dict[str, Any]:
-    """Return what the script of the view is told: addresses, and the field of a camera."""
+def sky_view(
+    database: ListedDatabase,
+    camera: Camera | None = None,
+    marks: Sequence[SkyStar] = (),
+    **more: Any,
+) -> dict[str, Any]:
+    """Return what the script of the view gets: addresses, the field of a camera, marked stars."""
     own, address = camera or database.camera, f"/databases/{database.id}"
     return {
         "stars": f"{address}/sky.json",
@@ -156,6 +183,7 @@ def sky_view(database: ListedDatabase, camera: Camera | None = None, **more: Any
         "catalog": _cds_catalog(str(database.spec["catalog"]["source"])),
         "outline": outline_of(own),
         "fov": [own.fov_x_deg, own.fov_y_deg],
+        "marks": [one.as_dict() for one in marks],
         **more,
     }
 
