@@ -75,8 +75,10 @@ def _star_numbers(stars: pa.Table, key: str) -> NDArray[np.int64]:
     """Return the stars' own numbers of a kind; 0 where they have none."""
     if key in {"hip_number", "hd_number"}:
         return whole_numbers(stars, key)
-    catalog = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia",)}[key]
-    of_kind = np.isin(np.array(stars["catalog"].to_pylist(), dtype=object), catalog)
+    archives = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia", "gaia_dr3_hats")}[key]
+    names = pc.unique(stars["catalog"]).to_pylist()
+    catalogs = [name for name in names if data_source(name).archive in archives]
+    of_kind = np.isin(np.array(stars["catalog"].to_pylist(), dtype=object), catalogs)
     return np.where(of_kind, np.maximum(stars["star_id"].to_numpy(), 0), 0)
 
 
