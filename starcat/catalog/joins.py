@@ -6,9 +6,11 @@ moved for it. What a source says of its stars is the matter of `variability.py` 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -103,6 +105,12 @@ def with_code(codes: str | None, code: str) -> str:
     if codes is None:
         return code
     return codes if code in codes.split(";") else f"{codes};{code}"
+
+
+def read_joined(source_name: str, paths: Sequence[Path], progress: Progress) -> Any:
+    """Read a list of variables or doubles by the function that its TOML names."""
+    module, _, name = data_source(source_name).python.partition(":")
+    return getattr(importlib.import_module(module), name)(paths, progress)
 
 
 @dataclass(frozen=True)

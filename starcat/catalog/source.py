@@ -175,7 +175,10 @@ class DataSource(_Model):
     citation: str
     licence: str
     reference: str = ""  # the document that the layout was taken from
-    python: str = ""  # of an archive of stars: the module that gives its records their meaning
+    # The module that gives the records of an archive of stars their meaning; of other tables the
+    # function that reads them, as module:function.
+    python: str = ""
+    supplies: Literal["", "amplitudes", "companions"] = ""  # what can be joined to other catalogs
     kind: Literal["stars", "variability", "doubles"] = (
         "stars"  # a catalog, or a table joined to one
     )
@@ -250,8 +253,8 @@ def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
     if isinstance(table, TableMap):
         bands = table.ordered_bands
         return {"frame": table.frame, "epoch_jyear": table.epoch_jyear, "bands": bands}
-    if table.archive not in _shipped_names() or not _shipped(table.archive).python:
-        archives = [name for name in _shipped_names() if _shipped(name).python]
+    if table.archive not in _shipped_names() or not _is_archive(_shipped(table.archive)):
+        archives = [name for name in _shipped_names() if _is_archive(_shipped(name))]
         raise ConfigError(
             f"archive: {table.archive!r} is not an archive of stars; choose one of "
             f"{', '.join(archives)}",
@@ -268,6 +271,10 @@ def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
                 key=f"fields.{name}",
             )
     return archive.model_dump(include={"frame", "epoch_jyear", "bands"})
+
+
+def _is_archive(source: DataSource) -> bool:
+    return source.kind == "stars" and bool(source.python)
 
 
 @cache
