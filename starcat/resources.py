@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tomllib
+from functools import cache
 from pathlib import Path
 
 PathLike = str | os.PathLike[str]
@@ -25,3 +27,14 @@ def resource_folder(name: str) -> Path:
         if folder.is_dir():
             return folder
     raise FileNotFoundError(f"starcat is installed without its folder {name!r}: reinstall it")
+
+
+@cache
+def sources_supplying(what: str) -> tuple[str, ...]:
+    """Return the names of the data sources whose file says that they supply something, sorted.
+
+    A new list of variables or doubles is therefore one new file: no key of a spec lists it.
+    """
+    paths = sorted(resource_folder("data_sources").glob("*.toml"))
+    contents = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in paths}
+    return tuple(name for name, content in contents.items() if content.get("supplies") == what)

@@ -7,12 +7,14 @@ twice: against themselves (ranges, overlaps, separators) and against genuine rec
 from __future__ import annotations
 
 import gzip
+import importlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from starcat import resources
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import ParsedRecords
@@ -402,3 +404,25 @@ def test_gcvs_flag_one_makes_the_minimum_an_amplitude(catalogs, expected):
     assert set(gcvs["mag_flag"]) == expected(genuine={0, 1, 2}, generated={0, 1})
     # Gaia numbers need 64-bit integers: a float64 would round them.
     assert max(len(text.strip()) for text in gcvs["star_ref"]) == 19
+
+
+# What sources supply to other catalogs
+
+
+def test_a_list_that_supplies_something_names_the_function_that_reads_it():
+    lists = [data_source(name) for name in SOURCES if data_source(name).kind != "stars"]
+    assert {source.name for source in lists} == {"gcvs", "vsx", "wds"}
+    for source in lists:
+        wanted = {"variability": "amplitudes", "doubles": "companions"}[source.kind]
+        assert source.supplies == wanted
+        assert source.name in resources.sources_supplying(wanted)
+        module, _, name = source.python.partition(":")
+        assert callable(getattr(importlib.import_module(module), name))
+
+
+def test_a_new_list_is_one_new_file(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").write_text('name = "mine"\nsupplies = "amplitudes"\n')
+    (tmp_path / "stars.toml").write_text('name = "stars"\n')
+    monkeypatch.setattr(resources, "resource_folder", lambda _: tmp_path)
+    monkeypatch.setattr(resources, "sources_supplying", resources.sources_supplying.__wrapped__)
+    assert resources.sources_supplying("amplitudes") == ("mine",)

@@ -216,7 +216,7 @@ def check_band(source: DataSource, band: str | None) -> str:
     """Return the band to use, the source's first by default, after checking that it has it."""
     if band is None:
         return source.bands[0]
-    if source.name == "2mass":
+    if source.archive == "2mass":
         blend_weights(band)
     elif band not in source.bands:
         raise ConfigError(

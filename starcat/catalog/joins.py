@@ -6,9 +6,11 @@ moved for it. What a source says of its stars is the matter of `variability.py` 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -75,8 +77,10 @@ def _star_numbers(stars: pa.Table, key: str) -> NDArray[np.int64]:
     """Return the stars' own numbers of a kind; 0 where they have none."""
     if key in {"hip_number", "hd_number"}:
         return whole_numbers(stars, key)
-    catalog = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia",)}[key]
-    of_kind = np.isin(np.array(stars["catalog"].to_pylist(), dtype=object), catalog)
+    archives = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia", "gaia_dr3_hats")}[key]
+    names = pc.unique(stars["catalog"]).to_pylist()
+    catalogs = [name for name in names if data_source(name).archive in archives]
+    of_kind = np.isin(np.array(stars["catalog"].to_pylist(), dtype=object), catalogs)
     return np.where(of_kind, np.maximum(stars["star_id"].to_numpy(), 0), 0)
 
 
@@ -101,6 +105,12 @@ def with_code(codes: str | None, code: str) -> str:
     if codes is None:
         return code
     return codes if code in codes.split(";") else f"{codes};{code}"
+
+
+def read_joined(source_name: str, paths: Sequence[Path], progress: Progress) -> Any:
+    """Read a list of variables or doubles by the function that its TOML names."""
+    module, _, name = data_source(source_name).python.partition(":")
+    return getattr(importlib.import_module(module), name)(paths, progress)
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
 from starcat.catalog.readers.tables import read_tables
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts, InputFile
+from starcat.catalog.table_map import ArchiveMap
 from starcat.errors import ParseError, SourceError
 from starcat.progress import Progress, no_progress
 from starcat.stars.star_table import Columns, move_to_epoch, split_by_verdict, table_from_columns
@@ -123,8 +124,11 @@ def parse_block(block: Block, options: IngestOptions) -> FilePart:
 def _records(block: Block, options: IngestOptions) -> tuple[Archive, ParsedRecords]:
     """Return what a block holds, and whose records they are."""
     layout = block.file.layout
-    if layout.table is not None and block.rows is not None:
-        return MappedTable(layout.table, {}), records_of(layout.table, block.rows, block.file)
+    if (table := layout.table) is not None and block.rows is not None:
+        records = records_of(table, block.rows, block.file)
+        if isinstance(table, ArchiveMap):
+            return archive_of(table.archive), records
+        return MappedTable(table, {}), records
     catalog = archive_of(options.source_name)
     parse = _PARSERS[layout.layout]
     return catalog, parse(block.data, layout, catalog.COLUMNS[layout.name], block.first_line)

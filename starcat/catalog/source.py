@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starcat.catalog.table_map import TableMap
+from starcat.catalog.table_map import ArchiveMap, TableMap
 from starcat.errors import ConfigError, suggest
 from starcat.failures import validation_message
 from starcat.resources import resource_folder
@@ -126,7 +126,7 @@ class RecordFile(_Model):
     optional: bool = False  # the source is usable without this file
     description: str = ""  # what is in the file, where a source has several
     layout: Literal["fixed_width", "delimited", "binary", "table"]
-    table: TableMap | None = None  # what the columns mean (table)
+    table: TableMap | ArchiveMap | None = None  # what the columns mean (table)
     record_bytes: int | None = None  # without the line end (fixed width, binary)
     trimmed: bool = False  # lines may end after their last field, or go on after the record
     header_bytes: int = 0  # before the first record (binary)
@@ -175,7 +175,10 @@ class DataSource(_Model):
     citation: str
     licence: str
     reference: str = ""  # the document that the layout was taken from
-    python: str = ""  # of an archive of stars: the module that gives its records their meaning
+    # The module that gives the records of an archive of stars their meaning; of other tables the
+    # function that reads them, as module:function.
+    python: str = ""
+    supplies: Literal["", "amplitudes", "companions"] = ""  # what can be joined to other catalogs
     kind: Literal["stars", "variability", "doubles"] = (
         "stars"  # a catalog, or a table joined to one
     )
@@ -194,14 +197,21 @@ class DataSource(_Model):
     @property
     def has_motions(self) -> bool:
         """Whether its records have proper motions."""
-        if self.table is not None:
+        if isinstance(self.table, TableMap):
             return self.table.columns.pm_dec is not None
+        if self.table is not None:
+            return data_source(self.table.archive).has_motions
         return any(column.unit in _MOTIONS for file in self.files for column in file.columns)
 
     @property
-    def table(self) -> TableMap | None:
+    def table(self) -> TableMap | ArchiveMap | None:
         """The map, where the source is a table of one's own."""
         return self.files[0].table
+
+    @property
+    def archive(self) -> str:
+        """The archive whose records it has: another one for some tables, else the source itself."""
+        return self.table.archive if isinstance(self.table, ArchiveMap) else self.name
 
 
 def read_source(path: Path) -> DataSource:
@@ -212,14 +222,14 @@ def read_source(path: Path) -> DataSource:
         return DataSource.model_validate(content) if "files" in content else mapped(content)
     except ValidationError as error:
         if "files" not in content:
-            raise what_is_wrong(error, path.name, TableMap, "map") from error
+            raise what_is_wrong(error, path.name, _map_of(content), "map") from error
         key, found = validation_message(error)
         raise ConfigError(f"{path.name}: {key}: {found}", key=key) from error
 
 
 def mapped(content: Mapping[str, Any]) -> DataSource:
     """Return the source that a map makes of a table."""
-    table = TableMap.model_validate(content)
+    table = _map_of(content).model_validate(content)
     usual = tuple(f"{table.name}.{ending}" for ending in _ENDINGS)
     names = table.file_names or usual
     return DataSource(
@@ -228,12 +238,43 @@ def mapped(content: Mapping[str, Any]) -> DataSource:
         identifier=table.identifier or "a table of one's own",
         citation=table.citation,
         licence=table.licence,
-        frame=table.frame,
-        epoch_jyear=table.epoch_jyear,
-        bands=table.ordered_bands,
+        **_light_and_place(table),
         urls_retrieved="no address",
         files=(RecordFile(name=table.name, file_names=names, layout="table", table=table),),
     )
+
+
+def _map_of(content: Mapping[str, Any]) -> type[TableMap] | type[ArchiveMap]:
+    return ArchiveMap if "archive" in content else TableMap
+
+
+def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
+    """Return frame, epoch and bands of a map, or of the archive whose records its rows are."""
+    if isinstance(table, TableMap):
+        bands = table.ordered_bands
+        return {"frame": table.frame, "epoch_jyear": table.epoch_jyear, "bands": bands}
+    if table.archive not in _shipped_names() or not _is_archive(_shipped(table.archive)):
+        archives = [name for name in _shipped_names() if _is_archive(_shipped(name))]
+        raise ConfigError(
+            f"archive: {table.archive!r} is not an archive of stars; choose one of "
+            f"{', '.join(archives)}",
+            key="archive",
+            value=table.archive,
+        )
+    archive = _shipped(table.archive)
+    known = [column.name for column in archive.files[0].columns]
+    for name in table.fields:
+        if name not in known:
+            raise ConfigError(
+                f"fields.{name}: {table.archive} has no such field; {suggest(name, known)}"
+                f"it has {', '.join(known)}",
+                key=f"fields.{name}",
+            )
+    return archive.model_dump(include={"frame", "epoch_jyear", "bands"})
+
+
+def _is_archive(source: DataSource) -> bool:
+    return source.kind == "stars" and bool(source.python)
 
 
 @cache
@@ -351,7 +392,7 @@ def _own(path: Path) -> DataSource:
 
 def _check_without_hook(source: DataSource, where: str) -> None:
     """Check that a map names no function: a file of data from elsewhere must not choose code."""
-    if source.python or (source.table is not None and source.table.python):
+    if source.python or (isinstance(source.table, TableMap) and source.table.python):
         raise ConfigError(
             f"{where}: python: only the maps that ship with starcat name a function; write "
             "expressions of columns, or give a table that has the values",

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.archives.mapped import Understood, names_wanted, records_of, target, understand
+from starcat.catalog.archives.mapped import Understood, names_wanted, records_of, understand
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers.tables import open_table, read_tables
 from starcat.catalog.source import DataSource
@@ -37,6 +37,8 @@ class _Range:
             self.yes += int(values.sum())
         elif values.dtype == object:
             self.missing += sum(value is None for value in values)
+        elif values.dtype.kind == "S":
+            self.missing += int(np.count_nonzero(values == b""))
         else:
             known = values[~np.isnan(values.astype(np.float64))]
             self.missing += len(values) - len(known)
@@ -79,7 +81,8 @@ def check_map(source: DataSource, path: Path) -> Checked:
         for rows in read_tables(file, wanted, lambda _: None):
             records = records_of(table, rows, file)
             for key, values in ranges.items():
-                values.add(records["star_text" if key == "columns.star_id" else key])
+                name = "star_text" if key == "columns.star_id" else key.removeprefix("fields.")
+                values.add(records[name])
     read = ingest_catalog(source.name, [path], neighbours=False)
     used = {name for one in found.values() for name in one.columns}
     return Checked(
@@ -98,7 +101,7 @@ def _told(key: str, found: Understood, values: _Range) -> dict[str, Any]:
         "key": key,
         "from": found.value.value,
         "unit": found.unit,
-        "becomes": (target(key) or "").replace(" ", ""),
+        "becomes": found.becomes.replace(" ", ""),
         "least": values.least if is_number else None,
         "greatest": values.greatest if is_number else None,
         "missing": values.missing,

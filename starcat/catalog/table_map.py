@@ -1,8 +1,9 @@
 """The map of a table of one's own: which columns of a file mean what, in which units and frame.
 
 A map is a TOML file of the user's, or one that ships for a table of others. It names columns, or
-expressions of columns, for the values of a star. This module reads no star; the rows of a table
-get their meaning in `starcat.catalog.archives.mapped`.
+expressions of columns, for the values of a star (`TableMap`), or for the fields of an archive whose
+records the rows are (`ArchiveMap`). This module reads no star; the rows of a table get their
+meaning in `starcat.catalog.archives.mapped`.
 """
 
 from __future__ import annotations
@@ -133,10 +134,16 @@ class Remote(_Model):
     hats: str = Field(
         "", description="address of a HATS catalog of it, which can be given as an input"
     )
+    strip_by: str = Field(
+        "", description="of an archive's records: field of the declination, by which TAP is asked"
+    )
+    limit_by: str = Field(
+        "", description="of an archive's records: field of the magnitude that a limit is for"
+    )
 
 
-class TableMap(_Model):
-    """What the columns of a table mean."""
+class AnyMap(_Model):
+    """What every map says of a table, whatever its rows are."""
 
     name: str = Field(pattern=NAME, description="of the source, in commands and specs")
     title: str = Field("", description="what the table is")
@@ -155,6 +162,48 @@ class TableMap(_Model):
     names: tuple[str, ...] = Field((), description="columns of a text file without a header")
     encoding: str = Field("utf8", description="of a text file")
     null: tuple[str | float, ...] = Field((), description="texts and numbers that mean no value")
+    remote: Remote | None = Field(None, description="where the table is served")
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """All values and conditions by what they are called in messages."""
+        raise NotImplementedError
+
+    @property
+    def asked_by(self) -> tuple[str, str]:
+        """The values that a TAP service is asked by: declination, and magnitude of a limit."""
+        raise NotImplementedError
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the map as a manifest holds it."""
+        return self.model_dump(mode="json", exclude_defaults=True, exclude={"remote"})
+
+
+class ArchiveMap(AnyMap):
+    """Which columns of a table are the fields of an archive, whose records its rows are."""
+
+    archive: str = Field(
+        pattern=NAME, description="source of starcat that gives the records their meaning"
+    )
+    fields: dict[str, Given] = Field(
+        min_length=1, description="columns or expressions by the archive's fields, in its units"
+    )
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """The fields by what they are called in messages."""
+        return {f"fields.{name}": value for name, value in self.fields.items()}
+
+    @property
+    def asked_by(self) -> tuple[str, str]:
+        """The fields that `remote` names."""
+        remote = self.remote or Remote(checked="")
+        return f"fields.{remote.strip_by}", f"fields.{remote.limit_by}"
+
+
+class TableMap(AnyMap):
+    """What the columns of a table mean."""
+
     frame: Literal["ICRS", "FK5", "FK4", "galactic"] = Field("ICRS", description="axes of ra, dec")
     equinox: str | None = Field(None, description="default: J2000 of FK5, B1950 of FK4")
     epoch: Given = Field(description="of the positions: 2016.0, J2000, B1950, a date, or a column")
@@ -170,7 +219,6 @@ class TableMap(_Model):
         {}, description=f"conditions on which a row is rejected: {', '.join(REJECTS)}"
     )
     quality: dict[str, str] = Field({}, description=f"conditions by bit: {', '.join(QUALITIES)}")
-    remote: Remote | None = Field(None, description="where the table is served")
     python: str = Field(
         "",
         pattern=r"^$|^[a-z_][a-z0-9_.]*:[a-z_][a-z0-9_]*$",
@@ -265,7 +313,11 @@ class TableMap(_Model):
             found[f"reject.{key}"] = Value(value=self.reject[key])
         return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
 
+    @property
+    def asked_by(self) -> tuple[str, str]:
+        """The declination and the first band."""
+        return "columns.dec", f"magnitudes.{self.ordered_bands[0]}"
+
     def recorded(self) -> dict[str, Any]:
         """Return the map as a manifest holds it; JSON has no order of keys, so bands have one."""
-        held = self.model_dump(mode="json", exclude_defaults=True, exclude={"remote"})
-        return {**held, "bands": list(self.ordered_bands)}
+        return {**super().recorded(), "bands": list(self.ordered_bands)}

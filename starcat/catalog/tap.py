@@ -32,7 +32,7 @@ from starcat.catalog.archives.mapped import understand
 from starcat.catalog.readers.tables import ANY, OpenTable, open_table
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.table_map import TableMap
+from starcat.catalog.table_map import AnyMap
 from starcat.errors import ConfigError, DownloadError, OutputError, ParseError
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import file_sha256, json_bytes, locked, whole_file, writing
@@ -63,7 +63,7 @@ class Asked:
     service: str  # address
     table: str = ""  # as it stands behind FROM
     query: str = ""  # a whole query in place of a table
-    map: TableMap | None = None  # whose columns are asked for; None for all
+    map: AnyMap | None = None  # whose columns are asked for; None for all
     limit_mag: float | None = None  # of the first band of the map
     strip_by: str = "dec"  # column in degrees, -90 to 90; with a map that of the declination
 
@@ -165,15 +165,16 @@ class _Fetch:
         opened = self._ask(f"SELECT TOP 1 * FROM {self.table}")
         if asked.map is not None:
             found = understand(asked.map, opened.columns, asked.table or "the answer")
-            dec = found["columns.dec"]
-            column = dec.columns[0] if dec.is_column and dec.unit == "deg" else ""
+            dec_key, mag_key = asked.map.asked_by
+            dec, band = found.get(dec_key), found.get(mag_key)
+            if dec is not None:
+                column = dec.columns[0] if dec.is_column and dec.unit == "deg" else ""
             names = dict.fromkeys(name for one in found.values() for name in one.columns)
             self.chosen = ", ".join(map(_quoted, names))
-            band = found[f"magnitudes.{asked.map.ordered_bands[0]}"]
             if asked.limit_mag is not None:
-                if not band.is_column or band.unit != "mag":
+                if band is None or not band.is_column or band.unit != "mag":
                     raise ConfigError(
-                        f"limit_mag: {asked.map.ordered_bands[0]} of the map is not a column of "
+                        f"limit_mag: {mag_key.partition('.')[2]} of the map is not a column of "
                         "magnitudes; write the limit into a query",
                         key="limit_mag",
                         fields=("limit_mag", "query"),

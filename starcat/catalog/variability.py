@@ -21,8 +21,17 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.ingest import ingest_catalog
-from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, whole_numbers, with_code
+from starcat.catalog.joins import (
+    Keys,
+    numbers_in,
+    read_joined,
+    read_records,
+    texts_of,
+    whole_numbers,
+    with_code,
+)
 from starcat.catalog.readers.records import ParsedRecords
+from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
@@ -61,8 +70,9 @@ def read_amplitudes(
     source_name: str, paths: Sequence[Path], progress: Progress = no_progress
 ) -> AmplitudeTable:
     """Read the amplitudes of a source."""
-    if source_name in _READERS:
-        return _READERS[source_name](paths, progress)
+    if data_source(source_name).kind == "variability":
+        table: AmplitudeTable = read_joined(source_name, paths, progress)
+        return table
     read = ingest_catalog(source_name, paths, neighbours=False, progress=progress)
     # A star without a position can still be known to vary.
     usable = read.rejected.filter(pc.is_valid(read.rejected["star_id"]))
@@ -136,9 +146,6 @@ def read_vsx(paths: Sequence[Path], progress: Progress = no_progress) -> Amplitu
 def _amplitudes_of_vsx(part: ParsedRecords) -> Array:
     maxima, minima = texts_of(part["mag_max"]), texts_of(part["mag_min"])
     return _amplitudes(maxima, minima, part["f_min"] == b"(")
-
-
-_READERS = {"gcvs": read_gcvs, "vsx": read_vsx}
 
 
 def _star_number(text: str) -> int:

@@ -22,8 +22,9 @@ from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.bands.response import Response
-from starcat.catalog.doubles import PairTable, read_wds
+from starcat.catalog.doubles import PairTable
 from starcat.catalog.ingest import unmoved_stars
+from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
 from starcat.catalog.variability import AmplitudeTable, read_amplitudes
 from starcat.geometry.sphere import separation
@@ -142,7 +143,7 @@ def supply_amplitudes(draft: Draft) -> None:
 def supply_doubles(draft: Draft) -> None:
     """Take the companions of double stars from other sources, and flag these stars."""
     for name in draft.spec.selection.doubles.join:
-        _join(draft, "supply_doubles", read_wds(draft.paths[name], draft.progress))
+        _join(draft, "supply_doubles", read_joined(name, draft.paths[name], draft.progress))
 
 
 def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:

@@ -452,10 +452,15 @@ _WRITERS: dict[str, Callable[[Sky], dict[str, Iterator[dict[str, Any]]]]] = {
 }  # fmt: skip
 
 
+def archive_rows(source_name: str, sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """Return the fields of the records of a sky in an archive, by layout; a blank one is absent."""
+    return _WRITERS[source_name](sky)
+
+
 def archive_records(source_name: str, sky: Sky) -> dict[str, list[bytes]]:
     """Return the records of a sky in an archive, by layout; text records end with a line feed."""
     layouts = {layout.name: layout for layout in data_source(source_name).files}
-    rows = _WRITERS[source_name](sky)
+    rows = archive_rows(source_name, sky)
     return {name: _records(layouts[name], rows[name]) for name in rows}
 
 

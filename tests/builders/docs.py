@@ -11,7 +11,7 @@ from every_command import every_command
 from typer.testing import CliRunner
 
 from starcat.catalog.source import data_source, source_names
-from starcat.catalog.table_map import UNITS, Flags, Remote, StarColumns, TableMap
+from starcat.catalog.table_map import UNITS, ArchiveMap, Flags, Remote, StarColumns, TableMap
 from starcat.cli.main import app
 from starcat.pipeline.stages import CHOOSE, FINISH, PRODUCTS, READ
 from starcat.query.gallery import gallery, macros
@@ -113,6 +113,9 @@ def sources_page() -> str:
     return "\n".join([*page, *map_keys()])
 
 
+OF_ARCHIVE = "Of a table whose rows are the records of an archive"
+
+
 def map_keys() -> list[str]:
     """Return the reference of the keys of a map."""
     page = [
@@ -124,8 +127,10 @@ def map_keys() -> list[str]:
         ("columns", StarColumns),
         ("flags", Flags),
         ("remote", Remote),
+        (OF_ARCHIVE, ArchiveMap),
     ):
-        page.append(f"### {f'[{title}]' if title else 'At the top, and sections'}\n")
+        titles = {"": "At the top, and sections", OF_ARCHIVE: OF_ARCHIVE}
+        page.append(f"### {titles.get(title, f'[{title}]')}\n")
         page.append("| key | needed | becomes | meaning |\n|---|---|---|---|")
         for name, field in model.model_fields.items():
             if field.description:

@@ -1,7 +1,8 @@
 """Tables of one's own: what their rows mean, as the map says.
 
 Rows become records with one column a value of the map, in the units of the star table and still
-in the frame of the map; then positions and proper motions become ICRS.
+in the frame of the map; then positions and proper motions become ICRS. Where the map says that the
+rows are the records of an archive, they become these, and the archive's module does the rest.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -21,10 +22,25 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.frames import icrs_from
-from starcat.catalog.readers.records import MalformedRecord, ParsedRecords, Rows, TableColumn
+from starcat.catalog.readers.records import (
+    MalformedRecord,
+    ParsedRecords,
+    Rows,
+    TableColumn,
+    check_record_fields,
+)
 from starcat.catalog.readers.tables import BLANKS, OpenTable
+from starcat.catalog.source import SourceColumn, data_source
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.table_map import ASSUMED, UNITS, TableMap, Value, unit_of_column
+from starcat.catalog.table_map import (
+    ASSUMED,
+    UNITS,
+    AnyMap,
+    ArchiveMap,
+    TableMap,
+    Value,
+    unit_of_column,
+)
 from starcat.errors import ConfigError, quoted
 from starcat.stars.expressions import columns_in, evaluate_expression
 from starcat.stars.star_table import Columns, known, where_known
@@ -36,6 +52,7 @@ _SEXAGESIMAL = (
     r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
     r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
 )
+_SINGLE_DECIMALS = 6  # of magnitudes and fields of four bytes, which hold 7 digits
 _TEXTS = ("columns.star_id", "columns.designation", "columns.spectral_type")
 
 
@@ -47,58 +64,76 @@ class Understood:
     columns: tuple[str, ...]  # of the file that it is made from
     is_column: bool  # one of them, as it is; else an expression or a number
     unit: str  # of what is found; empty for texts, conditions and pure numbers
+    becomes: str  # the unit of the star table or of the archive's field; empty likewise
     convert: Callable[[Array], Array]  # to the unit of the star table
 
 
 def understand(
-    table: TableMap, columns: Mapping[str, TableColumn], where: str
+    table: AnyMap, columns: Mapping[str, TableColumn], where: str
 ) -> dict[str, Understood]:
     """Find all that a map names among the columns of a file."""
     found = {}
+    fields = _fields_of(table) if isinstance(table, ArchiveMap) else {}
     for key, value in table.values.items():
         if isinstance(value.value, str):
             named, is_column = columns_in(value.value, list(columns), key, where)
         else:
             named, is_column = (), False
         unit, convert = "", cast(Callable[[Array], Array], _as_is)
-        if target(key) is not None:
-            unit, convert = _unit(key, value, columns[named[0]] if is_column else None, where)
-        found[key] = Understood(value, named, is_column, unit, convert)
+        wanted, assumed = _units(key, fields)
+        if wanted:
+            column = columns[named[0]] if is_column else None
+            unit, convert = _unit(key, value, column, where, wanted, assumed)
+        found[key] = Understood(value, named, is_column, unit, wanted, convert)
     return found
 
 
-def target(key: str) -> str | None:
-    """Return the unit of the star table of a value; None where it has none."""
+def _units(key: str, fields: Mapping[str, SourceColumn]) -> tuple[str, str]:
+    """Return the unit that a value gets, and the one it has where nobody states any."""
     kind, _, name = key.partition(".")
-    return "mag" if kind.startswith("magnitude") else UNITS.get(name) or None
+    if kind == "fields":
+        unit = (fields[name].unit or "").replace("cas", "0.01 arcsec")
+        return unit, unit
+    if kind.startswith("magnitude"):
+        return "mag", "mag"
+    return UNITS.get(name, ""), ASSUMED.get(name, "")
+
+
+def _fields_of(table: ArchiveMap) -> dict[str, SourceColumn]:
+    """Return the fields that the module of an archive reads, all of which the map has to give."""
+    archive = data_source(table.archive)
+    module = importlib.import_module(archive.python)
+    layout = archive.files[0]
+    if lacking := [name for name in module.COLUMNS[layout.name] if name not in table.fields]:
+        raise ConfigError(f"fields: {table.archive} also needs {', '.join(lacking)}", key="fields")
+    return {name: layout.column(name) for name in table.fields}
 
 
 def _unit(
-    key: str, value: Value, column: TableColumn | None, where: str
+    key: str, value: Value, column: TableColumn | None, where: str, wanted: str, assumed: str
 ) -> tuple[str, Callable[[Array], Array]]:
     from astropy import units
 
     kind, _, name = key.partition(".")
     told = column.unit if column and ":" not in column.unit else ""
-    text = value.unit or told or ("mag" if kind.startswith("magnitude") else ASSUMED.get(name, ""))
-    wanted = target(key)
+    text = value.unit or told or assumed
     if not text:
         raise ConfigError(
             f"{key}: neither {where} nor the map states a unit; write it, such as "
-            f'{{ value = "{value.value}", unit = "{str(wanted).replace(" ", "")}" }}',
+            f'{{ value = "{value.value}", unit = "{wanted.replace(" ", "")}" }}',
             key=key,
         )
     try:
         found = unit_of_column(text)
         if kind == "magnitudes" and found.physical_type == "spectral flux density":
             return text, lambda flux: _ab_magnitudes(flux, found)
-        if kind == "magnitudes" and isinstance(found, units.MagUnit):
+        if wanted == "mag" and isinstance(found, units.MagUnit):
             return text, _as_is
         # An hour or a second of right ascension is 15 degrees or 15 arcsec.
         second, arcsec = units.s, units.Unit(15.0 * units.arcsec)
         same = [(second, arcsec), (second / units.yr, arcsec / units.yr)]
         turns = same if name in ("ra", "ra_error", "pm_ra", "pm_ra_cosdec", "pm_ra_error") else []
-        factor = float(found.to(unit_of_column(str(wanted)), 1.0, equivalencies=turns))
+        factor = float(found.to(unit_of_column(wanted), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
         raise ConfigError(
@@ -125,7 +160,7 @@ def _ab_magnitudes(flux: Array, unit: Any) -> Array:
     return np.asarray((positive * unit).to_value(units.ABmag), dtype=np.float64)
 
 
-def names_wanted(table: TableMap, opened: OpenTable, *, where: str) -> list[str]:
+def names_wanted(table: AnyMap, opened: OpenTable, *, where: str) -> list[str]:
     """Return the columns of a file that a map needs."""
     found = understand(table, opened.columns, where)
     return list(dict.fromkeys(name for one in found.values() for name in one.columns))
@@ -134,7 +169,7 @@ def names_wanted(table: TableMap, opened: OpenTable, *, where: str) -> list[str]
 class _Reading:
     """Rows of a table while they become records."""
 
-    def __init__(self, table: TableMap, rows: Rows, where: str) -> None:
+    def __init__(self, table: AnyMap, rows: Rows, where: str) -> None:
         self.map = table
         self.rows = rows
         self.count = len(rows.number)
@@ -220,7 +255,11 @@ class _Reading:
             )
         array = _floats(values)
         array[np.isinf(array)] = np.nan
-        return self.found[key].convert(array)
+        array = self.found[key].convert(array)
+        is_light = key.startswith(("magnitudes.", "magnitude_errors.", "fields."))
+        if is_light and pa.types.is_float32(values.type):
+            return np.asarray(np.round(array, _SINGLE_DECIMALS))
+        return array
 
     def _angles(self, texts: pa.Array, key: str) -> Array:
         """Return angles of sexagesimal or decimal texts; right ascensions are in hours."""
@@ -237,7 +276,8 @@ class _Reading:
             pc.if_else(parts.is_valid(), pa.scalar(None, pa.string()), texts), key
         )
         decimal = found.convert(_floats(plain))
-        is_hours = key == "columns.ra" and self.map.frame != "galactic" and found.value.unit is None
+        is_galactic = isinstance(self.map, TableMap) and self.map.frame == "galactic"
+        is_hours = key == "columns.ra" and not is_galactic and found.value.unit is None
         signed = np.where(negative, -size, size)
         return np.where(is_split, 15.0 * signed if is_hours else found.convert(signed), decimal)
 
@@ -249,6 +289,26 @@ class _Reading:
             if pc.all(pc.equal(rounded, values)).as_py() is not False:
                 values = rounded.cast(pa.int64())
         return np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
+
+    def field(self, key: str, column: SourceColumn) -> NDArray[Any]:
+        """Return a field of an archive's records as its readers do: texts as bytes, blank for none.
+
+        A flag with a sign for each band that a table has as a number gets its leading zeros back.
+        """
+        if column.is_text:
+            values = self.value(key, as_text=True)
+            texts = pc.fill_null(values.cast(pa.string()), "")
+            if pa.types.is_integer(values.type) and column.format[1:]:
+                width = int(column.format[1:])
+                texts = pc.if_else(values.is_valid(), pc.utf8_lpad(texts, width, "0"), texts)
+            return np.array(texts.cast(pa.binary()).to_pylist() or [b""], dtype="S")[: self.count]
+        if column.format.startswith("<i"):
+            values = self.value(key)
+            wrong = np.asarray(values.is_null()) | (not pa.types.is_integer(values.type))
+            self.refuse(wrong, key, values, "a whole number")
+            return np.array(pc.fill_null(values, 0).cast(pa.int64(), safe=False), dtype=np.int64)
+        array = self.numbers(key)
+        return np.round(array, _SINGLE_DECIMALS) if column.is_integer else array
 
     def holds(self, key: str) -> Mask:
         """Return where a condition holds."""
@@ -301,9 +361,14 @@ def _is_number(value: str | float) -> bool:
     return True
 
 
-def records_of(table: TableMap, rows: Rows, file: InputFile) -> ParsedRecords:
-    """Return rows as records: the values of the map by their keys, in the map's frame."""
+def records_of(table: TableMap | ArchiveMap, rows: Rows, file: InputFile) -> ParsedRecords:
+    """Return rows as records: the values of the map by their keys, in the map's frame.
+
+    The rows that are records of an archive have its fields, and are checked as those of its files.
+    """
     reading = _Reading(table, rows, file.path.name)
+    if isinstance(table, ArchiveMap):
+        return _archive_records(table, reading)
     columns: dict[str, NDArray[Any]] = {}
     columns["columns.star_id"], columns["star_text"] = reading.identities()
     for key in reading.found:
@@ -318,6 +383,16 @@ def records_of(table: TableMap, rows: Rows, file: InputFile) -> ParsedRecords:
     records = ParsedRecords(table.name, rows.number, columns, rows.problems)
     records = records.without(reading.bad, reading.problems)
     return hook_of(table)(records) if table.python else records
+
+
+def _archive_records(table: ArchiveMap, reading: _Reading) -> ParsedRecords:
+    fields, layout = _fields_of(table), data_source(table.archive).files[0]
+    columns = {name: reading.field(f"fields.{name}", column) for name, column in fields.items()}
+    rows = reading.rows
+    records = ParsedRecords(layout.name, rows.number, columns, rows.problems)
+    checked = check_record_fields(records.without(reading.bad, reading.problems), layout)
+    problems = [replace(one, what="row", byte_range=None) for one in checked.problems]
+    return replace(checked, problems=problems)
 
 
 def hook_of(table: TableMap) -> Callable[[ParsedRecords], ParsedRecords]:
@@ -363,7 +438,8 @@ class MappedTable:
             columns |= {"second_mag": self.magnitudes(records, others[0]), "second_band": others[0]}
         if self.table.colour_bands:
             first, second = (self.magnitudes(records, one) for one in self.table.colour_bands)
-            columns |= {"colour_mag": first - second, "colour_bands": str(self.table.colour)}
+            colour = np.round(first - second, _SINGLE_DECIMALS)
+            columns |= {"colour_mag": colour, "colour_bands": str(self.table.colour)}
         return columns
 
     def _remarks(self, records: ParsedRecords) -> Columns:

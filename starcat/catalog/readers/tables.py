@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from starcat.catalog.readers.blocks import DigestReader, open_input
 from starcat.catalog.readers.records import MalformedRecord, Rows, TableColumn
 from starcat.catalog.source_files import InputFile
-from starcat.catalog.table_map import TableMap
+from starcat.catalog.table_map import AnyMap, TableMap
 from starcat.errors import StarcatError, quoted
 
 BLOCK_ROWS, BLOCK_BYTES = 1 << 16, 1 << 22
@@ -164,7 +164,7 @@ def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str,
     }, header
 
 
-def _open_text(file: InputFile, how: TableMap, head: bytes) -> OpenTable:
+def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     text = head.decode(how.encoding, errors="replace" if len(head) == HEAD_BYTES else "strict")
     lines = text.removeprefix("\ufeff").splitlines()
     if "\0" in text:
@@ -235,7 +235,7 @@ class _TextOptions:
     after: int  # lines between the header and the first row
     delimiter: str
     names: list[str]
-    how: TableMap
+    how: AnyMap
 
     def read(self, file: InputFile, wanted: Sequence[str]) -> Iterator[_Part]:
         """Read columns as texts, in blocks of lines; lines of another length are problems."""
@@ -288,7 +288,7 @@ class _TextOptions:
         return numbers, int(numbers[-1]) + 1 if count else first
 
 
-def _open_fits(file: InputFile, how: TableMap, _: bytes) -> OpenTable:
+def _open_fits(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
     from astropy.io import fits
 
     with _quiet(), fits.open(file.path, memmap=True) as found:
@@ -356,7 +356,7 @@ def _table(arrays: dict[str, pa.Array], count: int) -> pa.Table:
     return pa.table(arrays) if arrays else pa.table({"": pa.nulls(count)})
 
 
-def _open_votable(file: InputFile, how: TableMap, _: bytes) -> OpenTable:
+def _open_votable(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
     from astropy.io.votable import parse
 
     with _quiet():
@@ -417,7 +417,7 @@ def _plain(batch: pa.RecordBatch) -> pa.Table:
     return pa.Table.from_arrays(arrays, names=batch.schema.names)
 
 
-def _open_parquet(file: InputFile, _: TableMap, __: bytes) -> OpenTable:
+def _open_parquet(file: InputFile, _: AnyMap, __: bytes) -> OpenTable:
     with pq.ParquetFile(file.path) as found:
         columns = _arrow_columns(found.schema_arrow)
 
@@ -429,7 +429,7 @@ def _open_parquet(file: InputFile, _: TableMap, __: bytes) -> OpenTable:
     return OpenTable("Parquet", columns, read)
 
 
-def _open_arrow(file: InputFile, _: TableMap, head: bytes) -> OpenTable:
+def _open_arrow(file: InputFile, _: AnyMap, head: bytes) -> OpenTable:
     begin = pa.ipc.open_file if head.startswith(b"ARROW1") else pa.ipc.open_stream
     with pa.memory_map(str(file.path)) as source:
         columns = _arrow_columns(begin(source).schema)
@@ -446,7 +446,7 @@ def _open_arrow(file: InputFile, _: TableMap, head: bytes) -> OpenTable:
     return OpenTable("Arrow", columns, read)
 
 
-_OPENERS: dict[bytes, Callable[[InputFile, TableMap, bytes], OpenTable]] = {
+_OPENERS: dict[bytes, Callable[[InputFile, AnyMap, bytes], OpenTable]] = {
     b"SIMPLE  =": _open_fits,
     b"<?xml": _open_votable,
     b"<VOTABLE": _open_votable,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,7 @@ from pydantic import Field
 from starcat.arrays import Array, Mask, Rows
 from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
+from starcat.resources import sources_supplying
 from starcat.sections import Mag, Section
 from starcat.selection.merging import (
     MAX_PAIRS,
@@ -45,6 +46,12 @@ FORM = {
 }
 
 
+if TYPE_CHECKING:
+    CompanionSource: TypeAlias = str
+else:
+    CompanionSource = Literal[sources_supplying("companions")]
+
+
 class Doubles(Section):
     """Stars too close for the sensor to tell apart."""
 
@@ -73,10 +80,10 @@ class Doubles(Section):
         "separation is below the limit or unknown and the magnitudes are known to be close; or "
         "always a rejection",
     )
-    join: tuple[Literal["wds"], ...] = Field(
+    join: tuple[CompanionSource, ...] = Field(
         (),
         strict=False,  # a list in TOML
-        max_length=1,
+        max_length=len(sources_supplying("companions")),
         description="sources that flag stars with a companion closer than min_separation_deg, by "
         "HIP number or place; a pair without magnitudes counts as one of equal stars where it is "
         "closer than 5 arcsec, and not at all where it is wider",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field
 
+from starcat.resources import sources_supplying
 from starcat.sections import Section
 from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
@@ -17,6 +18,12 @@ COLUMNS = ("amplitude_mag", "is_flagged_variable")
 VARIABLE = RuleReason("variable", "amplitude above max_amplitude_mag")
 FLAGGED_VARIABLE = RuleReason("flagged_variable", "flagged variable, amplitude unknown")
 REASONS = (VARIABLE, FLAGGED_VARIABLE)
+
+
+if TYPE_CHECKING:
+    AmplitudeSource: TypeAlias = str
+else:
+    AmplitudeSource = Literal[sources_supplying("amplitudes")]
 
 
 class Variables(Section):
@@ -30,7 +37,7 @@ class Variables(Section):
         description="what an archive's flag of a variable means: nothing; a rejection of those "
         "without a known amplitude; or always a rejection",
     )
-    join: tuple[Literal["hipparcos", "tycho1", "gcvs", "vsx"], ...] = Field(
+    join: tuple[AmplitudeSource, ...] = Field(
         (),
         strict=False,  # a list in TOML
         description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number, or (vsx) "
