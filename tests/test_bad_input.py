@@ -707,6 +707,12 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "image that is none": run(
         "identify {artifact} {folder}/frame.png", {"frame.png": "no picture"}
     ),
+    "image of a format that is not read": run(
+        "identify {artifact} {folder}/frame.png", {"frame.png": b"RIFF\x10\0\0\0WEBPVP8 "}
+    ),
+    "frame of a format that is not read": run(
+        "identify {artifact} {folder}/frame.gif", {"frame.gif": b"GIF89a\xff\xfe"}
+    ),
     "pattern without a file": run("identify {artifact} {folder}/*.png"),
     "folder without frames": empty_folder,
     "picture of many files": run(

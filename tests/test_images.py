@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
+import starcat
 from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.images.background import SMALLEST_PX, SkyLevels, repair_hot_pixels, subtract_background
@@ -609,6 +610,45 @@ def test_jpeg_is_written_and_read(tmp_path):
     assert (tmp_path / "b.jpeg").stat().st_size < (tmp_path / "a.jpg").stat().st_size
 
 
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA"])
+def test_bmp_is_read(mode, tmp_path):
+    grey = GREY8 // 128 * 255 if mode == "1" else GREY8
+    Image.fromarray(grey).convert(mode).save(tmp_path / "a.bmp")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.bmp"), grey)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.bmp").read_bytes())
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), grey)
+
+
+def test_stars_of_a_bmp_are_found(tmp_path):
+    image = np.full((64, 80), 20, dtype=np.uint8)
+    image += np.random.default_rng(1).integers(0, 5, image.shape, dtype=np.uint8)
+    image[30:33, 40:43] = 200
+    Image.fromarray(image).save(tmp_path / "A.BMP")
+    [frame] = starcat.read_frames(tmp_path / "A.BMP")
+    np.testing.assert_allclose(frame.centroids_px[0], (41.5, 31.5), atol=0.1)
+
+
+UNREAD = [
+    ("a.png", b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP image"),
+    ("a.jpg", b"\0\0\0\x20ftypavif", "an AVIF image"),
+    ("a.jpg", b"\xff\x0a\xfa\x1f", "a JPEG XL image"),
+    ("a.jpg", b"\0\0\0\x0cjP  \r\n\x87\n", "a JPEG 2000 image"),
+    ("a.tif", b"II*\0\x10\0\0\0CR\x02\0", r"a raw image of Canon \(CR2\)"),
+    ("a.fits", b"XISF0100\xff\0", "an XISF image"),
+    ("a.gif", b"GIF89a\xff", "a GIF image"),
+    ("a.NEF", b"MM\0*\0\0\0\x08\xff", r"a raw image of Nikon \(NEF\)"),
+    ("a.ser", b"LUCAM-RECORDER\xff", "an SER video"),
+    ("a.mov", b"\0\0\0\x14ftypqt  \xff", "an MP4 or QuickTime video"),
+]
+
+
+@pytest.mark.parametrize(("name", "data", "words"), UNREAD)
+def test_a_format_that_is_not_read_is_named(name, data, words, tmp_path):
+    (tmp_path / name).write_bytes(data + bytes(40))
+    with pytest.raises(ConfigError, match=f"is {words}, which is not supported; convert it to"):
+        starcat.read_frames(tmp_path / name)
+
+
 HEIC = base64.b64decode(
     "AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAX1tZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAA"
     "AAAAAAAAACJpbG9jAAAAAERAAAEAAQAAAAABoQABAAAAAAAAA+sAAAAjaWluZgAAAAAAAQAAABVpbmZlAgAAAAABAABo"
@@ -662,9 +702,9 @@ def test_heic_without_its_library_is_told(tmp_path, monkeypatch):
         ("a.tif", tiff(GREY16, "<", 1)[:900], "TIFF|variety"),
         ("a.tif", b"II*\0xyz", "TIFF|variety"),
         ("a.gz", b"\x1f\x8bxyz", "damaged gzip file"),
-        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG, TIFF, JPEG or HEIC"),
+        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG, TIFF, JPEG, HEIC or BMP"),
         ("a.jpg", b"\xff\xd8\xff\xe0", "damaged, or a variety"),
-        ("a.fits", b"", "neither FITS nor PNG, TIFF, JPEG or HEIC"),
+        ("a.fits", b"", "neither FITS nor PNG, TIFF, JPEG, HEIC or BMP"),
     ],
 )
 def test_damaged_and_unknown_files_are_refused(name, data, word, tmp_path):

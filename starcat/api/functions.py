@@ -399,7 +399,7 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     Parameters
     ----------
     file : str or path-like
-        CSV, JSON, FITS, PNG, TIFF, JPEG or HEIC.
+        CSV, JSON, FITS, PNG, TIFF, JPEG, HEIC or BMP.
 
     Returns
     -------

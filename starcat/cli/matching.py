@@ -25,8 +25,8 @@ FrameFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="INPUT...",
-        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC), folders of "
-        "them, or patterns in quotes ('night/*.jpg').",
+        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP), "
+        "folders of them, or patterns in quotes ('night/*.jpg').",
     ),
 ]
 CameraFile = Annotated[

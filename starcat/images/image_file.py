@@ -1,6 +1,6 @@
 """Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
-HEIC, as telephones write it, is read too, and not written.
+HEIC, as telephones write it, and BMP are read too, and not written.
 
 A dark frame, dead pixels and a mosaic of colours are taken out of such an array, and copies of
 files are written that say where in the sky each pixel is.
@@ -31,6 +31,7 @@ from starcat.arrays import Array
 from starcat.errors import ConfigError, FileMissing, SourceError
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
+from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
 from starcat.version import install_command
 
@@ -49,7 +50,9 @@ _KINDS = {
     b"II+\0": "TIFF",
     b"MM\0+": "TIFF",
     b"\xff\xd8\xff": "JPEG",
+    b"BM": "BMP",
 }
+_OF_PILLOW = ("PNG", "TIFF", "JPEG", "BMP")
 # Brands of the container of HEIC, at byte 8, after its size and "ftyp".
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 # What is written under which suffix.
@@ -82,9 +85,15 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
         kind = "HEIC"
-    if kind is None:
+    unread = unread_format(path, data)
+    if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
+        if unread is not None:
+            raise ConfigError(
+                f"{path}: is {unread}, which is not supported; convert it to FITS, PNG, TIFF, "
+                "JPEG, HEIC or BMP"
+            )
         raise ConfigError(
-            f"{path}: neither FITS nor PNG, TIFF, JPEG or HEIC; convert it to one of these"
+            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP; convert it to one of these"
         )
     try:
         if kind == "FITS":
@@ -179,7 +188,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF", "JPEG"))
+        picture = Image.open(io.BytesIO(data), formats=_OF_PILLOW)
     except UnidentifiedImageError as error:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
     with picture:
@@ -244,7 +253,7 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
     """Return the bits of a value in the file, and whether 16 of them count from white down."""
     if picture.format == "PNG":
         return data[24], False
-    if picture.format == "JPEG":
+    if picture.format in ("JPEG", "BMP"):
         return 8, False
     bits = max(picture.tag_v2.get(258, (1,)))  # BitsPerSample
     # Pillow turns 8-bit values around where white is zero, but not 16-bit ones.

@@ -13,10 +13,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.images.attempts import BRIGHTEST, MAX_SEARCHES, Attempt, counted, further_attempts
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.spots import FOV_ERROR, Search, look_again, weighed
 from starcat.matcher.centroids import (
@@ -44,11 +46,9 @@ STDIN = Path("-")
 # Files that are read as images; all others hold centroids.
 IMAGE_SUFFIXES = (
     ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
-    ".heif",
+    ".heif", ".bmp",
 )  # fmt: skip
 
-# An image without an answer is measured again, hot pixels masked, by a lower threshold.
-DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
 CAMERA_NAME = "camera.toml"  # what messages call the text of a camera file
 
 
@@ -75,6 +75,15 @@ class MeasuredFile:
     shape: tuple[int, ...] | None = None  # of the image; None where the file holds centroids
     spots: Spots | None = None  # with the errors of the centroids; None where a file holds them
 
+    def brightest(self, count: int) -> MeasuredFile:
+        """Return an image with fewer of its spots, the brightest."""
+        frames, spots = self.frames, self.spots
+        if spots is not None:
+            names = ("centroids_px", "flux", "mag", "sigma_px")
+            spots = replace(spots, **{name: getattr(spots, name)[:count] for name in names})
+            frames = [MeasuredFrame(frames[0].name, spots.centroids_px, spots.mag)]
+        return replace(self, frames=frames, spots=spots)
+
 
 @dataclass(frozen=True)
 class FrameAnswer:
@@ -84,6 +93,7 @@ class FrameAnswer:
     result: MatchResult
     observer: Observer | None = None
     spots: Spots | None = None  # of an image: those of the frame
+    attempt: Attempt | None = None  # of an image that was identified after the first attempt
 
     @cached_property
     def sky(self) -> SkyInTime | None:
@@ -101,6 +111,9 @@ class FrameAnswer:
         found = {"frame": self.frame.name, **facts(self.result), "stars": self._stars()}
         if self.spots is not None and self.spots.streak is not None:
             found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
+        if self.attempt is not None:
+            found |= {"attempt": self.attempt.number, "spots_of_attempt": self.attempt.words}
+            found["searches_in_chance"] = MAX_SEARCHES
         if self.observer is not None:
             found["in_time"] = None if self.sky is None else self.sky.content()
         return found
@@ -205,38 +218,64 @@ class FileAnswers:
             result = exact if exact.ok else result
         if spots is not None:
             result = weighed(result, spots.sigma_px)
-        if not result.ok and not _is_limited(result):
-            if self.is_image and (deeper := self._deeper(search, fov_error)):
-                return deeper
-            if self._is_lost_in_space and result.status == "no_match":
-                result = look_again(
-                    search, frame, self.camera, result, fov_error,
-                    is_scale_free=self._is_scale_free, flip=self.options.flip,
-                )  # fmt: skip
+        if not result.ok and (again := self._answer_again(result, frame, search, fov_error)):
+            return again
+        is_searched = result.status == "no_match" and not _is_limited(result)
+        if is_searched and self._is_lost_in_space:
+            result = look_again(
+                search, frame, self.camera, result, fov_error,
+                is_scale_free=self._is_scale_free, flip=self.options.flip,
+            )  # fmt: skip
         return FrameAnswer(frame, result, observer, spots)
 
-    def _deeper(self, search: Search, fov_error: float) -> FrameAnswer | None:
-        """Return the answer of an image that is measured once more; None if there is none."""
+    def _answer_again(
+        self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
+    ) -> FrameAnswer | None:
+        """Return the answer to an image that is measured once more; None if there is none."""
+        limit, is_limited = self.matcher.max_false_match_probability, _is_limited(refused)
+        own_limit = self.options.time_limit_s is not None or self.options.max_steps is not None
+        if not self.is_image or (is_limited and own_limit):
+            return None
+        searched = [first.centroids_px]
+        for attempt in further_attempts(self.options, is_limited=is_limited):
+            measured = self._measured_again(attempt)
+            if measured is None:
+                continue
+            [frame], spots = measured.frames, measured.spots
+            # The same spots once more would only raise the chance of a false answer.
+            if spots is None or any(np.array_equal(frame.centroids_px, px) for px in searched):
+                continue
+            searched.append(frame.centroids_px)
+            result = counted(search(frame, fov_error), limit)
+            if result is not None:
+                result = weighed(result, spots.sigma_px)
+                return FrameAnswer(frame, result, self.local.observer, spots, attempt)
+        return None
+
+    def _measured_again(self, attempt: Attempt) -> MeasuredFile | None:
+        """Return the image with its spots of an attempt; None where it does not apply."""
+        if attempt.threshold is None:
+            return self.measured.brightest(BRIGHTEST)
+        image: NDArray[Any] | None = self._image
+        if attempt.without_blocks:
+            from starcat.images.blocks import without_block_edges
+
+            image = without_block_edges(self._image)
+        if image is None:
+            return None
         try:
-            [frame], spots = self._measured_deeper()
+            return measure_picture(
+                self.path, attempt.options(self.options), self.local, image=image,
+                without_hot_pixels=attempt.without_hot_pixels,
+            )  # fmt: skip
         except ConfigError:  # too much stands out: the first measurement has said what it could
             return None
-        result = search(frame, fov_error)
-        if not result.ok or spots is None:
-            return None
-        result = weighed(result, spots.sigma_px)
-        return FrameAnswer(frame, result, self.local.observer, spots)
 
-    def _measured_deeper(self) -> tuple[Sequence[MeasuredFrame], Spots | None]:
-        changes = {
-            "threshold": max(1.0, DEEPER_THRESHOLD * self.options.threshold),
-            "most_spots": min(self.options.most_spots, DEEPER_SPOTS),
-        }
-        chosen = self.options.model_copy(update=changes)
-        again = measure_picture(
-            self.path, chosen, self.local, without_hot_pixels=True, image=self.measured.image
-        )
-        return again.frames, again.spots
+    @cached_property
+    def _image(self) -> NDArray[Any]:
+        """The image, read again if it was not kept."""
+        given = self.measured.image
+        return _read_picture(self.path, self.options, self.local) if given is None else given
 
     def _check_size(self) -> None:
         camera, shape = self.camera, self.measured.shape
@@ -318,6 +357,12 @@ class FileAnswers:
             notes.append(
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
                 "attitude are those of the middle of the exposure."
+            )
+        if first and first.attempt is not None:
+            notes.append(
+                f"The image was identified in attempt {first.attempt.number}, with "
+                f"{first.attempt.words}; the chance of a false match counts all "
+                f"{MAX_SEARCHES} searches that an image can have."
             )
         refusal = None if first is None else first.result.refusal
         is_said = refusal is not None and refusal.reason == "mirrored" and refusal.flip is not None

@@ -33,6 +33,7 @@ from starcat.matcher.observation import (
     without_repeats,
 )
 from starcat.matcher.result import MatchResult
+from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
 
 MAX_CENTROIDS = 512
@@ -182,21 +183,11 @@ def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     return _json_frames(text, path) if path.suffix.lower() == ".json" else [_csv_frame(text, path)]
 
 
-# How files begin that are often given in place of a list of centroids, and that no reader knows.
-_OTHER_FORMATS = {
-    b"BM": "a BMP image", b"GIF8": "a GIF image", b"RIFF": "a WebP image, video or sound",
-    b"%PDF": "a PDF document", b"PK": "a ZIP archive", b"PAR1": "a Parquet file",
-    b"\x89HDF": "an HDF5 file",
-}  # fmt: skip
-
-
 def _not_text(path: Path, error: UnicodeDecodeError) -> ConfigError:
-    begin = bytes(error.object[:4])
-    names = (name for start, name in _OTHER_FORMATS.items() if begin.startswith(start))
-    found = next(names, f"not a text file ({error})")
+    found = unread_format(path, error.object) or f"not a text file ({error})"
     return ConfigError(
         f"{path}: is {found}, which is not supported; convert it to an image (FITS, PNG, TIFF, "
-        "JPEG, HEIC), or to centroids (CSV, JSON)"
+        "JPEG, HEIC, BMP), or to centroids (CSV, JSON)"
     )
 
 

@@ -338,5 +338,5 @@ def test_pasted_numbers_arrive_as_they_are(pairs, separator):
 
 def test_the_page_names_every_format_that_it_takes(client):
     page = client.get("/identify").text
-    for name in ("FITS", "PNG", "TIFF", "JPEG", "HEIC", "CSV", "JSON"):
+    for name in ("FITS", "PNG", "TIFF", "JPEG", "HEIC", "BMP", "CSV", "JSON"):
         assert name in page

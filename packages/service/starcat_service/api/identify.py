@@ -77,7 +77,7 @@ _FILE = _object(
     file={
         "type": "string",
         "format": "binary",
-        "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF, JPEG, HEIC).",
+        "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF, JPEG, HEIC, BMP).",
     },
     options={
         "type": "string",

@@ -1,0 +1,66 @@
+"""Further attempts at an image that was not identified: with other spots of the same image.
+
+Each attempt measures the image in another way and searches for its spots. By chance alone an
+answer is the more likely the more often a frame is searched for, so that the bound of an answer
+of a further attempt is multiplied by all searches that a frame can have (`counted`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from starcat.images.identify_options import IdentifyOptions
+from starcat.matcher.result import MatchResult
+
+DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
+"""Factor of the threshold of the second attempt, and the most spots of all that measure again."""
+
+HIGHER_THRESHOLDS = (8.0, 15.0)
+BRIGHTEST = 40
+"""Brightest spots of the first measurement that the last attempt is made with."""
+
+MAX_SEARCHES = 7
+"""Searches whose answer can be given: two of the first attempt, which also tries the focal length
+as it is stated, and one of each further attempt."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """How an image is measured once more."""
+
+    number: int  # 2 for the first of the further ones
+    words: str  # which spots these are
+    threshold: float | None = None  # None: spots are those of the first measurement, fewer of them
+    without_hot_pixels: bool = False
+    without_blocks: bool = False
+
+    def options(self, given: IdentifyOptions) -> IdentifyOptions:
+        """Return the options that the image is measured with."""
+        fewer = min(given.most_spots, DEEPER_SPOTS)
+        return given.model_copy(update={"threshold": self.threshold, "most_spots": fewer})
+
+
+def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[Attempt]:
+    """Return the attempts after the first; if a limit ended that, only those with fewer spots."""
+    deeper = max(1.0, DEEPER_THRESHOLD * given.threshold)
+    if not is_limited:
+        yield Attempt(2, "a lower threshold, without hot pixels", deeper, without_hot_pixels=True)
+    yield Attempt(3, "without the edges of JPEG blocks", given.threshold, without_blocks=True)
+    for number, threshold in enumerate(HIGHER_THRESHOLDS, start=4):
+        if threshold > given.threshold:
+            yield Attempt(number, f"a threshold of {threshold:g} times the noise", threshold)
+    if given.most_spots > BRIGHTEST:
+        yield Attempt(6, f"the {BRIGHTEST} brightest spots")
+
+
+def counted(result: MatchResult, limit: float) -> MatchResult | None:
+    """Return the answer of a further attempt with its bound for all searches; None without one.
+
+    The probability that chance agrees in any of K searches is at most the sum of those in each.
+    An answer whose bound times K is above the limit is withheld.
+    """
+    if not result.ok:
+        return None
+    chance = min(1.0, MAX_SEARCHES * result.false_match_probability)
+    return replace(result, false_match_probability=chance) if chance <= limit else None
