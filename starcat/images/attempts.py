@@ -7,9 +7,13 @@ of a further attempt is multiplied by all searches that a frame can have (`count
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from scipy.spatial import cKDTree
+
+from starcat.arrays import Pixels
 from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 
@@ -19,6 +23,9 @@ DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
 HIGHER_THRESHOLDS = (8.0, 15.0)
 BRIGHTEST = 40
 """Brightest spots of the first measurement that the last attempt is made with."""
+
+SAME_SPOT_PX = 0.5
+"""Centroids of one spot in two measurements are nearer to each other than this."""
 
 MAX_SEARCHES = 7
 """Searches whose answer can be given: two of the first attempt, which also tries the focal length
@@ -52,6 +59,19 @@ def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[At
             yield Attempt(number, f"a threshold of {threshold:g} times the noise", threshold)
     if given.most_spots > BRIGHTEST:
         yield Attempt(6, f"the {BRIGHTEST} brightest spots")
+
+
+def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:
+    """Return whether spots are others than those of all searches before.
+
+    The same spots once more would cost time, and could hardly give another answer.
+    """
+    for known in searched:
+        if len(known) == len(centroids_px):
+            distance, _ = cKDTree(known).query(centroids_px) if len(known) else (np.zeros(1), 0)
+            if np.max(distance) < SAME_SPOT_PX:
+                return False
+    return True
 
 
 def counted(result: MatchResult, limit: float) -> MatchResult | None:

@@ -7,18 +7,25 @@ the other, each when it is asked for; an answer is JSON, a row of a table, a pic
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.attempts import BRIGHTEST, MAX_SEARCHES, Attempt, counted, further_attempts
+from starcat.images.attempts import (
+    BRIGHTEST,
+    MAX_SEARCHES,
+    Attempt,
+    counted,
+    further_attempts,
+    is_new,
+)
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.spots import FOV_ERROR, Search, look_again, weighed
 from starcat.matcher.centroids import (
@@ -237,13 +244,15 @@ class FileAnswers:
         if not self.is_image or (is_limited and own_limit):
             return None
         searched = [first.centroids_px]
+        end_s = time.monotonic() + (self.options.time_limit_s or math.inf)
         for attempt in further_attempts(self.options, is_limited=is_limited):
+            if attempt.number > 2 and time.monotonic() > end_s:
+                break
             measured = self._measured_again(attempt)
             if measured is None:
                 continue
             [frame], spots = measured.frames, measured.spots
-            # The same spots once more would only raise the chance of a false answer.
-            if spots is None or any(np.array_equal(frame.centroids_px, px) for px in searched):
+            if spots is None or (attempt.number > 2 and not is_new(frame.centroids_px, searched)):
                 continue
             searched.append(frame.centroids_px)
             result = counted(search(frame, fov_error), limit)
