@@ -15,7 +15,7 @@ from services import add_database
 
 from starcat.catalog import tap
 from starcat.catalog.source import give_map
-from starcat.catalog.table_map import TableMap
+from starcat.catalog.table_map import AnyMap
 from starcat.catalog.tap import ACCOUNT_NAME, Asked, fetch_table
 from starcat.errors import ConfigError, DownloadError, OutputError, StarcatError
 from starcat.storage.download import DownloadOptions
@@ -56,14 +56,14 @@ def relay(port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Relay]:
 
 
 @pytest.fixture
-def own(tmp_path: Path) -> TableMap:
+def own(tmp_path: Path) -> AnyMap:
     (tmp_path / "own.toml").write_text(MAP)
     table = give_map(tmp_path / "own.toml").table
     assert table is not None
     return table
 
 
-def ask(relay: Relay, own: TableMap, **more: Any) -> Asked:
+def ask(relay: Relay, own: AnyMap | None, **more: Any) -> Asked:
     return Asked(relay.url("/tap"), **{"table": "small.stars", "map": own, **more})
 
 
@@ -91,6 +91,37 @@ def test_a_table_comes_in_strips_and_is_a_source(relay, own, small_artifact, tmp
     again = ask(relay, own, limit_mag=5.0000001)
     assert fetch_table(again, tmp_path / "own", HOW).status == "present"
     assert not any("COUNT" in one for one in relay.seen[count:])
+
+
+OF_ARCHIVE = """\
+name = "own"
+archive = "gaia"
+fields.source_id = "star_id"
+fields.ra_deg = "ra_deg"
+fields.dec_deg = "dec_deg"
+fields.mag_g = "mag"
+fields.bp_mag = 0
+fields.rp_mag = 0
+[remote]
+checked = "by this test"
+"""
+
+
+@SLOW
+def test_records_of_an_archive_come_in_strips_of_a_field(relay, small_artifact, tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text(OF_ARCHIVE)
+    with pytest.raises(ConfigError, match="no column of declinations"):
+        fetch_table(ask(relay, give_map(path).table), tmp_path / "own", HOW)
+    path.write_text(OF_ARCHIVE + 'strip_by = "dec_deg"\n')
+    with pytest.raises(ConfigError, match=r"limit_mag: remote\.limit_by of the map"):
+        fetch_table(ask(relay, give_map(path).table, limit_mag=5.0), tmp_path / "own", HOW)
+    path.write_text(OF_ARCHIVE + 'strip_by = "dec_deg"\nlimit_by = "mag_g"\n')
+    report = fetch_table(ask(relay, give_map(path).table, limit_mag=5.0), tmp_path / "own", HOW)
+    bright = pq.read_table(small_artifact / "stars.parquet", filters=[("mag", "<=", 5.0)])
+    assert report.account.rows == len(bright) > 300
+    got = read_catalog("own", [report.folder])
+    assert got.stars["star_id"].to_pylist() == sorted(bright["star_id"].to_pylist())
 
 
 RESUMED = {

@@ -174,8 +174,8 @@ class _Fetch:
             if asked.limit_mag is not None:
                 if band is None or not band.is_column or band.unit != "mag":
                     raise ConfigError(
-                        f"limit_mag: {mag_key.partition('.')[2]} of the map is not a column of "
-                        "magnitudes; write the limit into a query",
+                        f"limit_mag: {mag_key.partition('.')[2] or 'remote.limit_by'} of the map "
+                        "is not a column of magnitudes; write the limit into a query",
                         key="limit_mag",
                         fields=("limit_mag", "query"),
                     )
