@@ -72,6 +72,7 @@ LIGHT = {
     "starcat.rooms",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
+    "starcat.storage.file_formats",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
