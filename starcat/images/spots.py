@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from starcat.arrays import Array, Mask, Pixels
 from starcat.geometry.camera import Camera
@@ -148,7 +148,10 @@ def _scores(patches: Array, shift: Array, widths: Array, windows: Array) -> Arra
         inside = (np.abs(reach) <= half[:, None]).astype(np.float64)
         edges = np.arange(-size, size + 2) - 0.5
         across, down = (
-            inside * np.diff(0.5 * erf((edges - shift[:, axis, None]) / (np.sqrt(2) * sigma)))
+            inside
+            * np.diff(
+                0.5 * scipy.special.erf((edges - shift[:, axis, None]) / (np.sqrt(2) * sigma))
+            )
             for axis in (0, 1)
         )
         cut = patches[:, inner, inner]
