@@ -45,3 +45,18 @@ def test_all_photographs_are_identified_and_of_one_focal_length(starcat, nights,
     focal_px = np.array([one["focal_length_px"] for one in found])
     assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
     assert max(one["false_match_probability"] for one in found) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_range_of_fields_finds_what_the_stated_scale_finds(starcat, nights, tmp_path):
+    camera = CameraSpec(width_px=1024, height_px=1024, fov_x_deg=30.0)
+    spec = starter_spec("range", camera, widest_fov_x_deg=60.0).spec
+    short = spec.self_test.model_copy(update={"frames": 5})
+    built = build_database(spec.model_copy(update={"self_test": short}), {}, tmp_path)
+    run = starcat(["identify", built.folder, nights / "spel", "--fov", "30:60", "--json"])
+    assert run.code == 0, run.err
+    found = [json.loads(line) for line in run.out.splitlines()]
+    assert [one["status"] for one in found] == 50 * ["identified"]
+    focal_px = np.array([one["focal_length_px"] for one in found])
+    assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Pixels
 from starcat.images.identify_options import IdentifyOptions
@@ -68,8 +67,8 @@ def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:
     """
     for known in searched:
         if len(known) == len(centroids_px):
-            distance, _ = cKDTree(known).query(centroids_px) if len(known) else (np.zeros(1), 0)
-            if np.max(distance) < SAME_SPOT_PX:
+            apart_px = np.linalg.norm(known[:, None] - centroids_px, axis=2)
+            if not (apart_px.min(axis=0, initial=np.inf) >= SAME_SPOT_PX).any():
                 return False
     return True
 

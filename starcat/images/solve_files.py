@@ -265,14 +265,14 @@ class FileAnswers:
         """Return the image with its spots of an attempt; None where it does not apply."""
         if attempt.threshold is None:
             return self.measured.brightest(BRIGHTEST)
-        image: NDArray[Any] | None = self._image
-        if attempt.without_blocks:
-            from starcat.images.blocks import without_block_edges
-
-            image = without_block_edges(self._image)
-        if image is None:
-            return None
         try:
+            image: NDArray[Any] | None = self._image
+            if attempt.without_blocks:
+                from starcat.images.blocks import without_block_edges
+
+                image = without_block_edges(self._image)
+            if image is None:
+                return None
             return measure_picture(
                 self.path, attempt.options(self.options), self.local, image=image,
                 without_hot_pixels=attempt.without_hot_pixels,
