@@ -114,17 +114,17 @@ def test_c_solves_as_many_and_none_wrongly(sky, frames):
 
 def test_votes_are_for_the_default_search_at_a_known_scale(sky, frames):
     frame = as_frame(frames[0].centroids_px, CAMERA, frames[0].mag)
-    assert votes.serve(observe(frame, settings()), sky)
-    assert votes.serve(observe(frame, settings(method="pyramid")), sky)
-    assert not votes.serve(observe(frame, settings(method="pairs")), sky)
-    assert not votes.serve(observe(frame, settings(selection=TriangleOrder("inradius"))), sky)
-    assert not votes.serve(observe(frame, settings(), fov_error=0.02), sky)
+    assert votes.can_vote(observe(frame, settings()), sky)
+    assert votes.can_vote(observe(frame, settings(method="pyramid")), sky)
+    assert not votes.can_vote(observe(frame, settings(method="pairs")), sky)
+    assert not votes.can_vote(observe(frame, settings(selection=TriangleOrder("inradius"))), sky)
+    assert not votes.can_vote(observe(frame, settings(), fov_error=0.02), sky)
 
 
 def test_a_large_database_has_no_table(sky, monkeypatch, frames):
     monkeypatch.setattr(votes, "MAX_NEIGHBOURS", 10)
     frame = as_frame(frames[0].centroids_px, CAMERA, frames[0].mag)
-    assert not votes.serve(observe(frame, settings()), sky)
+    assert not votes.can_vote(observe(frame, settings()), sky)
 
 
 def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):

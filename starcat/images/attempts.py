@@ -32,7 +32,7 @@ as it is stated, and one of each further attempt."""
 
 
 @dataclass(frozen=True)
-class Attempt:
+class FurtherAttempt:
     """How an image is measured once more."""
 
     number: int  # 2 for the first of the further ones
@@ -47,17 +47,21 @@ class Attempt:
         return given.model_copy(update={"threshold": self.threshold, "most_spots": fewer})
 
 
-def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[Attempt]:
+def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[FurtherAttempt]:
     """Return the attempts after the first; if a limit ended that, only those with fewer spots."""
     deeper = max(1.0, DEEPER_THRESHOLD * given.threshold)
     if not is_limited:
-        yield Attempt(2, "a lower threshold, without hot pixels", deeper, without_hot_pixels=True)
-    yield Attempt(3, "without the edges of JPEG blocks", given.threshold, without_blocks=True)
+        yield FurtherAttempt(
+            2, "a lower threshold, without hot pixels", deeper, without_hot_pixels=True
+        )
+    yield FurtherAttempt(
+        3, "without the edges of JPEG blocks", given.threshold, without_blocks=True
+    )
     for number, threshold in enumerate(HIGHER_THRESHOLDS, start=4):
         if threshold > given.threshold:
-            yield Attempt(number, f"a threshold of {threshold:g} times the noise", threshold)
+            yield FurtherAttempt(number, f"a threshold of {threshold:g} times the noise", threshold)
     if given.most_spots > BRIGHTEST:
-        yield Attempt(6, f"the {BRIGHTEST} brightest spots")
+        yield FurtherAttempt(6, f"the {BRIGHTEST} brightest spots")
 
 
 def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:

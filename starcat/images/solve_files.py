@@ -21,7 +21,7 @@ from starcat.geometry.camera import Camera
 from starcat.images.attempts import (
     BRIGHTEST,
     MAX_SEARCHES,
-    Attempt,
+    FurtherAttempt,
     counted,
     further_attempts,
     is_new,
@@ -100,7 +100,7 @@ class FrameAnswer:
     result: MatchResult
     observer: Observer | None = None
     spots: Spots | None = None  # of an image: those of the frame
-    attempt: Attempt | None = None  # of an image that was identified after the first attempt
+    attempt: FurtherAttempt | None = None  # of an image that was identified after the first attempt
 
     @cached_property
     def sky(self) -> SkyInTime | None:
@@ -261,7 +261,7 @@ class FileAnswers:
                 return FrameAnswer(frame, result, self.local.observer, spots, attempt)
         return None
 
-    def _measured_again(self, attempt: Attempt) -> MeasuredFile | None:
+    def _measured_again(self, attempt: FurtherAttempt) -> MeasuredFile | None:
         """Return the image with its spots of an attempt; None where it does not apply."""
         if attempt.threshold is None:
             return self.measured.brightest(BRIGHTEST)

@@ -77,7 +77,7 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
     together, however many are tried.
     """
     patterns = proposals(observation, database)
-    if not votes.serve(observation, database):
+    if not votes.can_vote(observation, database):
         _try(patterns, observation, database, best)
         return
     if _try(patterns, observation, database, best, STEPS_BEFORE_VOTES):

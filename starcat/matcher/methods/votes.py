@@ -27,7 +27,7 @@ from starcat.matcher.settings import LOOKUP, TriangleOrder
 from starcat.matcher.star_cells import cells_for, rows_between
 
 MAX_REFERENCES = 12
-"""Centroids that serve as the reference, in the order of the observation."""
+"""Centroids that can_vote as the reference, in the order of the observation."""
 
 MAX_VOTERS = 32
 """Centroids around a reference, the nearest ones."""
@@ -57,7 +57,7 @@ PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
 """Units of a magnitude, the magnitude of the first one, and the unit of an unknown magnitude."""
 
 MAX_NEIGHBOURS = 16_000_000
-"""Neighbours of all stars together, up to which there are votes."""
+"""NeighbourTable of all stars together, up to which there are votes."""
 
 STARS_OF_LOOKUP = 100
 """Stars whose votes take the time of looking one pattern up."""
@@ -67,7 +67,7 @@ AT_ONCE = 512
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class NeighbourTable:
     """The stars around every star of a database, in small units."""
 
     radius_rad: float
@@ -81,7 +81,7 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Voters:
-    """The centroids around a reference, the nearest first, in the units of `Neighbours`."""
+    """The centroids around a reference, the nearest first, in the units of `NeighbourTable`."""
 
     centroids: Rows  # rows of the observation; shape (V,)
     nearest: NDArray[np.int64]  # separations from the reference that their stars may have
@@ -98,7 +98,7 @@ VOTING = ("triangle", "pyramid")
 """Methods whose frames are solved by votes if their own patterns do not solve them soon."""
 
 
-def serve(observation: Observation, database: Database) -> bool:
+def can_vote(observation: Observation, database: Database) -> bool:
     """Return whether votes may be counted: with the default search, where the scale is known."""
     settings = observation.settings
     is_own = settings.method in VOTING and settings.selection == TriangleOrder()
@@ -128,7 +128,7 @@ def candidates(
             yield proposed
 
 
-def neighbours(database: Database, radius_rad: float) -> Neighbours:
+def neighbours(database: Database, radius_rad: float) -> NeighbourTable:
     """Return the neighbours of every star within a separation."""
     u, cells = database.directions, cells_for(database, radius_rad)
     reach = 2.0 * math.sin(0.5 * radius_rad)
@@ -143,7 +143,7 @@ def neighbours(database: Database, radius_rad: float) -> Neighbours:
         aparts.append(_apart_units(separation(centre[own], u[near]), radius_rad).astype(np.uint16))
         turns.append(_turn_units(position_angle(centre[own], u[near])).astype(np.uint8))
     star = np.concatenate(stars)
-    return Neighbours(
+    return NeighbourTable(
         radius_rad,
         np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
         star,
@@ -178,7 +178,7 @@ def voters_of(reference: int, observation: Observation, radius_rad: float) -> Vo
     )
 
 
-def leaders(stars: Rows, voters: Voters, table: Neighbours) -> list[tuple[int, int]]:
+def leaders(stars: Rows, voters: Voters, table: NeighbourTable) -> list[tuple[int, int]]:
     """Return the stars with more votes than chance would give, and their turns, the best first."""
     run, entry = rows_between(table.offsets[stars], table.offsets[stars + 1])
     order = np.argsort(table.apart[entry], kind="stable")
@@ -217,7 +217,7 @@ def _agreeing(
     voters: Voters,
     observation: Observation,
     database: Database,
-    table: Neighbours,
+    table: NeighbourTable,
 ) -> Candidates | None:
     """Return a star with the pairs that voted for it and agree with one of them."""
     entry = slice(*table.offsets[star : star + 2])
