@@ -290,11 +290,14 @@ class Observation:
         # The chord loses no digits at small angles, where the cosine would.
         return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
 
-    def compatible(self, star_mag: Array) -> Mask | None:
-        """Return which centroids may be which stars by their magnitudes; None if all may be."""
+    def compatible(self, star_mag: Array, rows: Rows | slice = slice(None)) -> Mask | None:
+        """Return which centroids may be which stars by their magnitudes; None if all may be.
+
+        ``rows`` are the centroids that are asked about: all unless given.
+        """
         if self.mag is None or self.settings.noise_mag is None:
             return None
-        return compatible_pairs(self.mag, star_mag, self.settings.noise_mag)
+        return compatible_pairs(self.mag[rows], star_mag, self.settings.noise_mag)
 
     def in_frame(self, star_index: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the stars of usable centroids as those of the frame, -1 for all others."""

@@ -117,10 +117,8 @@ def candidates(
     """Propose the stars that have the most votes, each with the centroids that voted for it."""
     table = database.cached(neighbours, database.camera.radius_rad)
     voters = voters_of(reference, observation, table.radius_rad)
-    compatible = observation.compatible(database.mag)
-    stars = np.arange(len(database.mag))
-    if compatible is not None:
-        stars = compatible[reference].nonzero()[0]
+    compatible = observation.compatible(database.mag, np.array([reference]))
+    stars = np.arange(len(database.mag)) if compatible is None else compatible[0].nonzero()[0]
     observation.budget.spend(LOOKUP * (1 + len(stars) // STARS_OF_LOOKUP))
     for star, turn in leaders(stars, voters, table):
         proposed = _agreeing(reference, star, turn, voters, observation, database, table)
@@ -225,9 +223,9 @@ def _agreeing(
     votes = (apart >= voters.nearest) & (apart <= voters.farthest)
     votes &= (table.turn[entry, None] - voters.turn - turn) % TURN < 2 * PER_BIN
     near = table.star[entry]
-    compatible = observation.compatible(database.mag[near])
+    compatible = observation.compatible(database.mag[near], voters.centroids)
     if compatible is not None:
-        votes &= compatible[voters.centroids].T
+        votes &= compatible.T
     place, n = votes.nonzero()
     if not len(n):
         return None
