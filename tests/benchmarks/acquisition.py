@@ -30,7 +30,7 @@ from matcher import answers_of, count_answers, write_frames
 from rows import Options, Rows, database, ended
 
 from starcat.geometry.attitude import random_attitudes
-from starcat.matcher.c_engine import _onboard
+from starcat.matcher.c_engine import _neighbours, _onboard, c_engine
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import as_frame, observe
@@ -134,6 +134,19 @@ def solve(
     return found
 
 
+def print_table_of_neighbours(artifact: Path) -> None:
+    """Print the size of the table that votes need, and the time that making it takes."""
+    stars = Matcher.open(artifact, engine="c").database
+    engine = c_engine(stars, "triangle")
+    seconds = []
+    for _ in range(5):
+        start = time.process_time()
+        made = _neighbours(engine.image, stars)
+        seconds.append(time.process_time() - start)
+    size = 4 * made[0].capacity
+    print(f"neighbours of {len(stars.mag):,} stars: {size:,} bytes, {1e3 * min(seconds):.1f} ms")
+
+
 def print_row(who: str, kind: Kind, found: Found, count: int) -> None:
     """Print what became of the frames of a row."""
     ms = np.array(found.milliseconds)
@@ -177,6 +190,7 @@ def main(rows: Rows) -> None:
         artifact = database("sao-12deg", Path(folder), changes).folder
         stars = Matcher.open(artifact).database
         made = {kind.name: made_frames(stars, kind, asked.frames) for kind in KINDS}
+        print_table_of_neighbours(artifact)
         print(f"{'':34}  right  wrong  mean ms   median     most   missed  refused")
         for kind in KINDS:
             few = made[kind.name][: max(20, asked.frames // PART_ALONE)]
