@@ -83,7 +83,7 @@ class RateColumn(ProgressColumn):
 
 
 PANELS = {
-    "Design a database": ("sources", "bands", "presets", "init", "estimate"),
+    "Design a database": ("sources", "bands", "presets", "init", "estimate", "blend"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
     "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),

@@ -22,6 +22,7 @@ from typer.main import get_command_name
 from starcat.cli import (
     artifacts,
     bands,
+    blending,
     builds,
     catalogs,
     exchange,
@@ -54,7 +55,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 for part in (
-    *(catalogs, fetching, bands, specs, builds, artifacts, sql, exchange),
+    *(catalogs, fetching, bands, blending, specs, builds, artifacts, sql, exchange),
     *(releases, keys, matching, learning),
 ):
     app.add_typer(part.app)

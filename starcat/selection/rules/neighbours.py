@@ -245,22 +245,48 @@ class _Sky:
     widths: Widths  # radians
 
 
+@dataclass(frozen=True)
+class SeenStars:
+    """Some stars of a table as the sensor sees them among all others."""
+
+    sky: _Sky
+    rows: Rows  # the stars, shape (N,)
+    pairs: tuple[Rows, Rows]  # places in ``rows``, and the rows of the neighbours of these stars
+    blends: Blends  # of the N stars; offsets east and north, radians
+
+    @property
+    def moved_arcsec(self) -> Array:
+        """How far neighbours move each centroid, shape (N,)."""
+        return np.asarray(np.hypot(*self.blends.offset.T) / ARCSEC)
+
+    @property
+    def mag(self) -> Array:
+        """Magnitudes of all light in the window of each star, shape (N,)."""
+        return np.asarray(self.sky.mag[self.rows] - 2.5 * np.log10(self.blends.brightening))
+
+
+def seen_by_sensor(
+    stars: pa.Table, rows: Rows, rule: NeighbourRule, pixel_arcsec: float
+) -> SeenStars:
+    """Return what neighbours do to stars of a table, which has x, y, z, mag and star_id."""
+    widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px, rule.box_px)
+    mag, number = floats_of(stars, "mag"), stars["star_id"].to_numpy()
+    sky = _Sky(directions_of(stars), mag, number, widths.times(pixel_arcsec * ARCSEC))
+    pairs = _neighbours(sky, rows)
+    return SeenStars(sky, rows, pairs, _seen(sky, rows, pairs))
+
+
 def _judged(
     stars: pa.Table, rule: NeighbourRule, limit_mag: float, pixel_arcsec: float
 ) -> tuple[pa.Table, Mask]:
     """Return a star table with what neighbours do to its stars, and which of them are absorbed."""
-    widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px, rule.box_px)
-    widths = widths.times(pixel_arcsec * ARCSEC)
-    mag, number = floats_of(stars, "mag"), stars["star_id"].to_numpy()
-    sky = _Sky(directions_of(stars), mag, number, widths)
+    mag = floats_of(stars, "mag")
     with np.errstate(invalid="ignore"):
         margin = FAINTER_MAG if rule.action == "merge" else 0.0
         rows = np.flatnonzero(mag <= limit_mag + margin)
-    pairs = _neighbours(sky, rows)
-    seen = _seen(sky, rows, pairs)
-    moved_arcsec = np.hypot(*seen.offset.T) / ARCSEC
-    blend_mag = mag[rows] - 2.5 * np.log10(seen.brightening)
-    columns = (blend_mag, seen.contamination, moved_arcsec)
+    seen = seen_by_sensor(stars, rows, rule, pixel_arcsec)
+    sky, moved_arcsec, blend_mag = seen.sky, seen.moved_arcsec, seen.mag
+    columns = (blend_mag, seen.blends.contamination, moved_arcsec)
     names = ("blend_mag", "contamination", "centroid_offset_arcsec")
     filled = {name: np.full(len(stars), np.nan) for name in names}
     for name, values in zip(names, columns, strict=True):
@@ -269,11 +295,11 @@ def _judged(
     may_merge = np.zeros(len(stars), dtype=bool)
     if rule.action != "merge":
         return judged, may_merge
-    may_merge[rows] = rule.is_beyond(moved_arcsec, seen.contamination, pixel_arcsec)
-    may_merge[rows] &= ~seen.is_lost & (blend_mag <= limit_mag)
-    heads, absorbed = _spots(sky, rows, pairs, seen, may_merge)
+    may_merge[rows] = rule.is_beyond(moved_arcsec, seen.blends.contamination, pixel_arcsec)
+    may_merge[rows] &= ~seen.blends.is_lost & (blend_mag <= limit_mag)
+    heads, absorbed = _spots(sky, rows, seen.pairs, seen.blends, may_merge)
     place = np.searchsorted(rows, heads)
-    centre = _moved(sky.directions[heads], seen.offset[place])
+    centre = _moved(sky.directions[heads], seen.blends.offset[place])
     return with_merged(judged, heads, centre, blend_mag[place]), absorbed
 
 

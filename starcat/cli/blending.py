@@ -1,0 +1,101 @@
+"""The command about close stars: what the sensor of a spec sees of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcat.cli import options as opt
+from starcat.cli.console import print_things, progress_bars, show
+from starcat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from starcat.pipeline.blending import SensorView
+
+app = typer.Typer()
+
+
+# A declination below 0 is not an option.
+@app.command("blend", context_settings={"ignore_unknown_options": True})
+def blend_command(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SPEC] [RA DEC]",
+            help="A build spec (TOML), and where a star of its catalog is, degrees.",
+        ),
+    ] = None,
+    preset: opt.PresetName = None,
+    changes: opt.Changes = None,
+    separation: Annotated[
+        float | None, typer.Option(metavar="ARCSEC", help="Of two stars; with --mags.")
+    ] = None,
+    mags: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Magnitudes of two stars in the spec's band.")
+    ] = None,
+    inputs: opt.Input = None,
+    workers: opt.Workers = 2,
+    json: opt.Json = False,
+) -> None:
+    """Say what the sensor of a spec sees of two close stars, or of a star of its catalog.
+
+    Example: starcat blend --preset gaia-12deg --set selection.neighbours.psf_sigma_px=1.0
+    --separation 20 --mags 4.0,5.5
+    """
+    from starcat.pipeline.blending import sensor_view_at, sensor_view_of_pair
+    from starcat.sky.observer import observer_numbers
+
+    spec, position = _spec_and_position(words or [])
+    chosen = opt.chosen_spec(spec, preset, changes)
+    if position is None and separation is not None and mags is not None:
+        view = sensor_view_of_pair(chosen, separation, observer_numbers("--mags", mags, 2))
+    elif position is not None and separation is None and mags is None:
+        with progress_bars() as progress:
+            given = opt.inputs_by_source(inputs)
+            view = sensor_view_at(chosen, given, *position, workers=workers, progress=progress)
+    else:
+        raise ConfigError(
+            "state either two stars, by --separation ARCSEC and --mags A,B, or the RA and Dec of "
+            "a star of the catalog, in degrees after the spec"
+        )
+    show(json, view.to_dict(), _print_view, view)
+
+
+def _spec_and_position(words: list[str]) -> tuple[Path | None, tuple[float, float] | None]:
+    from starcat.matcher.centroids import is_number
+
+    for word in words:
+        if word.startswith("-") and not is_number(word):
+            raise typer.BadParameter(f"no such option: {word}")
+    numbers = [float(word) for word in words if is_number(word)]
+    others = [word for word in words if not is_number(word)]
+    if len(numbers) not in (0, 2) or len(others) > 1:
+        raise ConfigError(f"{' '.join(words)!r} is not a spec, or a spec with RA and Dec, degrees")
+    position = (numbers[0], numbers[1]) if numbers else None
+    return Path(others[0]) if others else None, position
+
+
+def _print_view(view: SensorView) -> None:
+    names = {True: "yes", False: "no"}
+    rows = [
+        (star, names[star.is_resolved], "beyond" if star.is_beyond_limits else "within")
+        for star in view.stars
+    ]
+    columns = {
+        "star": "{0[0].star}",
+        "mag": "{0[0].mag:.2f}",
+        'away "': "{0[0].separation_arcsec:.2f}",
+        "resolved": "{0[1]}",
+        "blend mag": "{0[0].blend_mag:.3f}",
+        "contamination": "{0[0].contamination:.4f}",
+        "offset px": "{0[0].centroid_offset_px:.4f}",
+        "limits": "{0[2]}",
+    }
+    title = (
+        f"{view.spec}: spot of {view.psf_sigma_px:g} px (sigma), pixel of {view.pixel_arcsec:.2f} "
+        f"arcsec, {view.band}; limits {view.max_offset_arcsec:.3g} arcsec and "
+        f"{view.max_contamination:g}"
+    )
+    print_things(title, rows, columns, (1, 2, 4, 5, 6))

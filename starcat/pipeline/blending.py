@@ -1,0 +1,157 @@
+"""What the sensor of a spec sees of close stars: two that are described, or those of the catalog.
+
+The numbers are those that a build writes of blended stars (`starcat.selection.rules.neighbours`),
+from magnitudes in the band of the spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from starcat.arrays import Rows
+from starcat.errors import ConfigError, SourceError
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.pipeline.draft import Inputs
+from starcat.pipeline.estimate import read_draft
+from starcat.products.blends import widths_px
+from starcat.products.match_figures import ARCSEC
+from starcat.progress import Progress, no_progress
+from starcat.selection.rules.neighbours import seen_by_sensor
+from starcat.specs.build_spec import BuildSpec
+from starcat.stars.star_table import directions_of, floats_of
+
+MAX_STARS = 100
+"""Stars of one window that are described, the brightest."""
+
+
+@dataclass(frozen=True)
+class StarInBlend:
+    """One star of a blend, and what the sensor measures of it."""
+
+    star: str
+    ra_deg: float
+    dec_deg: float
+    mag: float
+    separation_arcsec: float  # from the star that is asked about
+    blend_mag: float  # of all light in the window of its centroid
+    contamination: float  # fraction of that light which is from other stars
+    centroid_offset_arcsec: float  # how far other stars move its centroid
+    centroid_offset_px: float
+    is_resolved: bool  # whether it has a spot of its own; if not, a brighter star has its centroid
+    is_beyond_limits: bool  # of ``max_offset_*`` or ``max_contamination``
+
+
+@dataclass(frozen=True)
+class SensorView:
+    """A star and its neighbours as the sensor of a spec sees them."""
+
+    spec: str
+    band: str
+    pixel_arcsec: float
+    psf_sigma_px: float
+    max_offset_arcsec: float
+    max_contamination: float
+    stars: tuple[StarInBlend, ...]  # the star that is asked about is first, then by distance
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {**asdict(self), "stars": [asdict(star) for star in self.stars]}
+
+
+def sensor_view_of_pair(
+    spec: BuildSpec, separation_arcsec: float, mags: Sequence[float]
+) -> SensorView:
+    """Return how the sensor of a spec sees two stars, whose magnitudes are in its band."""
+    checked = np.array([separation_arcsec, *mags])
+    if len(mags) != 2 or not (np.isfinite(checked).all() and 0.0 < separation_arcsec <= 36_000.0):
+        raise ConfigError(
+            f"the separation is {separation_arcsec!r} arcsec and the magnitudes are "
+            f"{list(mags)!r}; expected a separation above 0, at most 36,000 arcsec, and two "
+            "magnitudes (separation, mags)",
+            fields=("separation", "mags"),
+        )
+    u = directions_from_radec([0.0, separation_arcsec / 3600.0], [0.0, 0.0])
+    columns = dict(zip("xyz", u.T, strict=True))
+    stars = pa.table({**columns, "mag": list(mags), "star_id": [1, 2], "designation": ["A", "B"]})
+    return _view(spec, stars, np.array([0, 1]), spec.catalog.band or "sensor")
+
+
+def sensor_view_at(
+    spec: BuildSpec,
+    inputs: Inputs,
+    ra_deg: float,
+    dec_deg: float,
+    *,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> SensorView:
+    """Return how the sensor of a spec sees the brightest star at a position, and its neighbours.
+
+    The star is looked for within the window of a centroid. `SourceError` if there is none.
+    """
+    if not (np.isfinite(ra_deg) and 0.0 <= ra_deg <= 360.0 and -90.0 <= dec_deg <= 90.0):
+        raise ConfigError(
+            f"the position is RA {ra_deg:g}, Dec {dec_deg:g}; expected degrees, RA 0 to 360 and "
+            "Dec -90 to 90"
+        )
+    reach = _reach_rad(spec)
+    stars = read_draft(spec, inputs, workers, progress).stars
+    u, mag = directions_of(stars), floats_of(stars, "mag")
+    known = np.where(np.isnan(mag), np.inf, mag)
+    near = np.flatnonzero(separation(u, directions_from_radec(ra_deg, dec_deg)) <= reach)
+    if not np.isfinite(known[near]).any():
+        raise SourceError(
+            f"no star with a magnitude within {reach / ARCSEC:.0f} arcsec of RA {ra_deg:g}, Dec "
+            f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}; check the position, or read a "
+            "deeper catalog (--set catalog.source=...)"
+        )
+    star = near[np.argmin(known[near])]
+    away = separation(u, u[star])
+    rows = np.flatnonzero((away <= reach) & np.isfinite(known))
+    rows = rows[np.argsort(known[rows], kind="stable")][:MAX_STARS]
+    return _view(spec, stars, rows[np.argsort(away[rows], kind="stable")], stars["band"][0].as_py())
+
+
+def _reach_rad(spec: BuildSpec) -> float:
+    """Return how far a star can be to count; ConfigError if the spec states no spot."""
+    rule = spec.selection.neighbours
+    if rule.psf_sigma_px is None:
+        raise ConfigError(
+            f"{spec.name}: selection.neighbours.psf_sigma_px is missing, the width of a star's "
+            "spot; add it to the spec, or give --set selection.neighbours.psf_sigma_px=1.0",
+            key="selection.neighbours.psf_sigma_px",
+        )
+    widths = widths_px(rule.psf_sigma_px, rule.window_px, rule.box_px)
+    return widths.reach * spec.camera.camera().pixel_arcsec * ARCSEC
+
+
+def _view(spec: BuildSpec, stars: pa.Table, rows: Rows, band: str) -> SensorView:
+    """Return the view of some stars, of which the first is asked about."""
+    _reach_rad(spec)
+    rule, pixel_arcsec = spec.selection.neighbours, spec.camera.camera().pixel_arcsec
+    ascending = np.argsort(rows)
+    seen = seen_by_sensor(stars, rows[ascending], rule, pixel_arcsec)
+    place = np.argsort(ascending)
+    moved, share, blend_mag = seen.moved_arcsec, seen.blends.contamination, seen.mag
+    is_beyond = rule.is_beyond(moved, share, pixel_arcsec)
+    u = directions_of(stars.take(pa.array(rows)))
+    found = zip(
+        stars["designation"].take(pa.array(rows)).to_pylist(),
+        *(values.tolist() for values in radec_from_directions(u)),
+        seen.sky.mag[rows].tolist(),
+        (separation(u, u[0]) / ARCSEC).tolist(),
+        *(values[place].tolist() for values in (blend_mag, share, moved, moved / pixel_arcsec)),
+        (~seen.blends.is_lost[place]).tolist(),
+        is_beyond[place].tolist(),
+        strict=True,
+    )
+    limits = rule.max_offset_of(pixel_arcsec), rule.max_contamination
+    width = rule.psf_sigma_px or 0.0
+    return SensorView(
+        spec.name, band, pixel_arcsec, width, *limits, tuple(StarInBlend(*one) for one in found)
+    )
