@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         ingest,
         init,
         learn,
+        plan,
         publish,
         pull,
         read_frames,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
     from starcat.matcher.tracking import Tracker
+    from starcat.planning.plan import Plan
     from starcat.sky.in_time import identify_in_time, sky_in_time
     from starcat.sky.observer import Observer
     from starcat.specs.reading import preset, read_spec
@@ -48,6 +50,7 @@ __all__ = [
     "Camera",
     "Matcher",
     "Observer",
+    "Plan",
     "StarcatError",
     "Tracker",
     "__version__",
@@ -61,6 +64,7 @@ __all__ = [
     "init",
     "learn",
     "open",
+    "plan",
     "preset",
     "publish",
     "pull",
@@ -75,6 +79,7 @@ _HOMES = {
     "Camera": ("starcat.geometry.camera", "Camera"),
     "Matcher": ("starcat.api.matcher", "Matcher"),
     "Observer": ("starcat.sky.observer", "Observer"),
+    "Plan": ("starcat.planning.plan", "Plan"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
     "build": ("starcat.api.functions", "build"),
@@ -87,6 +92,7 @@ _HOMES = {
     "init": ("starcat.api.functions", "init"),
     "learn": ("starcat.api.functions", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
+    "plan": ("starcat.api.functions", "plan"),
     "preset": ("starcat.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),

@@ -18,6 +18,8 @@ from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+    from numpy.typing import ArrayLike
+
     from starcat.api.artifact import Artifact
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
@@ -32,6 +34,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.matcher.database import Database
     from starcat.pipeline.build import Built
     from starcat.pipeline.starter import Starter
+    from starcat.planning.plan import Plan
     from starcat.progress import Progress
     from starcat.releases.publishing import Published
     from starcat.releases.pulling import Pulled
@@ -391,6 +394,66 @@ def simulate(
     noise = Noise(noise_px, drop_probability, false, noise_mag=noise_mag)
     frames = whole_number("count", count, 0), noise, whole_number("seed", seed, 0)
     return list(simulate_frames(sky.directions, sky.camera, *frames, mag=sky.mag))
+
+
+def plan(
+    database: Artifact | PathLike,
+    attitudes: Any,
+    *,
+    orbit: Any = None,
+    alignment: ArrayLike | None = None,
+    camera: Camera | None = None,
+    **expected: Any,
+) -> Plan:
+    """Plan what a star sensor will see at many attitudes, as ``starcat plan``.
+
+    Parameters
+    ----------
+    database : Artifact, str or path-like
+        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
+    attitudes : path, table or array_like of float64, shape (K, 4)
+        A CSV file, a CCSDS AEM (KVN), or a table (mapping, astropy, pandas, Arrow) with ``time``
+        (UTC) and either ``q_body_from_icrs``, or ``qx`` to ``qw``, or ``ra_deg``, ``dec_deg`` and
+        ``roll_deg``; or quaternions alone, scalar last.
+    orbit : path or table, optional
+        ``time``, ``x_km`` to ``z_km`` and ``vx_km_s`` to ``vz_km_s`` from the Earth in ICRS axes,
+        or a CCSDS OEM (KVN). Without it there is no limb of the Earth, and no aberration by the
+        motion around the Earth.
+    alignment : array_like of float64, shape (4,), optional
+        Quaternion from the frame of the attitudes to the camera's; they are the same by default.
+    camera : Camera, optional
+        The database's own by default.
+    **expected
+        ``noise_px`` and ``noise_mag`` (by default those of the self-test of the spec),
+        ``limit_mag``, ``drop_probability``, ``false_stars``, ``window_arcsec`` (20 px),
+        ``lookalike_mag`` (1), ``keep_out_deg`` (mapping of the body to degrees),
+        ``min_acquisition`` (0.9) and ``max_false_match_probability``: the fields of
+        `starcat.planning.plan.Expected`.
+
+    Returns
+    -------
+    Plan
+        Errors, probabilities of acquisition, stars, bodies and gaps; `Plan.to_dict`, `Plan.best`,
+        `Plan.plot`.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        As the command line says them.
+    """
+    from starcat.planning.plan import plan_attitudes
+
+    folder = database_path("database", database)
+    given = {"orbit": orbit, "alignment": alignment, "camera": camera}
+    unknown = sorted(set(expected) - set(signature(plan_attitudes).parameters))
+    if unknown:
+        raise ArgumentTypeError(
+            f"plan has no argument {unknown[0]!r}; expected one of "
+            f"{', '.join(signature(plan_attitudes).parameters)}",
+            key=unknown[0],
+            value=expected[unknown[0]],
+        )
+    return plan_attitudes(folder, attitudes, **given, **expected)
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:

@@ -86,7 +86,7 @@ PANELS = {
     "Design a database": ("sources", "bands", "presets", "init", "estimate", "blend"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
     "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
-    "Use it": ("simulate", "identify", "calibrate", "learn", "methods", "sql"),
+    "Use it": ("simulate", "identify", "plan", "calibrate", "learn", "methods", "sql"),
     "Ship it": ("export", "publish", "pull", "releases", "keys"),
     "Serve it": ("serve", "token"),
 }

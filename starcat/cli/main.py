@@ -31,6 +31,7 @@ from starcat.cli import (
     keys,
     learning,
     matching,
+    planning,
     releases,
     specs,
     sql,
@@ -56,7 +57,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, fetching, bands, blending, specs, builds, artifacts, sql, exchange),
-    *(releases, keys, matching, learning),
+    *(releases, keys, matching, planning, learning),
 ):
     app.add_typer(part.app)
 add_commands(app)

@@ -100,6 +100,40 @@ def false_match_probability(
     return math.exp(min(0.0, expected + log_values))
 
 
+def largest_squares_px(
+    n: int,
+    n_centroids: int,
+    stars_in_frame: int,
+    information: Array,
+    camera: Camera,
+    noise_px: float,
+    limit: float,
+) -> Array:
+    """Return the largest sums of squared residuals of n stars that are answers, pixels squared.
+
+    It is what `false_match_probability` returns ``limit`` for, where ``noise_px`` is stated.
+    ``information`` are determinants of sums of the squared derivatives (`place_information`).
+    """
+    most = min(n_centroids, stars_in_frame)
+    assignments = partial(log_assignments, n_centroids=n_centroids, stars=stars_in_frame)
+    log_values = -_log_share(n, most, assignments, noise_px, camera)
+    expected = _log_expected(assignments(n), n, 1.0, 1.0, camera) + log_values
+    with np.errstate(divide="ignore"):
+        left = math.log(limit) - expected - 0.5 * np.log(information)
+    return np.asarray(np.exp(np.minimum(left / (n - 1.5), 700.0)))
+
+
+def place_information(body: Array) -> dict[tuple[int, int], Array]:
+    """Return what each direction adds to the sums of products of derivatives by the three angles.
+
+    Arrays of shape (N,) by row and column, those above the diagonal once; directions have the
+    shape (N, 3). In units of the focal length, as `false_match_probability` has them.
+    """
+    x, y = (body[:, :2] / body[:, 2:]).T
+    rows = np.stack([x * y, -1.0 - x * x, y]), np.stack([1.0 + y * y, -x * y, -x])
+    return {(i, j): sum(row[i] * row[j] for row in rows) for i in range(3) for j in range(i, 3)}
+
+
 def _sums(body: Array) -> list[list[float]]:
     """Return the sums of the products of 1, x, y, x x, x y and y y, over places (x, y).
 

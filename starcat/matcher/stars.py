@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Matrix
+from starcat.arrays import Array, Directions, Matrix, Pixels
 from starcat.geometry.attitude import information
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
@@ -154,6 +154,24 @@ def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     return float(square.sum()) / free
 
 
+def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
+    """Return the torque ``b x db`` of an error of each centroid of 1 px in x, and of 1 px in y.
+
+    ``body`` are the directions b of the centroids; arrays of shape (N, 3).
+    """
+    found = []
+    for axis in (0, 1):
+        # Steps lead inwards, so that they end inside the fold of the distortion.
+        step = np.where(px[:, axis] > camera.principal_point_px[axis], -STEP_PX, STEP_PX)
+        once, twice = px.copy(), px.copy()
+        once[:, axis] += step
+        twice[:, axis] += 2.0 * step
+        moved = 4.0 * (camera.directions_from_pixels(once) - body)
+        moved -= camera.directions_from_pixels(twice) - body
+        found.append(np.cross(body, moved) * (0.5 / step)[:, None])
+    return found
+
+
 def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
@@ -177,15 +195,8 @@ def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) 
         sigma_px = np.where(np.isnan(sigma_px), of_residuals, sigma_px)
     body = camera.directions_from_pixels(px)
     total = np.zeros((3, 3))
-    for axis in (0, 1):
-        # Steps lead inwards, so that they end inside the fold of the distortion.
-        step = np.where(px[:, axis] > camera.principal_point_px[axis], -STEP_PX, STEP_PX)
-        once, twice = px.copy(), px.copy()
-        once[:, axis] += step
-        twice[:, axis] += 2.0 * step
-        moved = 4.0 * (camera.directions_from_pixels(once) - body)
-        moved -= camera.directions_from_pixels(twice) - body
-        turned = np.cross(body, moved) * (0.5 * weights * sigma_px / step)[:, None]
+    for turns in turns_per_px(px, body, camera):
+        turned = turns * (weights * sigma_px)[:, None]
         total += turned.T @ turned
     matrix = information(body, weights=weights)
     if np.linalg.matrix_rank(matrix, hermitian=True) < 3:

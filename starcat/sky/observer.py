@@ -47,13 +47,13 @@ def _deflected(u: Array, from_sun_au: Array) -> Array:
 
 
 def aberrated(u: Array, velocity_km_s: Array) -> Array:
-    """Return directions as a moving observer sees them.
+    """Return directions as moving observers see them, whose velocity has the shape (3,) or (N, 3).
 
     Stars shift towards the velocity; with the opposite velocity the same function takes them
     back. Exact in special relativity; the potential of the Sun, a microarcsecond, is left out.
     """
     beta = velocity_km_s / LIGHT_KM_S
-    return np.asarray(erfa.ab(u, beta, np.inf, np.sqrt(1.0 - beta @ beta)))
+    return np.asarray(erfa.ab(u, beta, np.inf, np.sqrt(1.0 - np.sum(beta * beta, axis=-1))))
 
 
 def _unit(u: Array) -> Array:
