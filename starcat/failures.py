@@ -88,6 +88,7 @@ OPTIONS = {
     "fov_deg": "fov",
     "form": "to",
     "inputs": "input",
+    "keep_out_deg": "keep-out",
     "memory_bytes": "memory",
     "size_px": "size",
     "values": "set",

@@ -403,6 +403,7 @@ def plan(
     orbit: Any = None,
     alignment: ArrayLike | None = None,
     camera: Camera | None = None,
+    plot: PathLike | None = None,
     **expected: Any,
 ) -> Plan:
     """Plan what a star sensor will see at many attitudes, as ``starcat plan``.
@@ -423,6 +424,8 @@ def plan(
         Quaternion from the frame of the attitudes to the camera's; they are the same by default.
     camera : Camera, optional
         The database's own by default.
+    plot : str or path-like, optional
+        PNG or SVG of the plan over time, to be written.
     **expected
         ``noise_px`` and ``noise_mag`` (by default those of the self-test of the spec),
         ``limit_mag``, ``drop_probability``, ``false_stars``, ``window_arcsec`` (20 px),
@@ -433,16 +436,19 @@ def plan(
     Returns
     -------
     Plan
-        Errors, probabilities of acquisition, stars, bodies and gaps; `Plan.to_dict`, `Plan.best`,
-        `Plan.plot`.
+        Errors, probabilities of acquisition, stars, bodies and gaps; `Plan.to_dict`, `Plan.best`.
 
     Raises
     ------
     ConfigError, ProductError
         As the command line says them.
     """
+    from starcat.images.overlay import check_kind
+    from starcat.planning.drawing import draw_plan
     from starcat.planning.plan import plan_attitudes
 
+    drawing = None if plot is None else path_of("plot", plot)
+    check_kind(drawing)
     folder = database_path("database", database)
     given = {"orbit": orbit, "alignment": alignment, "camera": camera}
     unknown = sorted(set(expected) - set(signature(plan_attitudes).parameters))
@@ -453,7 +459,10 @@ def plan(
             key=unknown[0],
             value=expected[unknown[0]],
         )
-    return plan_attitudes(folder, attitudes, **given, **expected)
+    made = plan_attitudes(folder, attitudes, **given, **expected)
+    if drawing is not None:
+        draw_plan(made, drawing)
+    return made
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:

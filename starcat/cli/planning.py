@@ -44,20 +44,26 @@ def plan_command(
         Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
     ] = None,
     noise_px: Annotated[
-        float | None, typer.Option(help="Noise of a centroid, each axis; default: the spec's.")
+        float | None,
+        typer.Option(
+            min=0.001, max=50, help="Noise of a centroid, each axis; default: the spec's."
+        ),
     ] = None,
     noise_mag: Annotated[
-        float | None, typer.Option(help="Noise of a magnitude; default: the spec's.")
+        float | None, typer.Option(min=0, max=10, help="Noise of a magnitude; default: the spec's.")
     ] = None,
     limit_mag: Annotated[
         float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
     ] = None,
     drop_probability: Annotated[
-        float, typer.Option(help="Probability of any star to be missing.")
+        float, typer.Option(min=0, max=1, help="Probability of any star to be missing.")
     ] = 0.0,
-    false_stars: Annotated[int, typer.Option(help="Centroids that are no stars, each frame.")] = 0,
+    false_stars: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Centroids that are no stars, each frame.")
+    ] = 0,
     window_arcsec: Annotated[
-        float | None, typer.Option(help="Radius of an acquisition window; default: 20 px.")
+        float | None,
+        typer.Option(min=0, max=36000, help="Radius of an acquisition window; default: 20 px."),
     ] = None,
     keep_out: Annotated[
         str | None,
@@ -66,10 +72,12 @@ def plan_command(
         ),
     ] = None,
     min_acquisition: Annotated[
-        float, typer.Option(help="Smallest probability of acquisition that is not a gap.")
+        float,
+        typer.Option(min=0, max=1, help="Smallest probability of acquisition that is not a gap."),
     ] = 0.9,
     best: Annotated[
-        int | None, typer.Option(metavar="N", help="Choose N guide stars of one attitude.")
+        int | None,
+        typer.Option(min=1, max=1000, metavar="N", help="Choose N guide stars of one attitude."),
     ] = None,
     row: Annotated[
         int | None,
@@ -84,6 +92,7 @@ def plan_command(
     --keep-out Sun=30,Moon=15 --best 8 --plot plan.png
     """
     from starcat.images.overlay import check_kind
+    from starcat.planning.drawing import draw_plan
     from starcat.planning.plan import plan_attitudes
     from starcat.sky.observer import observer_numbers
     from starcat.specs.camera_file import read_camera
@@ -114,7 +123,7 @@ def plan_command(
             )
         chosen = plan.best(best, (row or 1) - 1)
     if plot is not None:
-        plan.plot(plot)
+        draw_plan(plan, plot)
     if json:
         print_json({**plan.to_dict(), **({"best": chosen.to_dict()} if chosen else {})})
     else:
@@ -156,8 +165,8 @@ def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
     facts = plan.summary
     more = f", the first {MAX_ROWS} shown" if len(plan) > MAX_ROWS else ""
     title = f"{plan.database.name}: {len(plan):,} attitudes, {facts['usable']:,} usable{more}"
-    heads = ("UTC" if plan.attitudes.times else "attitude", "RA", "Dec", "stars", "x, y, z arcsec",
-             "acq.", "Sun", "Moon", "Earth", "")  # fmt: skip
+    heads = ("UTC" if plan.attitudes.times else "attitude", "RA", "Dec", "stars", "error, arcsec",
+             "acq.", "Sun", "Moon", "Earth", "!keep-out")  # fmt: skip
     print_table(title, heads, rows, numbers=range(1, 9))
     gaps = [
         (gap.start or gap.first + 1, gap.end or gap.last + 1, gap.last - gap.first + 1,
@@ -180,17 +189,17 @@ def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
 def _cells(plan: Plan, row: int) -> list[str]:
     facts = plan.attitude(row)
     angles = facts["angles_deg"]
-    notes = [f"near {name}" for name in facts["keep_out_violated"]]
+    notes = [f"!{name}" for name in facts["keep_out_violated"]]
     notes += [body["name"] for body in facts["bodies_in_frame"]]
     return [
         (facts["time"] or str(row + 1))[:19],
-        f"{facts['boresight_ra_deg']:.2f}",
-        f"{facts['boresight_dec_deg']:+.2f}",
+        f"{facts['boresight_ra_deg']:.1f}",
+        f"{facts['boresight_dec_deg']:+.1f}",
         f"{facts['stars_expected']:.1f}",
-        ", ".join("-" if one is None else f"{one:.3g}" for one in facts["error_arcsec"]),
+        " ".join("-" if one is None else f"{one:.1f}" for one in facts["error_arcsec"]),
         f"{facts['acquisition_probability']:.3f}",
         *(f"{angles[name]:.0f}" if name in angles else "-" for name in ("Sun", "Moon", "Earth")),
-        ", ".join(notes),
+        " ".join(notes),
     ]
 
 

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcat.images.overlay import check_kind, own_style, write_figure
+from starcat.planning.plan import Plan
 from starcat.report.plots import STYLE, headline
-
-if TYPE_CHECKING:
-    from starcat.planning.plan import Plan
 
 _COLOURS = {"Sun": "#d1495b", "Moon": "#5b6770", "Earth": "#2c6e9e"}
 
@@ -39,14 +36,17 @@ def draw_plan(plan: Plan, path: Path) -> None:
         axes[2].plot(x, plan.stars_expected, color="#2c6e9e", marker=mark)
         axes[2].set(ylim=(0, None), ylabel="stars")
         for name in (name for name in _COLOURS if name in plan.angles_deg):
-            line = axes[3].plot(x, plan.angles_deg[name], color=_COLOURS[name], label=name)
+            angle, colour = plan.angles_deg[name], _COLOURS[name]
+            line = axes[3].plot(x, angle, color=colour, label=name, marker=mark)
             if name in plan.expected.keep_out_deg:
                 limit = plan.expected.keep_out_deg[name]
                 axes[3].axhline(limit, color=line[0].get_color(), ls="--", lw=0.8)
         axes[3].set(ylabel="angle, deg", xlabel="attitude" if times is None else "UTC")
         for each in (axes[1], *axes[3:][: bool(plan.angles_deg)]):
             each.legend(loc="upper right", frameon=False, ncols=3)
-        for gap in plan.gaps:
-            for each in axes:
-                each.axvspan(x[gap.first], x[gap.last], color="#b9c4cc", alpha=0.5, lw=1)
+        for each in axes:
+            each.fill_between(
+                x, 0, 1, where=~plan.is_usable, step="mid", color="#b9c4cc", alpha=0.5, lw=0,
+                transform=each.get_xaxis_transform(),
+            )  # fmt: skip
         write_figure(figure, path)

@@ -211,9 +211,8 @@ class Plan:
             "contamination": _or_none(self.contamination[index]),
             "centroid_offset_px": _or_none(self.centroid_offset_px[index]),
         }
-        return [
-            dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)
-        ]
+        rows_of_cells = zip(*columns.values(), strict=True)
+        return [dict(zip(columns, cells, strict=True)) for cells in rows_of_cells]
 
     def attitude(self, row: int) -> dict[str, Any]:
         """Return what is known of an attitude but its stars, as plain values."""
@@ -266,12 +265,6 @@ class Plan:
             raise ConfigError(text, key="row", fields=("row",))
         return choose(self.stars_of(row), self.camera, count, stages)
 
-    def plot(self, path: Path | str) -> None:
-        """Draw acquisition, errors, stars and angles over time, as PNG or SVG."""
-        from starcat.planning.drawing import draw_plan
-
-        draw_plan(self, Path(path))
-
 
 def _or_none(values: Array) -> list[float | None]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
@@ -316,7 +309,11 @@ def plan_attitudes(
     for name in expected.keep_out_deg:
         if name not in angles:
             needed = "attitudes with a time" if observers is None else "an orbit (orbit)"
-            raise ConfigError(f"keep_out_deg has {name}, whose angle needs {needed}")
+            raise ConfigError(
+                f"the angle of {name} needs {needed} (keep_out_deg)",
+                key="keep_out_deg",
+                fields=("keep_out_deg", "orbit"),
+            )
     blocks = [
         _planned_block(database, planned, observers, hidden, eye, expected, bodies, first)
         for first in range(0, len(planned.matrices), BLOCK)
@@ -378,9 +375,6 @@ def _surroundings(
         angle = np.degrees(separation(seen.directions, matrix[2]))
         px = camera.pixels_from_directions(seen.directions @ matrix.T)
         inside = camera.contains(px) & (seen.mag <= faintest)
-        discs = [
-            (u, float(radius)) for u, radius in zip(seen.directions, seen.radius_rad, strict=True)
-        ]
         if observer.is_placed:
             limb = earth_limb_angle_deg(matrix[2], observer)
             angle[seen.row("Earth")] = limb
@@ -398,7 +392,8 @@ def _surroundings(
             )
         )
         large = np.flatnonzero(seen.radius_rad > 0.1 / camera.focal_length_px)
-        hidden.append([_Disc(*discs[k]) for k in large])
+        discs = zip(seen.directions[large], seen.radius_rad[large].tolist(), strict=True)
+        hidden.append([_Disc(*disc) for disc in discs])
     return dict(zip(seen.names, np.array(angles).T, strict=True)), tuple(in_frame), hidden
 
 
@@ -447,13 +442,8 @@ def _planned_block(
         for disc in discs:
             detection[rows][separation(u[rows], disc.direction) < disc.radius_rad] = 0.0
     kept = camera.contains(px) & (detection >= MIN_DETECTION)
-    body, px, detection, group, star = (
-        body[kept],
-        px[kept],
-        detection[kept],
-        group[kept],
-        star[kept],
-    )
+    body, px, detection = body[kept], px[kept], detection[kept]
+    group, star = group[kept], star[kept]
     false = np.array([len(found) for found in bodies[first : first + count]])
     noise_px = expected.noise_px
     acquisition = acquisition_probability(
