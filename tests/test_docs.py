@@ -35,6 +35,7 @@ WALKED = [
     "docs/tutorial.md",
     "docs/howto-prove.md",
     "docs/howto-calibrate.md",
+    "docs/howto-plan.md",
     "docs/howto-query.md",
     "docs/howto-release.md",
     "docs/howto-own-catalog.md",

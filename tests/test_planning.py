@@ -312,6 +312,6 @@ def test_what_is_wrong_is_said_in_the_words_of_the_command_line(
 )
 def test_a_table_that_is_no_table_of_attitudes_is_refused(tmp_path, text, words):
     (tmp_path / "given.csv").write_text(text)
-    with pytest.raises(ConfigError, match="given.csv") as refused:
+    with pytest.raises(ConfigError, match=r"given\.csv") as refused:
         attitudes_of(tmp_path / "given.csv")
     assert words in str(refused.value)
