@@ -109,7 +109,10 @@ def test_what_is_missing_is_said(spec_file, small_spec, sao_file, built, starcat
     star = built.slice(0, 1)
     (ra,), (dec,) = radec_from_directions(directions_of(star))
     for arguments, words in (
-        ([without, "--separation", "20", "--mags", "4,5"], "selection.neighbours.psf_sigma_px=1.0"),
+        (
+            [without, "--separation", "20", "--mags", "4,5"],
+            "selection.neighbours.psf_sigma_px = 1.0",
+        ),
         ([spec_file, "--separation", "20"], "--separation ARCSEC and --mags A,B"),
         ([spec_file, "--separation", "20", "--mags", "4"], "--mags is '4'"),
         ([spec_file, "--separation", "-20", "--mags", "4,5"], "(--separation, --mags)"),

@@ -108,7 +108,7 @@ def sensor_view_at(
         raise SourceError(
             f"no star with a magnitude within {reach / ARCSEC:.0f} arcsec of RA {ra_deg:g}, Dec "
             f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}; check the position, or read a "
-            "deeper catalog (--set catalog.source=...)"
+            "deeper catalog (catalog.source of the spec)"
         )
     star = near[np.argmin(known[near])]
     away = separation(u, u[star])
@@ -123,7 +123,7 @@ def _reach_rad(spec: BuildSpec) -> float:
     if rule.psf_sigma_px is None:
         raise ConfigError(
             f"{spec.name}: selection.neighbours.psf_sigma_px is missing, the width of a star's "
-            "spot; add it to the spec, or give --set selection.neighbours.psf_sigma_px=1.0",
+            "spot; state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
             key="selection.neighbours.psf_sigma_px",
         )
     widths = widths_px(rule.psf_sigma_px, rule.window_px, rule.box_px)
