@@ -16,7 +16,7 @@ from starcat.matcher.pose import (
     Pose,
     corner_deviation,
     explained_fraction,
-    is_scaled,
+    is_deformed,
     weighted_share,
 )
 
@@ -202,7 +202,7 @@ def test_a_frame_is_scaled_if_its_corners_move_farther_than_the_tolerance(factor
         noise = generator.normal(scale=0.3, size=predicted_px.shape)
         for scale in (factor, 1.0 / factor):
             centroids_px = scaled(predicted_px, scale) + noise
-            found.append(is_scaled(predicted_px, centroids_px, CAMERA, 2.0))
+            found.append(is_deformed(predicted_px, centroids_px, CAMERA, 2.0, is_partial=False))
     assert all(found) if is_plain else not any(found)
 
 
@@ -213,6 +213,51 @@ def test_a_difference_of_scale_within_the_noise_is_none():
     for seed in range(200):
         predicted_px = places(6, seed, 60.0)
         noisy_px = predicted_px + generator.normal(scale=0.5, size=predicted_px.shape)
-        found.append(is_scaled(predicted_px, noisy_px, CAMERA, 2.0))
+        found.append(is_deformed(predicted_px, noisy_px, CAMERA, 2.0, is_partial=False))
     # Three deviations, estimated from eight degrees of freedom: 2 %.
     assert np.mean(found) < 0.06
+
+
+# --- Shape
+
+
+def deformed(places_px: np.ndarray, across: float, aslant: float) -> np.ndarray:
+    middle = np.array([512.0, 384.0])
+    inner = places_px - middle
+    return np.asarray(middle + inner @ np.array([[1.0 + across, aslant], [aslant, 1.0 - across]]))
+
+
+@pytest.mark.parametrize("is_partial", [True, False])
+@pytest.mark.parametrize(
+    ("across", "aslant", "is_plain"),
+    [(0.0, 0.0, False), (0.002, 0.0, False), (0.01, 0.0, True), (-0.007, 0.007, True)],
+)
+def test_a_part_of_a_frame_has_another_shape_if_its_corners_move(
+    across, aslant, is_plain, is_partial
+):
+    generator = np.random.default_rng(13)
+    for seed in range(50):
+        predicted_px = places(12, seed)
+        noise = generator.normal(scale=0.3, size=predicted_px.shape)
+        centroids_px = deformed(predicted_px, across, aslant) + noise
+        found = is_deformed(predicted_px, centroids_px, CAMERA, 2.0, is_partial=is_partial)
+        assert found == (is_plain and is_partial)
+
+
+def test_noise_is_rarely_a_shape():
+    # Six stars within 60 px: noise alone makes a map that moves the corner by many pixels.
+    generator, found = np.random.default_rng(14), []
+    for seed in range(2000):
+        predicted_px = places(6, seed, 60.0)
+        noisy_px = predicted_px + generator.normal(scale=0.2, size=predicted_px.shape)
+        plain = is_deformed(predicted_px, noisy_px, CAMERA, 2.0, is_partial=False)
+        found.append(
+            not plain and is_deformed(predicted_px, noisy_px, CAMERA, 2.0, is_partial=True)
+        )
+    assert 0 <= np.sum(found) <= 8  # 2 of 2,000 expected at 1e-3
+
+
+def test_stars_on_a_line_tell_no_shape():
+    predicted_px = np.linspace([100.0, 100.0], [900.0, 700.0], 9)
+    centroids_px = predicted_px + np.array([[1.0, -1.0], [-1.0, 1.0], [0.0, 0.0]] * 3)
+    assert not is_deformed(predicted_px, centroids_px, CAMERA, 2.0, is_partial=True)

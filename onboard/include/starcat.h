@@ -119,7 +119,7 @@ typedef enum {
   STARCAT_REASON_NO_CANDIDATE = 2, /* no pattern of the frame is in the image */
   STARCAT_REASON_CHANCE = 3,       /* no attitude fits better than chance */
   STARCAT_REASON_SHARE = 4,        /* the best agreement explains too little of the frame */
-  STARCAT_REASON_SCALE = 5,        /* the frame is of another scale than the camera */
+  STARCAT_REASON_SCALE = 5,        /* the frame has another scale or shape than the camera */
   STARCAT_REASON_STEPS = 6         /* the steps were used up */
 } starcat_reason;
 

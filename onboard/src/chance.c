@@ -15,8 +15,14 @@
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
 #define LEAST_EXTENT R(1e-6)                    /* of stars on the detector, square pixels */
+#define LEAST_BREADTH R(1e-4) /* of stars that tell a shape: of the determinant of xx, xy, yy */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
+
+/* Sums over the matched centroids: of products of their stars' places x, y and their offsets. */
+typedef struct {
+  real xx, xy, yy, x_dx, y_dx, x_dy, y_dy, left;
+} moments;
 
 /* How places move as the camera turns, summed over the matched centroids: the determinant, and
  * that with the focal length as a fourth unknown over the one without. */
@@ -213,12 +219,51 @@ void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tol
   }
 }
 
-/* Whether the frame differs in scale from the stars that it matches: a wrong focal length. */
-int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px) {
+/* Add what a matched centroid says of the frame's shape: its star's place from their middle, and
+ * its offset from its star, from the middle of the offsets. */
+static void add_moments(moments *of, real x, real y, real dx, real dy) {
+  of->xx += x * x;
+  of->xy += x * y;
+  of->yy += y * y;
+  of->x_dx += x * dx;
+  of->y_dx += y * dx;
+  of->x_dy += x * dy;
+  of->y_dy += y * dy;
+  of->left += dx * dx + dy * dy;
+}
+
+/* Whether offsets are those of another shape: of pixels that are not square, or of axes that are
+ * not at right angles. A linear map has to move the corners, beside its turn and its scale, and
+ * has to leave less than noise would leave with a probability of 1e-3. */
+static int has_other_shape(const moments *of, real n, real corner_px, real tolerance_px) {
+  const real extent = of->xx + of->yy;
+  const real determinant = of->xx * of->yy - of->xy * of->xy;
+  if (!(determinant > LEAST_BREADTH * extent * extent)) {
+    return 0;
+  }
+  const real a = (of->yy * of->x_dx - of->xy * of->y_dx) / determinant;
+  const real b = (of->xx * of->y_dx - of->xy * of->x_dx) / determinant;
+  const real c = (of->yy * of->x_dy - of->xy * of->y_dy) / determinant;
+  const real d = (of->xx * of->y_dy - of->xy * of->x_dy) / determinant;
+  const real bent = corner_px * corner_px * ((a - d) * (a - d) + (b + c) * (b + c));
+  if (!(bent > R(4.0) * tolerance_px * tolerance_px)) {
+    return 0;
+  }
+  const real scale = of->x_dx + of->y_dy, turn = of->x_dy - of->y_dx;
+  const real of_similar = of->left - (scale * scale + turn * turn) / extent;
+  const real of_linear = of->left - (a * of->x_dx + b * of->y_dx + c * of->x_dy + d * of->y_dy);
+  const real ratio = starcat_larger(of_linear / of_similar, STARCAT_LEAST_WEIGHT);
+  return (n - R(3.0)) * STARCAT_LOG(ratio) < STARCAT_LOG_LIKELY;
+}
+
+/* Whether the frame differs from the stars that it matches in scale, which means a wrong focal
+ * length; or in shape, which is tested where the stars explain a part of the frame only. */
+int starcat_is_deformed(const starcat_call *call, uint32_t n_matched, real tolerance_px,
+                        int is_partial) {
   const starcat_workspace *w = call->work;
   const real n = (real)n_matched;
   real mean_x = R(0.0), mean_y = R(0.0), off_x = R(0.0), off_y = R(0.0);
-  real extent = R(0.0), product = R(0.0), left = R(0.0);
+  moments of = {0};
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
       const uint32_t j = starcat_find_match(w, i);
@@ -231,26 +276,19 @@ int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real toleran
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
       const uint32_t j = starcat_find_match(w, i);
-      const real x = w->x_of[j] - mean_x, y = w->y_of[j] - mean_y;
-      extent += x * x + y * y;
-      product += x * (w->x[i] - w->x_of[j]) + y * (w->y[i] - w->y_of[j]);
+      add_moments(&of, w->x_of[j] - mean_x, w->y_of[j] - mean_y, w->x[i] - w->x_of[j] - off_x,
+                  w->y[i] - w->y_of[j] - off_y);
     }
   }
-  const real excess = product / starcat_larger(extent, LEAST_EXTENT);
+  const real extent = starcat_larger(of.xx + of.yy, LEAST_EXTENT);
+  const real excess = (of.x_dx + of.y_dy) / extent;
   const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
                                       call->camera.half_height * call->camera.half_height);
   const real moved = excess < R(0.0) ? -excess * corner_px : excess * corner_px;
-  if (!(moved > tolerance_px)) {
-    return 0;
+  const real variance = (of.left - excess * excess * extent) / (R(2.0) * n - R(4.0)) / extent;
+  if ((moved > tolerance_px) &&
+      (excess * excess > STARCAT_SCALE_DEVIATIONS * STARCAT_SCALE_DEVIATIONS * variance)) {
+    return 1;
   }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    if (w->match[i] >= 0) {
-      const uint32_t j = starcat_find_match(w, i);
-      const real x = w->x[i] - w->x_of[j] - off_x - excess * (w->x_of[j] - mean_x);
-      const real y = w->y[i] - w->y_of[j] - off_y - excess * (w->y_of[j] - mean_y);
-      left += x * x + y * y;
-    }
-  }
-  const real variance = left / (R(2.0) * n - R(4.0)) / starcat_larger(extent, LEAST_EXTENT);
-  return excess * excess > STARCAT_SCALE_DEVIATIONS * STARCAT_SCALE_DEVIATIONS * variance;
+  return (is_partial != 0) && (has_other_shape(&of, n, corner_px, tolerance_px) != 0);
 }

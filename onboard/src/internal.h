@@ -218,7 +218,8 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
 void starcat_add_information(starcat_information *h, const real b[3]);
 void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
                              starcat_agreement *found);
-int starcat_is_scaled(const starcat_call *call, uint32_t n_matched, real tolerance_px);
+int starcat_is_deformed(const starcat_call *call, uint32_t n_matched, real tolerance_px,
+                        int is_partial);
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);

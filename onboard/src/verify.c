@@ -7,7 +7,7 @@
  *             match centroids and stars that are nearest to each other
  *             refine the attitude on them
  *         judge: bound the probability that chance matches as many as well  [chance.c]
- *             withhold what explains too little of the frame, or is of another scale
+ *             withhold what explains too little of the frame, or is of another scale or shape
  *         if it is not due to chance: give stars to competing centroids that fit better
  *         if it is not certain: fit anew with a smaller radius of matching
  *         if much of the frame is unexplained: fit anew, from a wider radius down
@@ -21,6 +21,8 @@
 
 #define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
+#define MISS_REACH R(8.0)  /* how near a star a centroid misses it, in reaches */
+#define PI R(3.14159265358979324)
 
 /* Whether a centroid may be a star, by their magnitudes. */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
@@ -245,6 +247,39 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
+/* Whether centroids without a star are close to stars without a centroid: more of them than half of
+ * the matched ones, and twice what chance brings there. Then the frame has another shape than the
+ * camera: stars match in a part of it, and beside that part they miss. */
+static int has_near_misses(const starcat_call *call, uint32_t matched, real reach_px) {
+  const starcat_workspace *w = call->work;
+  const real reach = MISS_REACH * MISS_REACH * reach_px * reach_px;
+  uint8_t is_near[STARCAT_MAX_CENTROIDS] = {0};
+  uint32_t pairs = 0, stars = 0, centroids = 0;
+  for (uint32_t k = 0; k < call->own->n_within; k++) {
+    const uint32_t owner = starcat_limit_place(w->nearest[k], STARCAT_MAX_CENTROIDS);
+    int is_near_one = 0;
+    for (uint32_t i = 0; (i < call->own->count) && (w->match[owner] != (int16_t)k); i++) {
+      if ((w->match[i] < 0) &&
+          starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
+        const real dx = w->x[i] - w->x_of[k], dy = w->y[i] - w->y_of[k];
+        pairs++;
+        if (dx * dx + dy * dy <= reach) {
+          is_near[i] = 1;
+          is_near_one = 1;
+        }
+      }
+    }
+    stars += (uint32_t)is_near_one;
+  }
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    centroids += is_near[i];
+  }
+  const real by_chance =
+      (real)pairs * PI * reach / (R(4.0) * call->camera.half_width * call->camera.half_height);
+  return (real)(stars < centroids ? stars : centroids) >
+         R(0.5) * (real)matched + R(2.0) * by_chance;
+}
+
 /* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
 static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
                       starcat_agreement *found) {
@@ -284,11 +319,17 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   found->log_chance = found->log_bound;
   if (found->log_bound < R(0.0)) {
     starcat_weigh_agreement(call, m, factor * call->tolerance_rad, found);
-    if ((found->share < STARCAT_MIN_SHARE) &&
-        ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
+    const int is_partial = found->share < STARCAT_SURE_SHARE;
+    if ((is_partial != 0) && !starcat_spend_steps(call, call->own->count * call->own->n_within)) {
       withhold_agreement(found, STARCAT_REASON_SHARE);
-    } else if (starcat_is_scaled(call, matched, factor * call->tolerance_px) != 0) {
+    } else if ((found->share < STARCAT_MIN_SHARE) &&
+               ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
+      withhold_agreement(found, STARCAT_REASON_SHARE);
+    } else if ((starcat_is_deformed(call, matched, factor * call->tolerance_px, is_partial) != 0) ||
+               ((is_partial != 0) && has_near_misses(call, matched, factor * call->reach_px))) {
       withhold_agreement(found, STARCAT_REASON_SCALE);
+    } else {
+      /* Nothing speaks against it. */
     }
   }
 }

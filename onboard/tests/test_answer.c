@@ -192,7 +192,7 @@ static void check_places(const unit_sky *sky) {
   memset(unit_work.near_row, 0x7f, sizeof unit_work.near_row);
   memset(unit_work.match, 0x7f, sizeof unit_work.match);
   starcat_count_ways(&call, 4);
-  CHECK(starcat_is_scaled(&call, 4, (starcat_real)1e6) == 0);
+  CHECK(starcat_is_deformed(&call, 4, (starcat_real)1e6, 1) == 0);
   starcat_weigh_agreement(&call, m, call.tolerance_rad, &unit_work.found);
   (void)starcat_end_call(&call, &sky->options, &unit_result);
   traps_on();

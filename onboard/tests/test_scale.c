@@ -214,6 +214,36 @@ static void check_corners(void) {
   CHECK(wrong < 4u);
 }
 
+/* Pixels that are not square: stars match in a part of the frame, and the boresight of no answer is
+ * farther off than such pixels move it. */
+static void check_shapes(void) {
+  static const double stretches[4] = {0.95, 0.98, 1.02, 1.05};
+  const unit_sky *skies[2] = {&unit_triangle, &unit_crowded};
+  uint64_t state = 79;
+  uint32_t refused = 0;
+  for (uint32_t n = 0; n < 160u; n++) {
+    const unit_sky *sky = skies[n % 2u];
+    unit_scratch = *sky;
+    unit_scratch.options.fov_error = (starcat_real)(n % 3u == 0u ? 0.0 : 0.05);
+    unit_scratch.options.noise_mag = (starcat_real)(n % 5u == 0u ? 0.3 : 0.0);
+    sky_look(&sky->image, &sky->camera, &state, 0.3, STARCAT_MAX_CENTROIDS, 2u, &truth);
+    for (uint32_t k = 0; k < truth.count; k++) {
+      const double middle = 0.5 * (double)sky->camera.width_px;
+      const double stretch = stretches[(n / 2u) % 4u];
+      truth.x[k] = (starcat_real)(middle + stretch * ((double)truth.x[k] - middle));
+    }
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      double cosine = 0.0;
+      for (uint32_t k = 6; k < 9u; k++) {
+        cosine += (double)unit_result.matrix[k] * truth.matrix[k];
+      }
+      CHECK_NEAR(cosine, 1.0, 2e-6); /* 0.1 degrees */
+    }
+    refused += (uint32_t)(unit_result.reason == (uint32_t)STARCAT_REASON_SCALE);
+  }
+  CHECK(refused > 20u);
+}
+
 /* Whatever the budget, a call takes no more of it, and what it finds is right. */
 static void check_budgets(void) {
   uint64_t state = 78;
@@ -248,5 +278,6 @@ void test_scale(void) {
   check_near();
   check_other_scales();
   check_corners();
+  check_shapes();
   check_budgets();
 }

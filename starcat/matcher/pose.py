@@ -28,6 +28,13 @@ _SCALINGS = 2
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
+SHAPE_CHANCE = 1e-3
+"""Probability that noise looks as much like another shape of the frame, below which it is one."""
+
+MIN_BREADTH = 1e-4
+"""Least breadth of matched stars that tell the shape of a frame: the determinant of their second
+moments over the square of its trace."""
+
 SURE_CORNER = 0.5
 """Largest error of a corner, in tolerances, that stars may leave which determine their frame where
 the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
@@ -236,22 +243,56 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
     return math.sqrt(max(0.0, variance))
 
 
-def is_scaled(
-    predicted_px: Pixels, centroids_px: Pixels, camera: Camera, tolerance_px: float
+def is_deformed(
+    predicted_px: Pixels,
+    centroids_px: Pixels,
+    camera: Camera,
+    tolerance_px: float,
+    *,
+    is_partial: bool,
 ) -> bool:
-    """Return whether a frame differs in scale from the stars that it matches.
+    """Return whether a frame differs in scale, or in shape, from the stars that it matches.
 
-    A frame of another scale means that the camera's focal length is wrong. The attitude may be
+    A frame of another scale means that the camera's focal length is wrong; one of another shape,
+    that its pixels are not square, or that its axes are not at right angles. The attitude may be
     right, but towards the edge of the frame stars are taken for their neighbours.
+
+    Parameters
+    ----------
+    predicted_px, centroids_px : arrays of shape (N, 2), N >= 4
+        Where the attitude puts the matched stars, and where they are; pixels.
+    camera : Camera
+        Gives the distance from the middle of the frame to its corners.
+    tolerance_px : float
+        A difference that moves the corners less than this is none.
+    is_partial : bool
+        Whether the stars explain a part of the frame only. Then the shape is tested, too: lenses
+        that nobody has calibrated differ from square pixels a little, and where stars everywhere
+        in the frame match, that does no harm.
     """
     inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
-    extent = float(np.vdot(inner, inner))
     offset = centroids_px - predicted_px
-    excess = float(np.vdot(inner, offset)) / extent
+    offset -= offset.sum(axis=0) / len(offset)
+    (xx, xy), (_, yy) = inner.T @ inner
+    (x_dx, x_dy), (y_dx, y_dy) = inner.T @ offset
+    extent, left = float(xx + yy), float(np.vdot(offset, offset))
+    excess = float(x_dx + y_dy) / extent
     corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
-    if abs(excess) * corner_px <= tolerance_px:
+    if abs(excess) * corner_px > tolerance_px:
+        variance = (left - excess * excess * extent) / (2 * len(offset) - 4) / extent
+        if excess * excess > SCALE_DEVIATIONS**2 * variance:
+            return True
+    determinant = float(xx * yy - xy * xy)
+    if not is_partial or determinant <= MIN_BREADTH * extent * extent:
         return False
-    left = offset - excess * inner
-    left -= left.sum(axis=0) / len(left)
-    variance = float(np.vdot(left, left)) / (2 * len(left) - 4) / extent
-    return excess * excess > SCALE_DEVIATIONS**2 * variance
+    # The linear map of the offsets: [[a, b], [c, d]].
+    a, b = (yy * x_dx - xy * y_dx) / determinant, (xx * y_dx - xy * x_dx) / determinant
+    c, d = (yy * x_dy - xy * y_dy) / determinant, (xx * y_dy - xy * x_dy) / determinant
+    if 0.5 * math.hypot(a - d, b + c) * corner_px <= tolerance_px:
+        return False
+    # Of a turn and a scale, and of any linear map: what they leave of the offsets. Of noise, the
+    # ratio is below r with the probability r**(N - 3) (Fisher's F with 2 and 2N - 6 degrees).
+    of_similar = left - ((x_dx + y_dy) ** 2 + (x_dy - y_dx) ** 2) / extent
+    of_linear = left - (a * x_dx + b * y_dx + c * x_dy + d * y_dy)
+    ratio = max(float(of_linear / of_similar), MIN_WEIGHT)
+    return (len(offset) - 3) * math.log(ratio) < math.log(SHAPE_CHANCE)

@@ -48,7 +48,7 @@ MESSAGES: dict[Reason, str] = {
     "prior": "no attitude as near to the prior as its error says explains the frame",
     "chance": "no attitude fits better than chance",
     "share_of_frame": "the best agreement explains too little of the frame",
-    "scale": "the frame is of another scale than the camera",
+    "scale": "the frame has another scale or shape than the camera",
     "mirrored": "the frame matches only mirrored: its y counts up",
     "time": "the time limit ended the search",
     "steps": "the limit of steps ended the search",
@@ -73,7 +73,8 @@ HINTS: dict[Reason, str] = {
         "leave out centroids that are no stars, give the camera its distortion, use a database "
         "that is as deep as the frame, or ask for a smaller share (min_share)"
     ),
-    "scale": "give the camera its true focal length, or allow a larger error of it (fov_error)",
+    "scale": "give the camera its true focal length, or allow a larger error of it (fov_error); "
+    "'starcat calibrate' finds pixels that are not square",
     "mirrored": "turn the frame over (flip)",
     "time": (
         "allow more time (time_limit_s), give magnitudes, or leave out centroids that are no stars"

@@ -25,7 +25,7 @@ from starcat.matcher.pose import (
     explained_fraction,
     first_poses,
     fit,
-    is_scaled,
+    is_deformed,
     pose_at,
     scaled_directions,
 )
@@ -54,6 +54,9 @@ NARROWER = (0.5, 0.25, 0.125)
 OVER_CHANCE = 2.0
 """Centroids within a smaller reach, over the number that its area would have by chance, from which
 it is tried."""
+
+MISS_REACH = 8.0
+"""How near a star a centroid misses it; in units of the final reach."""
 
 RIVAL_REACH = 4.0
 """A centroid without a star that is this near to one that another centroid has may have more right
@@ -371,14 +374,39 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
         is_free = is_firm and chance <= FIRM_CHANCE and asked <= MIN_SHARE
         if share < asked and not is_free:
             withheld = "share_of_frame"
-        elif is_scaled(
+        elif is_deformed(
             refined.predicted_px[star],
             observation.centroids_px[matched],
             pose.camera,
             refined.last * observation.tolerance_px,
-        ):
+            is_partial=share < SURE_SHARE,
+        ) or (share < SURE_SHARE and _has_near_misses(refined, within, observation)):
             withheld = "scale"
     return Agreement(pose, index, residual_rad, chance, share, withheld, is_firm)
+
+
+def _has_near_misses(refined: _Fit, within: Rows, observation: Observation) -> bool:
+    """Return whether centroids without a star are close to stars without a centroid.
+
+    They are if they are more than half of the matched ones, and twice what chance brings there.
+    Then the frame has another shape than the camera: stars match in a part of the frame, and
+    beside that part they miss.
+    """
+    loose = np.flatnonzero(refined.star < 0)
+    free = np.setdiff1d(within, refined.star[refined.matched])
+    offset = observation.centroids_px[loose][:, None] - refined.predicted_px[free]
+    offset *= offset
+    square = offset[..., 0] + offset[..., 1]
+    pairs = square.size
+    reach = (MISS_REACH * REACH * refined.last * observation.tolerance_px) ** 2
+    near = square <= reach
+    if refined.compatible is not None:
+        compatible = refined.compatible[np.ix_(loose, free)]
+        pairs, near = int(compatible.sum()), near & compatible
+    camera = observation.camera
+    by_chance = pairs * math.pi * reach / (camera.width_px * camera.height_px)
+    misses = min(int(near.any(axis=0).sum()), int(near.any(axis=1).sum()))
+    return misses > 0.5 * len(refined.matched) + 2.0 * by_chance
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:

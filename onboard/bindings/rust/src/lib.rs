@@ -83,7 +83,7 @@ pub enum Reason {
     Chance,
     /// The best agreement explains too little of the frame.
     Share,
-    /// The frame is of another scale than the camera.
+    /// The frame has another scale or shape than the camera.
     Scale,
 }
 
