@@ -8,7 +8,7 @@ import tomlkit
 from fastapi import Query
 from fastapi.responses import Response
 
-from starcat.onboard import BYTE_ORDERS, FEATURES
+from starcat.onboard import BYTE_ORDERS, FEATURES, PROFILES
 from starcat_service.access import Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.pages.rendering import page_router
@@ -19,6 +19,7 @@ router = page_router()
 
 Method = Literal["triangle", "pyramid"]
 Endian = Literal["little", "big"]
+ProfileName = Literal["full", "small"]
 
 
 def image_choices(database: ListedDatabase) -> dict[str, list[tuple[str, str]]]:
@@ -27,6 +28,9 @@ def image_choices(database: ListedDatabase) -> dict[str, list[tuple[str, str]]]:
     return {
         "methods": [(name, f"{name}s") for name in methods],
         "orders": [(name, f"{name}-endian") for name in BYTE_ORDERS],
+        "profiles": [
+            (name, name) for name, profile in PROFILES.items() if profile.methods[0] in methods
+        ],
     }
 
 
@@ -35,20 +39,25 @@ async def flight_image_page(
     service: TheService,
     _: Reader,
     database_id: str,
-    method: Annotated[Method, Query()] = "triangle",
+    method: Annotated[Method | None, Query()] = None,
     endian: Annotated[Endian, Query()] = "little",
+    profile: Annotated[ProfileName, Query()] = "full",
 ) -> Response:
     """Give the image for flight software, the bytes that ``starcat export`` writes."""
     database = service.library.database(database_id)
-    return await service.sandbox.run(_image, service, database, method, endian)
+    options = {"method": method, "endian": endian, "profile": profile}
+    return await service.sandbox.run(_image, service, database, options)
 
 
-def _image(service: Service, database: ListedDatabase, method: str, endian: str) -> Response:
+def _image(
+    service: Service, database: ListedDatabase, options: dict[str, str | None]
+) -> Response:
+    name = "" if options["profile"] == "full" else f"-{options['profile']}"
     with scratch_folder(service.paths) as folder:
         target = folder / "image.img"
         arguments = {"artifact": str(database.folder), "target": str(target)}
-        service.sandbox.call("flight_image", {**arguments, "method": method, "endian": endian})
-        return open_attachment(target, f"{database.title}.img", BYTES)
+        service.sandbox.call("flight_image", {**arguments, **options})
+        return open_attachment(target, f"{database.title}{name}.img", BYTES)
 
 
 @router.get("/databases/{database_id}/spec.toml")
