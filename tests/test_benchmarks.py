@@ -15,7 +15,7 @@ BENCHMARKS = [
     "false_matches", "fields", "hostile", "ingest", "instructions", "interrupts",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
     "matcher --of ruststartracker", "photographs", "pictures", "products", "scale", "service",
-    "service_load", "sql", "tracking", "votable",
+    "service_load", "small_images", "sql", "tracking", "votable",
 ]  # fmt: skip
 
 

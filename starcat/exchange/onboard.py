@@ -25,7 +25,6 @@ from starcat.onboard.checking import (
     shrink,
     value_problems,
 )
-from starcat.onboard.flight_limits import voting_bytes
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
 from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder, crc_of
 from starcat.onboard.patching import (
@@ -40,7 +39,7 @@ from starcat.onboard.profiles import method_of, profile_named
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
-from starcat.simulation.in_flight import FlightRates, flight_rates
+from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file

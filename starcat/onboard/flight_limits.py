@@ -6,10 +6,7 @@ that it identifies frames that the library in flight refuses.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-
-from starcat.arrays import Directions
 
 FLIGHT_CENTROIDS = 64
 FLIGHT_STARS = 192
@@ -17,30 +14,6 @@ FLIGHT_STARS = 192
 
 FLIGHT_STEPS = 4_000_000
 """``max_steps`` of ``starcat_set_default_options``."""
-
-
-def voting_bytes(directions: Directions, radius_rad: float) -> int:
-    """Return the memory of the table of neighbours, which votes need.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors of the stars of the image.
-    radius_rad : float
-        Largest separation of neighbours, half of the field's diagonal.
-
-    Returns
-    -------
-    int
-        4 bytes for each neighbour of each star, and 4 for each star and one more.
-    """
-    import scipy.spatial
-
-    if not len(directions):
-        return 4
-    tree = scipy.spatial.cKDTree(directions)
-    chord = 2.0 * math.sin(0.5 * min(radius_rad, math.pi))
-    return int(4 * tree.count_neighbors(tree, chord)) + 4  # each star counts as its own neighbour
 
 
 def stars_in_flight(most_near: int) -> Iterator[str]:

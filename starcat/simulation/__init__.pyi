@@ -1,4 +1,3 @@
-from starcat.simulation.in_flight import flight_rates as flight_rates
 from starcat.simulation.selftest import rates_of as rates_of
 from starcat.simulation.selftest import self_test as self_test
 from starcat.simulation.selftest import wilson_interval as wilson_interval

@@ -15,8 +15,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import scipy
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.attitude import quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.c_engine import CEngine, is_compiled
@@ -106,6 +107,28 @@ def flight_rates(
         engine.image.neighbours = table if votes else null
         found += [_rates(kind, engine, some, votes=votes) for kind, some in simulated.items()]
     return tuple(found)
+
+
+def voting_bytes(directions: Directions, radius_rad: float) -> int:
+    """Return the memory of the table of neighbours, which votes need.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors of the stars of the image.
+    radius_rad : float
+        Largest separation of neighbours, half of the field's diagonal.
+
+    Returns
+    -------
+    int
+        4 bytes for each neighbour of each star, and 4 for each star and one more.
+    """
+    if not len(directions):
+        return 4
+    tree = scipy.spatial.cKDTree(directions)
+    chord = 2.0 * math.sin(0.5 * min(radius_rad, math.pi))
+    return int(4 * tree.count_neighbors(tree, chord)) + 4  # each star counts as its own neighbour
 
 
 def _rates(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import tomlkit
@@ -20,16 +21,19 @@ router = page_router()
 Method = Literal["triangle", "pyramid"]
 Endian = Literal["little", "big"]
 ProfileName = Literal["full", "small"]
+FULL_NAME: ProfileName = "full"
 
 
 def image_choices(database: ListedDatabase) -> dict[str, list[tuple[str, str]]]:
-    """Return the methods and the byte orders that an image of a database can have."""
+    """Return the methods, the byte orders and the profiles that an image of a database can have."""
     methods = [name for name, (product, _) in FEATURES.items() if product in database.products]
     return {
         "methods": [(name, f"{name}s") for name in methods],
         "orders": [(name, f"{name}-endian") for name in BYTE_ORDERS],
         "profiles": [
-            (name, name) for name, profile in PROFILES.items() if profile.methods[0] in methods
+            (name, f"{name}, with {profile.methods[0]}s")
+            for name, profile in PROFILES.items()
+            if name != FULL_NAME and profile.methods[0] in methods
         ],
     }
 
@@ -41,7 +45,7 @@ async def flight_image_page(
     database_id: str,
     method: Annotated[Method | None, Query()] = None,
     endian: Annotated[Endian, Query()] = "little",
-    profile: Annotated[ProfileName, Query()] = "full",
+    profile: Annotated[ProfileName, Query()] = FULL_NAME,
 ) -> Response:
     """Give the image for flight software, the bytes that ``starcat export`` writes."""
     database = service.library.database(database_id)
@@ -50,9 +54,9 @@ async def flight_image_page(
 
 
 def _image(
-    service: Service, database: ListedDatabase, options: dict[str, str | None]
+    service: Service, database: ListedDatabase, options: Mapping[str, str | None]
 ) -> Response:
-    name = "" if options["profile"] == "full" else f"-{options['profile']}"
+    name = "" if options["profile"] == FULL_NAME else f"-{options['profile']}"
     with scratch_folder(service.paths) as folder:
         target = folder / "image.img"
         arguments = {"artifact": str(database.folder), "target": str(target)}
