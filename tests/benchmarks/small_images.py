@@ -40,6 +40,12 @@ IMAGES: dict[str, tuple[dict[str, str], tuple[int | None, ...]]] = {
     "small": ({"profile": "small"}, (None, 140_000, 120_000, 100_000, 80_000, 65_000)),
 }
 
+HEADINGS = (
+    "profile", "bytes", "stars", "features", "identified, %", "steps", "bytes for votes",
+    "identified, %", "steps",
+)  # fmt: skip
+"""Steps are the mean and the most of the hard frames; the last three columns are with votes."""
+
 FRAMES = {**KINDS, "poor": Noise(NOISE_PX, 0.3, 6, noise_mag=0.3)}
 
 
@@ -91,20 +97,17 @@ def main(rows: Rows) -> None:
             with rows.row(name):
                 built = database(preset, Path(scratch), changes)
                 print(f"\n{name}: {', '.join(FRAMES)} frames, {given.frames} of each\n")
-                print("| profile, method | bytes | stars | features | identified, % | steps of hard"
-                      " frames: mean; most | bytes for votes | identified, % | steps |")  # fmt: skip
-                print(f"|{'---|' * 9}")
+                print(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
                 for image_name, image in images(built.folder, Path(scratch, "db.img")):
                     rates = flight_rates(image.fitted.contents, image.sky, given.frames, FRAMES)
                     print(told(image, image_name, rates), flush=True)
                     wrong = sum(one.wrong for one in rates)
                     rows.expect(wrong == 0, f"{name}, {image_name}: {wrong} wrong answers")
-                small = export_image(
-                    built.folder, "onboard", Path(scratch, "small.img"), profile="small"
-                )
-                rows.expect(
-                    len(small.made.data) <= MAX_BYTES, f"{name}: the small profile is large"
-                )
+                    if image.profile == "small":
+                        size = len(image.made.data)
+                        rows.expect(
+                            size <= MAX_BYTES, f"{name}: the small profile has {size:,} bytes"
+                        )
 
 
 if __name__ == "__main__":
