@@ -18,6 +18,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from rows import LackingError, Options, Rows, database, ended
 
@@ -34,7 +35,7 @@ DATABASES = {
     "sao15": ("sao-12deg", {"name": '"sao15"', "camera.fov_x_deg": "15"}),
 }
 
-IMAGES: dict[str, tuple[dict[str, str], tuple[int | None, ...]]] = {
+IMAGES: dict[str, tuple[dict[str, Any], tuple[int | None, ...]]] = {
     "full, triangle": ({}, (None, 500_000, 300_000, MAX_BYTES)),
     "full, pyramid": ({"method": "pyramid"}, (None, 500_000, 300_000, MAX_BYTES)),
     "small": ({"profile": "small"}, (None, 140_000, 120_000, 100_000, 80_000, 65_000)),
