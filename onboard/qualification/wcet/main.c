@@ -5,7 +5,8 @@
  *   KIND NUMBER instructions steps status flags genes
  *
  * KIND is o, r or s; flags: 1 lens, 2 focal length sought, 4 crowded, 8 tracked, 16 pyramids, 32
- * magnitudes, 64 votes. Half of the calls have a table of neighbours, if there is memory for it.
+ * magnitudes, 64 votes. Half of the calls have a table of neighbours, if there is memory for it;
+ * these have as many more steps as are taken before votes are counted.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -23,6 +24,7 @@
 #define SEED 1
 #endif
 #define N_WORST 8u
+#define STEPS_BEFORE_VOTES 150000u /* of identify.c */
 #define TABLE_STARS 1000u
 #define TABLE_NEIGHBOURS 6000u
 #define WEIGHT 2000.0 /* steps that the work before the first one is worth in the search */
@@ -50,16 +52,18 @@ static int has_magnitudes(void) {
   return known;
 }
 
+static int can_vote(void) {
+  return (image.neighbours != NULL) && !made.is_tracked &&
+         !(made.options.fov_error > (starcat_real)0.0);
+}
+
 static uint32_t flags_of(void) {
   return (uint32_t)((made.camera.k1 != (starcat_real)0.0 ? 1 : 0) |
                     (made.options.fov_error > (starcat_real)0.0 ? 2 : 0) |
                     ((result.n_usable > 32u) && !has_magnitudes() ? 4 : 0) |
                     (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0) |
                     (has_magnitudes() ? 32 : 0) |
-                    ((image.neighbours != NULL) && !made.is_tracked &&
-                             !(made.options.fov_error > (starcat_real)0.0)
-                         ? 64
-                         : 0));
+                    (can_vote() ? 64 : 0));
 }
 
 /* List the neighbours of the stars. Returns whether the table can be used. */
@@ -78,6 +82,9 @@ static int list_neighbours(void) {
 /* Make a call and print it. Returns instructions for a step. */
 static double measure(char kind, unsigned id, const uint8_t *genes) {
   adversary_make(&image, genes, &made);
+  if (can_vote() && (kind != 'o')) {
+    made.options.max_steps += STEPS_BEFORE_VOTES;
+  }
   memset(&result, 0, sizeof result);
   const uint64_t before = clock_now();
   const starcat_status status = adversary_call(&image, &made, &work, &result);
