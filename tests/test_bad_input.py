@@ -1194,6 +1194,8 @@ def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
 ONBOARD_IMAGES: Cases = {
     "onboard image that cannot be so small": run(f"{ONBOARD} --max-bytes 9000"),
     "onboard image for a method that has none": run(f"{ONBOARD} --method grid"),
+    "profile of an onboard image unknown": run(f"{ONBOARD} --profile tiny"),
+    "profile without a method": run(f"{ONBOARD} --profile small --method triangle"),
     "byte order unknown": run(f"{ONBOARD} --endian middle"),
     "option of an onboard image for tables": run(f"{EXPORT} --to fits --max-bytes 9000"),
     "option of tables for an onboard image": run(f"{ONBOARD} --product stars"),

@@ -43,8 +43,8 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 
 
 OPTIONS_OF_EXPORT = (
-    "products", "max_partition_rows", "method", "endian", "max_bytes", "patch_from", "sign",
-    "replace",
+    "products", "max_partition_rows", "profile", "method", "endian", "max_bytes", "patch_from",
+    "sign", "replace",
 )  # fmt: skip
 """Options of `export`; each format has some of them."""
 
@@ -504,9 +504,9 @@ def export(
     output : str or path-like, optional
         A folder for tables, by default ``export``, or for a solver's files; the file of an image.
     **options
-        ``products``, ``replace``, ``max_partition_rows`` for tables; ``method``, ``endian``,
-        ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys) for an image;
-        ``replace`` for a solver.
+        ``products``, ``replace``, ``max_partition_rows`` for tables; ``profile`` (full or small),
+        ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys)
+        for an image; ``replace`` for a solver.
 
     Returns
     -------

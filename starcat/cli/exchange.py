@@ -13,6 +13,7 @@ from starcat.cli.options import Json, to_either
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
+from starcat.onboard.profiles import PROFILES
 
 if TYPE_CHECKING:
     from starcat.exchange.export import Exported
@@ -49,7 +50,15 @@ MaxPartitionRows = Annotated[
     int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
 ]
 Method = Annotated[
-    str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+    str | None,
+    typer.Option(help="onboard, c: triangle or pyramid; default: triangle, or the profile's."),
+]
+ProfileName = Annotated[
+    str | None,
+    typer.Option(
+        help=f"onboard, c: {' or '.join(PROFILES)}; small: short pairs of bright stars, for little "
+        "memory. What the image identifies is measured."
+    ),
 ]
 Endian = Annotated[
     str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
@@ -76,6 +85,7 @@ def export_command(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
     max_partition_rows: MaxPartitionRows = None,
+    profile: ProfileName = None,
     method: Method = None,
     endian: Endian = None,
     max_bytes: MaxBytes = None,
@@ -88,6 +98,7 @@ def export_command(
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
     of_images: dict[str, Any] = {
+        "profile": profile,
         "method": method,
         "endian": endian,
         "max_bytes": max_bytes,
@@ -186,11 +197,12 @@ def print_exported_solver(exported: ExportedSolver) -> None:
 def _say_left_out(exported: ExportedImage) -> None:
     fitted, made = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
+    why = "to fit" if exported.profile is None else f"by the profile {exported.profile}"
     if fitted.features < fitted.features_before:
-        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, to fit")
+        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, {why}")
     if fitted.stars_per_field is not None:
         say(
-            f"{fitted.stars_before - fitted.stars:,} stars are left out, to fit: those that are "
+            f"{fitted.stars_before - fitted.stars:,} stars are left out, {why}: those that are "
             f"not among the {fitted.stars_per_field} brightest of a field"
         )
     for sentence in stars_in_flight(made.most_near):
@@ -212,11 +224,35 @@ def print_exported_image(exported: ExportedImage) -> None:
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
         ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
         ("a frame in flight", f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"),
+        *_profile_rows(exported),
         *_patch_rows(exported),
         *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def _profile_rows(exported: ExportedImage) -> list[tuple[str, str]]:
+    """Return what an image by a profile takes and identifies."""
+    if exported.profile is None:
+        return []
+    rows = [
+        ("profile", exported.profile),
+        (
+            "memory for votes",
+            f"{exported.voting_bytes:,} bytes besides the image, if they are used",
+        ),
+    ]
+    for one in exported.rates:
+        share = 100.0 * one.identified / one.frames
+        rows.append(
+            (
+                f"{one.kind} frames, {'with' if one.votes else 'no'} votes",
+                f"{share:g} % of {one.frames} identified, {one.wrong} wrong; "
+                f"{one.mean_steps:,} steps, at most {one.most_steps:,}",
+            )
+        )
+    return rows
 
 
 def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:

@@ -105,11 +105,14 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
         return write_batches(stream, Path(target), form, named)
 
 
-def make_flight_image(artifact: str, target: str, method: str, endian: str) -> int:
+def make_flight_image(
+    artifact: str, target: str, method: str | None, endian: str, profile: str
+) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
     from starcat.exchange import export_image
 
-    made = export_image(Path(artifact), "onboard", Path(target), method=method, endian=endian)
+    options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
+    made = export_image(Path(artifact), "onboard", Path(target), **options)
     return len(made.made.data)
 
 
