@@ -18,7 +18,8 @@ from starcat.cli.console import (
     show,
     warn,
 )
-from starcat.cli.options import Input, Json, inputs_by_source, to_folder
+from starcat.cli.options import Input, Json, inputs_by_source
+from starcat.cli.outputs import Replace, expect_free, to_folder
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def coverage_command(
         Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
     ],
     output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
     """Say how many stars, pairs and triangles the fields of a database hold.
@@ -72,6 +74,7 @@ def coverage_command(
     """
     from starcat.artifact.reader import open_artifact
 
+    expect_free(output, replace=replace)
     print_coverage(open_artifact(artifact), output, as_json=json)
 
 

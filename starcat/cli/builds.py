@@ -28,8 +28,8 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
-    to_folder,
 )
+from starcat.cli.outputs import Replace, to_folder
 from starcat.cli.remote import client_of
 from starcat.errors import BuildError
 from starcat.failures import failure_of
@@ -57,9 +57,7 @@ def build_command(
     inputs: Input = None,
     sources: OwnSources = None,
     output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a different database of that name.")
-    ] = False,
+    replace: Replace = False,
     workers: Annotated[
         int, typer.Option(min=1, max=64, help="Threads; the database is the same for any number.")
     ] = 2,

@@ -15,9 +15,8 @@ from starcat.cli.options import (
     Scheduler,
     Workers,
     inputs_by_source,
-    to_either,
-    to_file,
 )
+from starcat.cli.outputs import Replace, expect_free, to_either, to_file
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
@@ -71,7 +70,6 @@ MemoryGib = Annotated[
 ]
 PartitionRows = Annotated[int, typer.Option(min=1, help="Stars of a partition at most (hats).")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that differs (hats).")]
 
 
 @app.command("ingest")
@@ -123,6 +121,7 @@ def ingest_command(
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         expect_parquet(output)
+        expect_free(output, replace=replace)
         read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
         print_ingested(read, output, as_json=json)
         return
@@ -177,10 +176,13 @@ def crossmatch_command(
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
-    output: Annotated[Path, to_file("Where the Parquet file goes.")],
+    output: Annotated[
+        Path, to_file("Where the counterparts go; the suffix selects the format.")
+    ],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
     """Find the counterparts of stars in another catalog by position, epoch and magnitude.
@@ -190,12 +192,15 @@ def crossmatch_command(
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
-    from starcat.exchange.formats import expect_parquet
+    from starcat.exchange.formats import format_of
+    from starcat.exchange.writers import write_batches
     from starcat.pipeline.counterparts import match_files
     from starcat.products.crossmatch import Crossmatch
 
-    expect_parquet(output)
-    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
+    form = format_of(output)
+    expect_free(output, replace=replace)
+    table, found = match_files(a, b, Crossmatch(radius_arcsec=radius_arcsec))
+    write_batches(table.to_reader(), output, form)
     names = {"a": a.stem, "b": b.stem}
     facts = {**names, **found.as_dict(), "output": str(output)}
     show(json, facts, print_crossmatch, found, *names.values(), output)

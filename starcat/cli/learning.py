@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.cli import options as opt
+from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.cli.console import print_json, print_table, say
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def learn_command(
         typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
     ],
     output: Annotated[
-        Path | None, opt.to_file("Where the section of a spec for a patch release goes (TOML).")
+        Path | None, to_file("Where the section of a spec for a patch release goes (TOML).")
     ] = None,
     stars: Annotated[
         Path | None,
@@ -41,6 +42,7 @@ def learn_command(
     min_frames: Annotated[
         int, typer.Option(min=2, max=1000, help="Fewest frames that a star is judged from.")
     ] = 3,
+    replace: Replace = False,
     json: opt.Json = False,
 ) -> None:
     """Learn zero point, colour term and the stars to distrust from identified frames.
@@ -52,6 +54,7 @@ def learn_command(
     from starcat.exchange.writers import write_batches
 
     form = None if stars is None else format_of(stars)
+    expect_free(output, stars, replace=replace)
     found = learn_files(database, results, by_frame=by_frame, min_frames=min_frames)
     if output is not None:
         write_observed(found, output)

@@ -9,39 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError, OutputError
+from starcat.errors import ConfigError, words_of
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
     from starcat.specs.build_spec import BuildSpec, CameraSpec
-
-
-def _no_file(path: Path | None) -> Path | None:
-    if path is not None and path.is_file():
-        raise OutputError(f"{path}: is a file; choose a folder with --output", path=path)
-    return path
-
-
-def _no_folder(path: Path | None) -> Path | None:
-    if path is not None and path.is_dir():
-        raise OutputError(f"{path}: is a folder; choose a file with --output", path=path)
-    return path
-
-
-# ``-o`` is everywhere where the result goes: a file where a command makes one, else a folder.
-def to_folder(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes into a folder."""
-    return typer.Option("--output", "-o", metavar="FOLDER", callback=_no_file, help=what)
-
-
-def to_file(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes a file."""
-    return typer.Option("--output", "-o", metavar="FILE", callback=_no_folder, help=what)
-
-
-def to_either(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes a file or a folder, by the format."""
-    return typer.Option("--output", "-o", metavar="FILE|FOLDER", help=what)
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -198,7 +170,18 @@ def camera_of_options(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        raise what_is_wrong(error, "camera") from error
+        text = str(what_is_wrong(error, "camera")).removeprefix("camera: ").removeprefix("spec: ")
+        raise ConfigError(words_of(text, CAMERA_OPTIONS, CAMERA_OPTIONS.__getitem__)) from error
+
+
+CAMERA_OPTIONS = {
+    "width_px": "--size WIDTH",
+    "height_px": "--size HEIGHT",
+    "focal_length_mm": "--focal-mm",
+    "pixel_um": "--pixel-um",
+    "fov_x_deg": "--fov-x-deg",
+}
+"""Options by the key of the spec."""
 
 
 def size_in_px(text: str) -> tuple[int, int]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_things, progress_bars, say, show
-from starcat.cli.options import Json, to_folder
+from starcat.cli.options import Json
+from starcat.cli.outputs import to_folder
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:

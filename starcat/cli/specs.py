@@ -30,6 +30,7 @@ from starcat.cli.options import (
     field_range,
     inputs_by_source,
 )
+from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -126,9 +127,7 @@ def init_command(
             metavar="FILE", help="Star sensor (TOML) as for 'evaluate --ecss': its limit."
         ),
     ] = None,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a file of that name.")
-    ] = False,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
     """Write a build spec for a camera, every key explained, and say how many stars a field has.

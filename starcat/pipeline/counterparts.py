@@ -187,12 +187,11 @@ def source_facts(read: Ingested, role: str) -> SourceFacts:
     return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
 
 
-def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
+def match_files(a: Path, b: Path, wanted: Crossmatch) -> tuple[pa.Table, Summary]:
     """Find the counterparts of the stars of one file in another."""
     stars, counterparts = read_star_table(a), read_star_table(b)
     table, summary = match_tables(stars, counterparts, wanted)
-    write_table(with_own_names(table, stars), output)
-    return summary
+    return with_own_names(table, stars), summary
 
 
 def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
