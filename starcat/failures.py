@@ -162,6 +162,8 @@ _EXPECTED = {
     "int_from_float": "a whole number",
     "float_type": "a number",
     "float_parsing": "a number",
+    "model_type": "a table",
+    "dict_type": "a table",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
 }

@@ -433,8 +433,8 @@ def export(
         A folder for tables, by default ``export``, or for a solver's files; the file of an image.
     **options
         ``products``, ``replace``, ``max_partition_rows`` for tables; ``method``, ``endian``,
-        ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys), ``camera`` (a file) for an image;
-        ``replace`` for a solver.
+        ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys), ``camera`` (a
+        file) for an image; ``replace`` for a solver.
 
     Returns
     -------

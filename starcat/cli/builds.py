@@ -154,6 +154,7 @@ def _build_remotely(
     print_rates(list(map(rates_of, report["self_test"])))
     say(f"{outcome}: {folder}")
     say(f"database {database} of {client.url}")
+    _say_next(folder)
 
 
 def _print_facts(
@@ -184,6 +185,15 @@ def print_built(built: Built, *, as_json: bool) -> None:
     print_problems(built.problems)
     say(f"{built.outcome}: {built.folder}")
     say(f"report: {built.folder / 'report' / 'index.html'}")
+    _say_next(built.folder)
+
+
+def _say_next(folder: Path) -> None:
+    say(
+        f"go on with:\n  starcat simulate {folder} -o frame.csv\n"
+        f"  starcat identify {folder} frame.csv\n"
+        f"  starcat export {folder} --to onboard -o {folder.name}.img"
+    )
 
 
 def _print_contents(built: Built) -> None:

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_json, print_table, progress_bars, say, show
-from starcat.cli.options import (
-    Json,
-    OwnSources,
-    Scheduler,
-    Workers,
-    inputs_by_source,
-)
+from starcat.cli.options import Json, OwnSources, Scheduler, Workers, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_either, to_file
 from starcat.errors import SourceError
 
@@ -51,7 +45,7 @@ def sources(
     if check is not None or draft or file is not None:
         _about_table(file, check, draft=draft, as_json=json)
         return
-    found = _source_facts()
+    found = source_facts()
     show(json, found, _print_sources, found)
 
 
@@ -176,9 +170,7 @@ def crossmatch_command(
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
-    output: Annotated[
-        Path, to_file("Where the counterparts go; the suffix selects the format.")
-    ],
+    output: Annotated[Path, to_file("Where the counterparts go; the suffix selects the format.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
@@ -206,7 +198,8 @@ def crossmatch_command(
     show(json, facts, print_crossmatch, found, *names.values(), output)
 
 
-def _source_facts() -> list[dict[str, Any]]:
+def source_facts() -> list[dict[str, Any]]:
+    """Return what is known of each catalog, and where it would be read from."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import locate
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.cli.console import print_json, print_table, say
+from starcat.cli.outputs import Replace, expect_free, to_file
+from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.calibration.learn import Learnt
@@ -20,14 +21,19 @@ app = typer.Typer()
 @app.command("learn")
 def learn_command(
     database: Annotated[
-        Path, typer.Argument(help="The folder <name>-<version> they were identified with.")
+        Path, opt.database("The folder <name>-<version> they were identified with.")
     ],
     results: Annotated[
         list[Path],
         typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
     ],
     output: Annotated[
-        Path | None, to_file("Where the section of a spec for a patch release goes (TOML).")
+        Path | None,
+        to_file("Where the section of a spec goes, or with --patch the spec of the patch (TOML)."),
+    ] = None,
+    patch: Annotated[
+        Path | None,
+        typer.Option(metavar="SPEC", help="Spec of the database: write its whole patch release."),
     ] = None,
     stars: Annotated[
         Path | None,
@@ -49,15 +55,25 @@ def learn_command(
 
     Example: starcat learn dist/gaia-12deg-1.0.0 answers.ndjson -o observed.toml
     """
-    from starcat.calibration.learn import content_of, learn_files, star_table, write_observed
+    from starcat.calibration.learn import (
+        content_of,
+        learn_files,
+        observed_toml,
+        patch_toml,
+        star_table,
+    )
     from starcat.exchange.formats import format_of
     from starcat.exchange.writers import write_batches
+    from starcat.storage.atomic import write_file
 
+    if patch is not None and output is None:
+        raise ConfigError("--patch needs a name for the new spec; give it with -o", key="output")
     form = None if stars is None else format_of(stars)
     expect_free(output, stars, replace=replace)
     found = learn_files(database, results, by_frame=by_frame, min_frames=min_frames)
     if output is not None:
-        write_observed(found, output)
+        text = observed_toml(found) if patch is None else patch_toml(found, patch)
+        write_file(output, text.encode())
     if stars is not None and form is not None:
         write_batches(star_table(found).to_reader(), stars, form)
     if json:
@@ -66,6 +82,8 @@ def learn_command(
         _print_learnt(found)
     for path in filter(None, (output, stars)):
         say(f"written: {path}")
+    if patch is not None:
+        say(f"go on with: starcat build {output}")
 
 
 def _print_learnt(found: Learnt) -> None:

@@ -24,6 +24,7 @@ from starcat.cli import (
     bands,
     builds,
     catalogs,
+    doctor,
     exchange,
     fetching,
     interrupts,
@@ -55,7 +56,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, fetching, bands, specs, builds, artifacts, sql, exchange),
-    *(releases, keys, matching, learning),
+    *(releases, keys, matching, learning, doctor),
 ):
     app.add_typer(part.app)
 add_commands(app)

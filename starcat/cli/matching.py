@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Folder = Annotated[Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")]
+Folder = Annotated[Path, opt.database()]
+FolderOrImage = Annotated[
+    Path, opt.database("The folder <name>-<version>, or an onboard image.", or_image=True)
+]
 FrameFiles = Annotated[
     list[str],
     typer.Argument(
@@ -117,7 +120,7 @@ def simulate_command(
 @app.command("identify", cls=OptionsInPanels)
 def identify_command(
     context: typer.Context,
-    artifact: Folder,
+    artifact: FolderOrImage,
     files: FrameFiles,
     method: opt.MethodName = None,
     camera: CameraFile = None,
@@ -252,7 +255,7 @@ def _print_file_answers(
 
 @app.command("calibrate")
 def calibrate_command(
-    artifact: Folder,
+    artifact: FolderOrImage,
     files: Annotated[
         list[str], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
     ],
@@ -318,7 +321,7 @@ def calibrate_command(
 
 @app.command("selftest")
 def selftest(
-    artifact: Folder,
+    artifact: FolderOrImage,
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     noise_px: opt.NoisePx = 0.5,

@@ -16,6 +16,38 @@ if TYPE_CHECKING:
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 
+def database(
+    what: str = "The folder <name>-<version>.", *, or_image: bool = False, name: str = "DATABASE"
+) -> Any:
+    """Return the argument of a command that opens a database, or an onboard image too."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and path.is_file() and not (or_image and path.suffix == ".img"):
+            _refuse_other_files(path)
+        return path
+
+    return typer.Argument(metavar=name, callback=check, help=what)
+
+
+def _refuse_other_files(path: Path) -> None:
+    from starcat.images.batch import CENTROID_SUFFIXES
+    from starcat.images.solve_files import IMAGE_SUFFIXES
+
+    kinds = {
+        "a picture": IMAGE_SUFFIXES,
+        "a file of centroids": CENTROID_SUFFIXES,
+        "a file of answers": (".ndjson",),
+        "a spec or a camera": (".toml",),
+        "an onboard image": (".img",),
+    }
+    for kind, suffixes in kinds.items():
+        if path.suffix.lower() in suffixes:
+            raise ConfigError(
+                f"{path} is {kind}; the database comes first: the folder <name>-<version> that "
+                "'starcat build' made"
+            )
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
     list[str] | None,

@@ -1,8 +1,8 @@
 """The one rule of ``-o``, for every command that writes.
 
-A command that makes one file takes the name of a file, and its suffix selects the format. A command
-that makes several files takes a folder. What exists is replaced with ``--replace`` only, and this is
-said before anything is computed.
+A command that makes one file takes the name of a file, and its suffix selects the format. A
+command that makes several files takes a folder. What exists is replaced with ``--replace`` only,
+and this is said before anything is computed.
 """
 
 from __future__ import annotations

@@ -168,9 +168,7 @@ def export_tables(
     return Exported(tables.name, file_format, folder, tuple(files), has_columns)
 
 
-def _check_asked(
-    file_format: str, folder: Path, products: Sequence[str], *, is_file: bool
-) -> None:
+def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_file: bool) -> None:
     """Refuse what cannot be done before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
@@ -188,7 +186,7 @@ def _check_asked(
     if is_file and len(products) != 1:
         raise ConfigError(
             f"{folder}: the name is that of one file, and there are {len(products)} products: "
-            f"{', '.join(products)}; choose one of them with products, or a folder without a suffix",
+            f"{', '.join(products)}; choose one of them with products, or a folder",
             key="output",
             fields=("products",),
         )

@@ -17,6 +17,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
+from starcat.geometry.camera import Camera
 from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
     Shrunk,
@@ -36,7 +37,6 @@ from starcat.onboard.patching import (
     signature_problems,
 )
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
-from starcat.geometry.camera import Camera
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
 from starcat.specs.camera_file import read_camera

@@ -35,7 +35,6 @@ from starcat.selection.merging import MERGED
 from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import sort_rows
-from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
