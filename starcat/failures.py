@@ -233,8 +233,9 @@ def hint_in(message: str) -> str | None:
 
 def _put_plainly(error: TyperException) -> None:
     """Have a refused option say what was typed and what was expected."""
-    if hasattr(error.__cause__, "errors"):
-        first = error.__cause__.errors()[0]
+    errors = getattr(error.__cause__, "errors", None)
+    if errors is not None:
+        first = errors()[0]
         error.message = f"found {str(first['input'])[:80]!r}; {expected_words(first)}"
 
 
