@@ -38,6 +38,7 @@ WALKED = [
     "docs/howto-query.md",
     "docs/howto-release.md",
     "docs/howto-own-catalog.md",
+    "docs/howto-new-release.md",
 ]
 
 

@@ -191,6 +191,15 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     _print_changes("Spec", found.spec)
     _print_changes("Sources", found.sources)
     _print_changes("Software", found.software)
+    print_table(
+        "Stars of both",
+        ("paired by", "stars"),
+        [
+            ("number", f"{found.paired_by_number:,}"),
+            ("position, motion and magnitude", f"{found.paired_by_position:,}"),
+        ],
+        numbers=(1,),
+    )
     one_sided = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
     _print_stars("came", found.came, one_sided)
     _print_stars("went", found.went, one_sided)
