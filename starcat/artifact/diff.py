@@ -113,8 +113,8 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
     n_numbered = int((_numbers(stars_a)[rows_a] == _numbers(stars_b)[rows_b]).sum())
     known_a, known_b = rejected_a, rejected_b
     if not is_numbered_alike:
-        known_a = _numbered_as(stars_b, rejected_a)
-        known_b = _numbered_as(stars_a, rejected_b)
+        known_a = _numbered_as(stars_b.take(_others(stars_b, rows_b)), rejected_a)
+        known_b = _numbered_as(stars_a.take(_others(stars_a, rows_a)), rejected_b)
     return Difference(
         spec=changes_between(_dotted(a.manifest["spec"]), _dotted(b.manifest["spec"])),
         sources=changes_between(_source_facts(a), _source_facts(b)),
@@ -152,6 +152,10 @@ def _common_rows(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np
     return rows_a, rows_b
 
 
+def _others(stars: pa.Table, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.setdiff1d(np.arange(len(stars)), rows)
+
+
 def _agree(a: pa.Table, b: pa.Table) -> bool:
     """Return whether stars of one number are near each other in two databases."""
     rows_a, rows_b = _common_rows(a, b)
@@ -164,10 +168,7 @@ def _paired_rows(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the rows of the stars of both: by number if that holds, the others by position."""
     numbered = _common_rows(a, b) if is_numbered_alike else (_NO_ROWS, _NO_ROWS)
-    left_a, left_b = (
-        np.setdiff1d(np.arange(len(table)), rows)
-        for table, rows in zip((a, b), numbered, strict=True)
-    )
+    left_a, left_b = _others(a, numbered[0]), _others(b, numbered[1])
     placed = _rows_by_position(a.take(left_a), b.take(left_b))
     return np.append(numbered[0], left_a[placed[0]]), np.append(numbered[1], left_b[placed[1]])
 
@@ -188,6 +189,8 @@ def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
     """Return the rejected rows that are stars of another catalog, with the numbers of those."""
     is_placed = np.isfinite([floats_of(rejected, name) for name in ("ra_deg", "epoch_jyear")])
     placed = rejected.filter(pa.array(is_placed.all(axis=0)))
+    for name in sorted({*NEEDED} - {*placed.column_names}):  # rejected stars have no motions
+        placed = placed.append_column(name, pa.nulls(len(placed), pa.float64()))
     rows, known = _rows_by_position(stars, placed)
     number = placed.column_names.index("star_id")
     return placed.take(known).set_column(number, "star_id", stars["star_id"].take(rows))
