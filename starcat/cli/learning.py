@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,8 +25,11 @@ def learn_command(
         Path, opt.database("The folder <name>-<version> they were identified with.")
     ],
     results: Annotated[
-        list[Path],
-        typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
+        list[str],
+        typer.Argument(
+            metavar="RESULTS...",
+            help="What 'starcat identify --ndjson' printed: files, folders of *.ndjson, patterns.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -70,7 +74,7 @@ def learn_command(
         raise ConfigError("--patch needs a name for the new spec; give it with -o", key="output")
     form = None if stars is None else format_of(stars)
     expect_free(output, stars, replace=replace)
-    found = learn_files(database, results, by_frame=by_frame, min_frames=min_frames)
+    found = learn_files(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
     if output is not None:
         text = observed_toml(found) if patch is None else patch_toml(found, patch)
         write_file(output, text.encode())
@@ -84,6 +88,18 @@ def learn_command(
         say(f"written: {path}")
     if patch is not None:
         say(f"go on with: starcat build {output}")
+
+
+def _files_of(given: list[str]) -> list[Path]:
+    """Return the files that names, folders and patterns stand for."""
+    files: list[Path] = []
+    for text in given:
+        pattern = f"{glob.escape(text)}/*.ndjson" if Path(text).is_dir() else text
+        found = [Path(name) for name in sorted(glob.glob(pattern))]
+        if not found and Path(text).is_dir():
+            raise ConfigError(f"{text}: no file *.ndjson is in this folder")
+        files += found or [Path(text)]
+    return files
 
 
 def _print_learnt(found: Learnt) -> None:

@@ -119,7 +119,11 @@ def init_command(
         ),
     ] = None,
     response: Annotated[
-        str | None, typer.Option(help="Response of the sensor, as 'starcat bands' lists them.")
+        str | None,
+        typer.Option(help="Response of the sensor, as 'starcat bands' lists them, or a CSV file."),
+    ] = None,
+    per: Annotated[
+        str | None, typer.Option(help="What a CSV file is relative to: photon or energy.")
     ] = None,
     sensor: Annotated[
         Path | None,
@@ -143,22 +147,26 @@ def init_command(
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
-        camera = with_sensor(camera, response, sensor)
+        camera = with_sensor(camera, response, sensor, per)
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
 
 
-def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -> CameraSpec:
+def with_sensor(
+    camera: CameraSpec, response: str | None, sensor: Path | None, per: str | None = None
+) -> CameraSpec:
     """Return a camera with the band of its sensor, and with the light and noise of a frame."""
     if response is None and sensor is None:
         return camera
     from starcat.bands.response import shipped
-    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse
+    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse, response_of_file
     from starcat.specs.star_sensor import read_sensor
 
     content = camera.model_dump()
-    if response is not None:
+    if response is not None and Path(response).is_file():
+        content["response"] = response_of_file(Path(response), {"per": per})
+    elif response is not None:
         shipped(response)
         content["response"] = CameraResponse(name=response).model_dump()
     if sensor is not None:

@@ -61,23 +61,20 @@ def c_camera(name: str, camera: Camera) -> str:
         "fold_radius": 0.0 if lens.is_none else lens.fold_radius,
     }
     lines = [f"    (starcat_real){float(value)!r}, /* {key} */" for key, value in values.items()]
-    return "\n".join(
-        [
-            f"/* The calibrated camera for {name}: camera = {symbol};",
-            " * after, or in place of, starcat_get_camera(&image, &camera). */",
-            f"#ifndef {symbol.upper()}_H",
-            f"#define {symbol.upper()}_H",
-            "",
-            '#include "starcat.h"',
-            "",
-            f"static const starcat_camera {symbol} = {{",
-            *lines,
-            "};",
-            "",
-            "#endif",
-            "",
-        ]
-    )
+    numbers = "\n".join(lines)
+    return f"""\
+/* The calibrated camera for {name}, in place of that of starcat_get_camera: camera = {symbol}; */
+#ifndef {symbol.upper()}_H
+#define {symbol.upper()}_H
+
+#include "starcat.h"
+
+static const starcat_camera {symbol} = {{
+{numbers}
+}};
+
+#endif
+"""
 
 
 def c_source(name: str, data: bytes, byte_order: ByteOrder, header_name: str) -> str:
