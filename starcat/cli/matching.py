@@ -29,7 +29,7 @@ FrameFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="INPUT...",
-        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP), "
+        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP, raw), "
         "folders of them, or patterns in quotes ('night/*.jpg').",
     ),
 ]

@@ -32,9 +32,10 @@ def database(
 def _refuse_other_files(path: Path) -> None:
     from starcat.images.batch import CENTROID_SUFFIXES
     from starcat.images.solve_files import IMAGE_SUFFIXES
+    from starcat.storage.file_formats import RAW_MAKERS
 
     kinds = {
-        "a picture": IMAGE_SUFFIXES,
+        "a picture": (*IMAGE_SUFFIXES, *RAW_MAKERS),
         "a file of centroids": CENTROID_SUFFIXES,
         "a file of answers": (".ndjson",),
         "a spec or a camera": (".toml",),
