@@ -85,6 +85,7 @@ SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
 PATTERN_WORDS = {
     NAME_PATTERN: "1 to 64 lower-case letters, digits and '-', such as gaia-12deg",
     SOURCE_NAME: "1 to 64 letters, digits, '_' and '-', such as gaia",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in lower case",
     VERSION_PATTERN: "MAJOR.MINOR.PATCH, such as 1.0.1",
 }
 """What texts look like that match a pattern, for messages."""

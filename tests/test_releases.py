@@ -160,7 +160,7 @@ def test_tables_fit(registry, starcat, artifact_version):
         (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
         (
             ["pull", "small@1.0.0", "--registry", "registry"],
-            "pulled: dist/small-1.0.0; nothing is signed in this registry",
+            "pulled: dist/small-1.0.0; this registry has no signatures",
         ),
         (["pull", "--locked"], "unchanged: dist/small-1.0.0"),
         (["releases", "registry"], ""),

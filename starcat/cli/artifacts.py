@@ -42,7 +42,7 @@ def inspect(
     ],
     json: Json = False,
 ) -> None:
-    """Say what a database or an onboard image holds and what it was made from.
+    """Show what a database or an onboard image holds and what it was made from.
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
@@ -66,7 +66,7 @@ def coverage_command(
     replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Say how many stars, pairs and triangles the fields of a database hold.
+    """Show how many stars, pairs and triangles the fields of a database hold.
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
@@ -129,7 +129,7 @@ def diff_command(
     b: Annotated[Path, database("The later one's.", name="B")],
     json: Json = False,
 ) -> None:
-    """Say what differs between two databases: spec, sources, stars and why, products.
+    """Show what differs between two databases: spec, sources, stars and why, products.
 
     Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
     """

@@ -70,7 +70,7 @@ def build_command(
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Only say what each stage would do, and which files it would read."
+            "--explain", help="Only print what each stage would do, and which files it would read."
         ),
     ] = False,
     json: Json = False,
@@ -289,7 +289,7 @@ def print_coverage_table(report: CoverageReport) -> None:
     columns = {
         "in a field": "{0[0]}",
         "fewest": "{0[1].minimum:,}",
-        "1 %": "{0[1].one_percent:,}",
+        "1 % have at most": "{0[1].one_percent:,}",
         "median": "{0[1].median:,}",
         "mean": "{0[1].mean:,.1f}",
         "most": "{0[1].maximum:,}",

@@ -29,7 +29,7 @@ def sources(
     ] = None,
     check: Annotated[
         Path | None,
-        typer.Option(metavar="MAP.toml", help="Say what this map makes of the table FILE."),
+        typer.Option(metavar="MAP.toml", help="Show what this map makes of the table FILE."),
     ] = None,
     draft: Annotated[
         bool, typer.Option("--draft", help="Propose a map for the table FILE.")

@@ -87,7 +87,7 @@ Scheduler = Annotated[
 ]
 FieldRange = Annotated[
     str | None,
-    typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
+    typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
 ]
 Time = Annotated[
     str | None,
@@ -106,11 +106,14 @@ FrameSize = Annotated[
     typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
 ]
 FovError = Annotated[
-    str | None, typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5%.")
+    str | None,
+    typer.Option(metavar="2%", help="How far the field of view may be off; default: 5%."),
 ]
 MinShare = Annotated[
     float | None,
-    typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
+    typer.Option(
+        min=0, max=1, help="Smallest fraction of the centroids to be identified; default: a third."
+    ),
 ]
 MaxSteps = Annotated[
     int | None,

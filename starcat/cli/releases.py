@@ -25,7 +25,7 @@ Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an ad
 SIGNED = {
     "checked": "; signed by keys that you trust",
     "unchecked": "; signed, but not checked: name a key that you trust with --trust",
-    "unsigned": "; nothing is signed in this registry",
+    "unsigned": "; this registry has no signatures",
     "pinned": "",
 }
 """What is said of the signatures of what was pulled."""

@@ -84,7 +84,7 @@ def estimate_command(
     sources: OwnSources = None,
     json: Json = False,
 ) -> None:
-    """Say what a spec will give without building it: guide stars, fields, files, time, memory.
+    """Print what a spec will give without building it: guide stars, fields, files, time, memory.
 
     Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
     """
@@ -134,7 +134,7 @@ def init_command(
     replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Write a build spec for a camera, every key explained, and say how many stars a field has.
+    """Write a build spec for a camera, every key explained, and print how many stars a field has.
 
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
@@ -211,7 +211,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",
         "guide stars": "{0[2].guide_stars:,}",
         "fewest": "{0[2].stars.minimum:,}",
-        "1 %": "{0[2].stars.one_percent:,}",
+        "1 % have at most": "{0[2].stars.one_percent:,}",
         "median": "{0[2].stars.median:,}",
         "most": "{0[2].stars.maximum:,}",
     }
@@ -224,8 +224,8 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
         f"{thinned.stars.median:,} in the middle one."
-        "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
-        f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
+        f"\nA frame needs 4 stars. Choose the limit where 99 of 100 fields have {ENOUGH_STARS} or "
+        "more: enough\nremain when a few are missed, and the database stays small."
     )
     warn(figures.advice)
     say(figures.in_words)
