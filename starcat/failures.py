@@ -181,6 +181,8 @@ def expected_words(error: Mapping[str, Any]) -> str:
     "expected 'csv' or 'fits'"
     """
     kind, context = error["type"], error.get("ctx", {})
+    if kind == "missing":
+        return kind
     if kind == "string_pattern_mismatch":
         from starcat.sections import PATTERN_WORDS
 

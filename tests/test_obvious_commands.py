@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import http.server
 import json
+import re
 import shutil
 import subprocess
 import threading
@@ -16,6 +17,7 @@ import pytest
 from astropy.table import Table
 from every_command import every_command
 
+import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
 from starcat.releases.metadata import read_signing
 from starcat.releases.publishing import publish_artifact
@@ -291,3 +293,13 @@ def test_init_takes_a_response_of_a_file(starcat, tmp_path):
     assert ran.code == 0, ran.err
     written = tomllib.loads((tmp_path / "cam.toml").read_text())
     assert written["camera"]["response"]["wavelength_nm"][0] == 400.0
+
+
+def test_every_pattern_that_a_message_may_be_about_has_words():
+    """A pattern without words would say no more than that other characters were expected."""
+    from starcat.sections import PATTERN_WORDS
+
+    text = "".join(path.read_text() for path in Path(starcat_package.__file__).parent.rglob("*.py"))
+    written = set(re.findall(r'pattern=r"([^"]+)"', text))
+    assert written
+    assert written <= set(PATTERN_WORDS)
