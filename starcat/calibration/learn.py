@@ -628,6 +628,12 @@ def star_table(learnt: Learnt) -> pa.Table:
     return pa.table(columns)
 
 
+def _colour_stars(learnt: Learnt) -> int:
+    """Return how many stars have a measured magnitude and a colour."""
+    measured = np.isfinite(learnt.lesson.records.observed_mag)
+    return int(np.count_nonzero(measured & np.isfinite(learnt.stars.colour)))
+
+
 def content_of(learnt: Learnt) -> dict[str, Any]:
     """Return all of it as JSON has it."""
     lesson, terms = learnt.lesson, learnt.lesson.terms
@@ -642,6 +648,7 @@ def content_of(learnt: Learnt) -> dict[str, Any]:
         "colour_bands": learnt.colour_bands,
         "colour_term": terms.colour_term,
         "colour_term_error": terms.colour_term_error,
+        "colour_stars": _colour_stars(learnt),
         "limit_mag": limit if math.isfinite(limit) else None,
         "noise_mag": float(np.median(lesson.mag_noise.sigma)),
         "star_scatter_mag": lesson.mag_noise.of_stars,

@@ -108,7 +108,7 @@ def _print_learnt(found: Learnt) -> None:
     told, lesson = content_of(found), found.lesson
     rows = [_term("zero point, mag", told["zero_point_mag"], told["zero_point_error_mag"])]
     if told["colour_term"] is not None:
-        name = f"colour term, {told['colour_bands']}"
+        name = f"colour term, {told['colour_bands']}, of {told['colour_stars']:,} stars"
         rows.append(_term(name, told["colour_term"], told["colour_term_error"]))
     rows += [
         ("noise of a magnitude, mag", f"{told['noise_mag']:.3f}", ""),
