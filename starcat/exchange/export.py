@@ -190,13 +190,12 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
             key="output",
             fields=("products",),
         )
-    if is_file and folder.is_dir():
+    if folder.exists() and folder.is_dir() == is_file:
+        found, wanted = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"{folder}: is a folder; choose a file with output", path=folder, fields=("output",)
-        )
-    if folder.exists() and not (is_file or folder.is_dir()):
-        raise OutputError(
-            f"{folder}: is a file; choose a folder with output", path=folder, fields=("output",)
+            f"{folder}: is a {found}; choose a {wanted} with output",
+            path=folder,
+            fields=("output",),
         )
 
 

@@ -17,21 +17,10 @@ from starcat.releases.tree import INDEX_NAME
 def verify_registry(
     text: str, trust: Path | None = None, progress: Progress = no_progress
 ) -> Verification:
-    """Check all releases of a registry: files, databases and signatures.
+    """Check files, databases and signatures of all releases, in a folder or at an address.
 
-    Parameters
-    ----------
-    text : str
-        Folder or http(s) address of the registry.
-    trust : Path, optional
-        Public key, or root, that has to have signed every release. It is remembered, as by a pull.
-    progress : Progress, optional
-        Called with the bytes of each release.
-
-    Returns
-    -------
-    Verification
-        A finding names the release that it is about as its product.
+    ``trust`` is a public key, or a root, that has to have signed them; it is remembered, as by a
+    pull. A finding has the release that it is about as its product.
     """
     registry, findings = open_registry(text), []
     listed = registry.releases()
