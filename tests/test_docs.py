@@ -39,6 +39,7 @@ WALKED = [
     "docs/howto-query.md",
     "docs/howto-release.md",
     "docs/howto-own-catalog.md",
+    "docs/howto-new-release.md",
 ]
 
 

@@ -219,7 +219,7 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     observed = tomllib.loads(section.read_text())["selection"]["observed"]
     assert observed["zero_point_mag"] == pytest.approx(0.2, abs=0.02)
     assert observed["database"] == "small-1.0.0"
-    told_json = json.loads(starcat([*command, "--json"]).out)
+    told_json = json.loads(starcat([*command, "--json", "--replace"]).out)
     assert sorted(one["star_id"] for one in told_json["distrusted"]) == sorted(
         map(str, observed["reject"])
     )

@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 
 OPTIONS_OF_EXPORT = (
     "products", "max_partition_rows", "profile", "method", "endian", "max_bytes", "patch_from",
-    "sign", "replace",
+    "sign", "camera", "replace",
 )  # fmt: skip
 """Options of `export`; each format has some of them."""
 
@@ -505,8 +505,8 @@ def export(
         A folder for tables, by default ``export``, or for a solver's files; the file of an image.
     **options
         ``products``, ``replace``, ``max_partition_rows`` for tables; ``profile`` (full or small),
-        ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys)
-        for an image; ``replace`` for a solver.
+        ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of
+        keys), ``camera`` (a file) for an image; ``replace`` for a solver.
 
     Returns
     -------

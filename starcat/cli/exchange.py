@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_facts, print_table, print_things, say, show
-from starcat.cli.options import Json, to_either
+from starcat.cli.options import Json
+from starcat.cli.outputs import Replace, to_either
 from starcat.errors import ConfigError
-from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
+from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS, suffix_format
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
 from starcat.onboard.profiles import PROFILES
 
@@ -28,12 +29,13 @@ SourcePath = Annotated[
     Path | None, typer.Argument(metavar="SOURCE", help="A database's folder, or a Parquet file.")
 ]
 FormatName = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--to",
         "--format",
         metavar="FORMAT",
-        help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
+        help="Default: as the suffix of --output says, or csv. "
+        f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
         f"{' or '.join(ONBOARD_FORMATS)} for flight software; for other solvers "
         f"{', '.join(SOLVER_FORMATS[:-1])} or {SOLVER_FORMATS[-1]}.",
     ),
@@ -41,9 +43,9 @@ FormatName = Annotated[
 OutputPath = Annotated[
     Path | None,
     to_either(
-        "Where the result goes: the folder of one file a product, default: export; for onboard and "
-        "c the file, default: <name>-<version>.img or .c; for other solvers the folder, default: "
-        "<name>-<version>-<format>."
+        "Where the result goes: with a suffix the file of one product, else the folder of all, "
+        "default: export; for onboard and c the file, default: <name>-<version>.img or .c; for "
+        "other solvers the folder, default: <name>-<version>-<format>."
     ),
 ]
 MaxPartitionRows = Annotated[
@@ -73,17 +75,25 @@ PatchFrom = Annotated[
     Path | None,
     typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
 ]
+CameraToC = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        metavar="camera.toml",
+        help="onboard, c: calibrated camera; written for C beside the image, as *_camera.h.",
+    ),
+]
 
 
 @app.command("export")
 def export_command(
     source: SourcePath = None,
-    form: FormatName = "csv",
+    form: FormatName = None,
     output: OutputPath = None,
     product: Annotated[
         list[str] | None, typer.Option(help="Product of a database; default: all. Repeatable.")
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
+    replace: Replace = False,
     max_partition_rows: MaxPartitionRows = None,
     profile: ProfileName = None,
     method: Method = None,
@@ -91,6 +101,7 @@ def export_command(
     max_bytes: MaxBytes = None,
     patch_from: PatchFrom = None,
     sign: Sign = None,
+    camera: CameraToC = None,
     json: Json = False,
 ) -> None:
     """Write tables for other tools, an image for flight software, or other solvers' databases.
@@ -104,7 +115,9 @@ def export_command(
         "max_bytes": max_bytes,
         "patch_from": patch_from,
         "sign": sign,
+        "camera": camera,
     }
+    form = form or _form_of(output)
     of_tables: dict[str, object] = {"product": product}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
@@ -130,6 +143,14 @@ def export_command(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _form_of(output: Path | None) -> str:
+    """Return the format that an output's suffix selects; csv without one."""
+    if output is None:
+        return "csv"
+    own = {".img": "onboard", ".c": "c"}
+    return own.get(output.suffix.lower()) or suffix_format(output) or "csv"
 
 
 def _for_flight(

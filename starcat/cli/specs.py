@@ -30,6 +30,7 @@ from starcat.cli.options import (
     field_range,
     inputs_by_source,
 )
+from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def estimate_command(
     sources: OwnSources = None,
     json: Json = False,
 ) -> None:
-    """Say what a spec will give without building it: guide stars, fields, files, time, memory.
+    """Print what a spec will give without building it: guide stars, fields, files, time, memory.
 
     Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
     """
@@ -118,7 +119,11 @@ def init_command(
         ),
     ] = None,
     response: Annotated[
-        str | None, typer.Option(help="Response of the sensor, as 'starcat bands' lists them.")
+        str | None,
+        typer.Option(help="Response of the sensor, as 'starcat bands' lists them, or a CSV file."),
+    ] = None,
+    per: Annotated[
+        str | None, typer.Option(help="What a CSV file is relative to: photon or energy.")
     ] = None,
     sensor: Annotated[
         Path | None,
@@ -126,12 +131,10 @@ def init_command(
             metavar="FILE", help="Star sensor (TOML) as for 'evaluate --ecss': its limit."
         ),
     ] = None,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a file of that name.")
-    ] = False,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Write a build spec for a camera, every key explained, and say how many stars a field has.
+    """Write a build spec for a camera, every key explained, and print how many stars a field has.
 
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
@@ -144,22 +147,26 @@ def init_command(
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
-        camera = with_sensor(camera, response, sensor)
+        camera = with_sensor(camera, response, sensor, per)
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
 
 
-def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -> CameraSpec:
+def with_sensor(
+    camera: CameraSpec, response: str | None, sensor: Path | None, per: str | None = None
+) -> CameraSpec:
     """Return a camera with the band of its sensor, and with the light and noise of a frame."""
     if response is None and sensor is None:
         return camera
     from starcat.bands.response import shipped
-    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse
+    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse, response_of_file
     from starcat.specs.star_sensor import read_sensor
 
     content = camera.model_dump()
-    if response is not None:
+    if response is not None and Path(response).is_file():
+        content["response"] = response_of_file(Path(response), {"per": per})
+    elif response is not None:
         shipped(response)
         content["response"] = CameraResponse(name=response).model_dump()
     if sensor is not None:
@@ -204,7 +211,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",
         "guide stars": "{0[2].guide_stars:,}",
         "fewest": "{0[2].stars.minimum:,}",
-        "1 %": "{0[2].stars.one_percent:,}",
+        "1 % have at most": "{0[2].stars.one_percent:,}",
         "median": "{0[2].stars.median:,}",
         "most": "{0[2].stars.maximum:,}",
     }
@@ -217,8 +224,8 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
         f"{thinned.stars.median:,} in the middle one."
-        "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
-        f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
+        f"\nA frame needs 4 stars. Choose the limit where 99 of 100 fields have {ENOUGH_STARS} or "
+        "more: enough\nremain when a few are missed, and the database stays small."
     )
     warn(figures.advice)
     say(figures.in_words)

@@ -17,7 +17,8 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
-from starcat.onboard.c_source import c_header, c_source
+from starcat.geometry.camera import Camera
+from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
     Shrunk,
     artifact_problems,
@@ -40,6 +41,7 @@ from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_im
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
 from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
+from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
@@ -117,11 +119,13 @@ def export_image(
     patch_from: Path | None = None,
     replace: bool = False,
     sign: Sequence[Path] = (),
+    camera: Path | None = None,
 ) -> ExportedImage:
     """Write the onboard image of a database, signed with the keys of some files.
 
     A profile is a name of `PROFILES`; the method is the profile's default unless one is given.
-    With `patch_from`, an older image, the patch that makes the new one of it is beside it.
+    With `patch_from`, an older image, the patch that makes the new one of it is beside it. With
+    `camera`, a camera file, a header with this camera for the library is beside it.
     """
     kept = profile_named("full" if profile is None else profile)
     method = method_of("full" if profile is None else profile, method)
@@ -150,6 +154,7 @@ def export_image(
             key="patch_from",
             fields=("patch_from", "form"),
         )
+    own_camera = None if camera is None else read_camera(Path(camera))
     old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
         raise OutputError(
@@ -157,6 +162,8 @@ def export_image(
         )
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
+    if own_camera is not None:
+        _check_camera(own_camera, contents.camera, Path(str(camera)))
     room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
     fields = partial(_fields, opened)
     fitted = shrink(contents, _times_seen(opened, method), fields, room, kept)
@@ -168,6 +175,9 @@ def export_image(
     patch = None if old is None else _checked_patch(old, read_onboard_image(made.data))
     if patch is not None:
         files[target.with_suffix(".patch")] = patch
+    if own_camera is not None:
+        text = c_camera(fitted.contents.name, own_camera)
+        files[target.with_name(f"{target.stem}_camera.h")] = text.encode()
     _write(files, replace=replace)
     signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
     size = None if patch is None else len(patch)
@@ -175,6 +185,16 @@ def export_image(
     return ExportedImage(
         made, fitted, file_format, order, paths, contents, profile, signed_by, size
     )
+
+
+def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
+    size_px, expected_px = ((one.width_px, one.height_px) for one in (camera, built_for))
+    if size_px != expected_px:
+        raise ConfigError(
+            f"{path}: a camera of {size_px[0]} x {size_px[1]} px; the database is for "
+            f"{expected_px[0]} x {expected_px[1]} px. Give the camera that was calibrated with it",
+            key="camera",
+        )
 
 
 def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:

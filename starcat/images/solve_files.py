@@ -40,6 +40,7 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
+from starcat.storage.file_formats import RAW_MAKERS
 
 if TYPE_CHECKING:
     from starcat.images.centroiding import Spots
@@ -473,7 +474,7 @@ def measure_picture(
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
+    if path.suffix.lower() not in (*IMAGE_SUFFIXES, *RAW_MAKERS):
         return MeasuredFile(read_centroid_files(path))
     from starcat.images.centroiding import find_spots
 

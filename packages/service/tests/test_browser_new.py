@@ -130,7 +130,7 @@ def test_nothing_wrong_can_be_built(page):
     assert build.is_enabled()
     fill(page, "Faint limit mag", "99")
     assert build.is_disabled()
-    assert "less than or equal to 40" in page.locator("#summary").inner_text()
+    assert "at most 40" in page.locator("#summary").inner_text()
     fill(page, "Faint limit mag", "-29")  # no star is that bright: what the build would say
     assert build.is_disabled()
     fill(page, "Faint limit mag", "5")
