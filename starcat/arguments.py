@@ -24,7 +24,7 @@ FLOAT64 = np.dtype(np.float64)
 # Units by the ends of parameter names; the longer end comes first, as "_km_s" ends with "_s".
 UNITS = {
     "_km_s": "km / s", "_km": "km", "_arcsec": "arcsec", "_mas": "mas", "_deg": "deg",
-    "_rad": "rad", "_px": "pix", "_mag": "mag", "magnitudes": "mag", "mag": "mag", "_s": "s",
+    "_rad": "rad", "_px": "pix", "mag": "mag", "_s": "s",
 }  # fmt: skip
 
 

@@ -37,13 +37,13 @@ def test_a_unit_is_converted_or_refused(matcher, frame):
     assert np.allclose(found.position_au, expected.position_au, rtol=1e-15)
     assert np.allclose(found.velocity_km_s, expected.velocity_km_s, rtol=1e-14)
     px = frame.centroids_px
-    same = matcher.identify(px * u.pix, magnitudes=frame.mag * u.mag)
+    same = matcher.identify(px * u.pix, mag=frame.mag * u.mag)
     assert same.star_index.tolist() == matcher.identify(px).star_index.tolist()
     refused = [
         lambda: matcher.identify(px * u.deg),
         lambda: matcher.identify_many([px, px * u.deg]),
         lambda: matcher.identify([[1.0 * u.deg, 2.0 * u.deg]]),
-        lambda: matcher.identify(px, magnitudes=frame.mag * u.Jy),
+        lambda: matcher.identify(px, mag=frame.mag * u.Jy),
         lambda: matcher.identify(px, sigma_px=np.ones(len(px)) * u.arcsec),
         lambda: matcher.identify(px, prior=np.ones(4) * u.m, prior_error_deg=1.0),
         lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.deg),
@@ -60,13 +60,13 @@ def test_masked_entries_are_not_used(matcher, frame):
     px = np.ma.array(frame.centroids_px, mask=False)
     px[0] = np.ma.masked
     mag = MaskedColumn(frame.mag, unit="mag", mask=np.arange(len(frame.mag)) == 1)
-    found = matcher.identify(px, magnitudes=mag)
+    found = matcher.identify(px, mag=mag)
     assert found.ok
     assert found.star_index[0] == -1
     assert found.dropped == ((0, "not_finite"),)
     assert matcher.identify_many([px])[0].dropped == ((0, "not_finite"),)
-    assert np.isnan(numbers_of("magnitudes", mag, "(N,)")[1])
-    assert np.isnan(numbers_of("magnitudes", [3.0, None], "(N,)")[1])
+    assert np.isnan(numbers_of("mag", mag, "(N,)")[1])
+    assert np.isnan(numbers_of("mag", [3.0, None], "(N,)")[1])
 
 
 @pytest.mark.parametrize(
@@ -90,11 +90,11 @@ def test_tables_are_read_by_the_names_of_their_columns(matcher, frame):
         pandas.DataFrame(columns),
         np.rec.fromarrays(list(columns.values()), names=list(columns)),
     ]
-    expected = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    expected = matcher.identify(frame.centroids_px, mag=frame.mag)
     for table in tables:
         found = matcher.identify(table)
         assert found.star_index.tolist() == expected.star_index.tolist()
-        assert found.frame.magnitudes.tolist() == frame.mag.tolist()
+        assert found.frame.mag.tolist() == frame.mag.tolist()
     many = matcher.identify_many(tables)
     assert [one.star_index.tolist() for one in many] == [expected.star_index.tolist()] * len(tables)
     for lacking in (Table({"x": x, "y_px": y}), pandas.DataFrame({"x": x, "y": y})):
@@ -140,7 +140,7 @@ WRONG = [
     lambda db: starcat.Matcher.open(db).identify_many(Other()),
     lambda db: starcat.Matcher.open(db).identify_many(iter([Other()])),
     lambda db: starcat.Matcher.open(db).identify_many([], threads=0),
-    lambda db: starcat.Matcher.open(db).identify_many([], magnitudes=3.0),
+    lambda db: starcat.Matcher.open(db).identify_many([], mag=3.0),
     lambda db: starcat.Observer.at(Other()),
     lambda db: starcat.Observer.at(TIME, position_km=Other()),
     lambda db: starcat.build(Other()),

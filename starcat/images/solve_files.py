@@ -325,7 +325,7 @@ class FileAnswers:
         def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
             identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
             if observer is None:
-                return identify(frame.centroids_px, magnitudes=frame.mag)
+                return identify(frame.centroids_px, mag=frame.mag)
             from starcat.sky.in_time import identify_in_time
 
             return identify_in_time(
@@ -334,7 +334,7 @@ class FileAnswers:
                 frame.centroids_px,
                 camera,
                 observer,
-                magnitudes=frame.mag,
+                mag=frame.mag,
                 tolerance_px=matcher.tolerance_px,
                 max_false_match_probability=matcher.max_false_match_probability,
             )

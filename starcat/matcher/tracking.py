@@ -20,6 +20,7 @@ from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import FrameLike
 from starcat.matcher.prior import WIDEST_PRIOR_DEG, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
 
@@ -97,10 +98,10 @@ class Tracker:
 
     def identify(
         self,
-        centroids_px: ArrayLike,
+        centroids_px: FrameLike,
         camera: Camera | None = None,
         *,
-        magnitudes: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
         prior: ArrayLike | None = None,
@@ -111,7 +112,7 @@ class Tracker:
 
         Parameters
         ----------
-        centroids_px, camera, magnitudes, sigma_px, fov_error, prior, prior_error_deg
+        centroids_px, camera, mag, sigma_px, fov_error, prior, prior_error_deg
             As for `Matcher.identify`; a prior, of a gyroscope for example, takes the place of the
             prediction.
         time_s : float, optional
@@ -130,7 +131,7 @@ class Tracker:
             As `Matcher.identify`, or if the time is no later than the one before.
         """
         found = self.attempt(
-            centroids_px, camera, magnitudes=magnitudes, sigma_px=sigma_px, fov_error=fov_error,
+            centroids_px, camera, mag=mag, sigma_px=sigma_px, fov_error=fov_error,
             prior=prior, prior_error_deg=prior_error_deg, time_s=time_s,
         )  # fmt: skip
         self.record(found, camera, time_s=time_s)
@@ -138,10 +139,10 @@ class Tracker:
 
     def attempt(
         self,
-        centroids_px: ArrayLike,
+        centroids_px: FrameLike,
         camera: Camera | None = None,
         *,
-        magnitudes: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
         prior: ArrayLike | None = None,
@@ -158,7 +159,7 @@ class Tracker:
         expected, error_deg = prior, prior_error_deg
         if expected is None and error_deg is None:
             expected, error_deg = self._predicted(now, camera)
-        beside: dict[str, Any] = {"magnitudes": magnitudes, "sigma_px": sigma_px}
+        beside: dict[str, Any] = {"mag": mag, "sigma_px": sigma_px}
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
@@ -193,7 +194,7 @@ class Tracker:
             )
         )
 
-    def follow(self, frames: Iterable[ArrayLike]) -> Iterator[MatchResult]:
+    def follow(self, frames: Iterable[FrameLike]) -> Iterator[MatchResult]:
         """Identify frames one after the other, each when its answer is asked for.
 
         Parameters
