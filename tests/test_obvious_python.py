@@ -1,4 +1,4 @@
-"""What a user of Python tries first: results, frames, tables and seeds as other libraries have them."""
+"""What a user of Python tries first: frames, results, tables, units and seeds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def frames(small_artifact):
 @pytest.fixture(scope="module")
 def dark(matcher):
     """The result of a frame that is not identified."""
-    return matcher.identify([[1.0, 2.0], [30.0, 40.0], [500.0, 60.0], [70.0, 800.0]])
+    return matcher.identify([[1.0, 2.0], [30.0, 40.0], [500.0, 60.0], [70.0, 400.0]])
 
 
 @pytest.fixture(scope="module")

@@ -363,13 +363,14 @@ def simulate(
     false_stars : int, default 0
         Centroids that are no stars, in each frame.
     seed : int, default 0
-        The same seed gives the same frames.
+        The same seed gives the same frames: the first ones are the same for any ``count``, and
+        ``starcat simulate --seed`` writes the first one.
 
     Returns
     -------
-    list of Frame
-        ``centroids_px`` of shape (N, 2) and ``mag`` of shape (N,) to identify; ``matrix`` (body
-        from ICRS) and ``star_index`` are the truth.
+    list of SimulatedFrame
+        Each is a frame for `Matcher.identify`, with ``centroids_px`` of shape (N, 2) and ``mag`` of
+        shape (N,); ``matrix`` (body from ICRS) and ``star_index`` are the truth.
 
     Raises
     ------
@@ -379,9 +380,9 @@ def simulate(
     from starcat.geometry.distortion import checked_number
     from starcat.matcher.database import as_database
     from starcat.matcher.settings import in_range
-    from starcat.simulation.simulate import Noise, simulate_frames
+    from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
-    sky = as_database("database", database)
+    known = as_database("database", database)
     for name, value in (("noise_px", noise_px), ("noise_mag", noise_mag)):
         if checked_number(name, value) < 0.0:
             text = f"{name} is {value!r}; expected a finite number, 0 or larger"
@@ -389,8 +390,9 @@ def simulate(
     in_range("drop_probability", drop_probability, 1.0, with_zero=True)
     false = whole_number("false_stars", false_stars, 0)
     noise = Noise(noise_px, drop_probability, false, noise_mag=noise_mag)
-    frames = whole_number("count", count, 0), noise, whole_number("seed", seed, 0)
-    return list(simulate_frames(sky.directions, sky.camera, *frames, mag=sky.mag))
+    sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
+    seed = whole_number("seed", seed, 0)
+    return list(simulate_sequence(sky, known.camera, frames, noise, seed))
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:
