@@ -72,7 +72,7 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
         return values
     mask = getattr(values, "mask", None)  # of a pandas column, a method
-    plain = _in_unit(name, values)
+    plain = without_unit(name, values)
     try:
         raw = np.asarray(plain)
         if raw.dtype.kind == "O":
@@ -103,8 +103,20 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _in_unit(name: str, values: Any) -> Any:
-    """Return values without their unit, converted to that of the parameter."""
+def without_unit(name: str, values: Any) -> Any:
+    """Return a number or numbers without their unit, converted to the unit of the parameter.
+
+    Raises
+    ------
+    ConfigError
+        If the unit cannot be converted.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> without_unit("fov_x_deg", 30.0 * u.arcmin), without_unit("fov_x_deg", 0.5)
+    (0.5, 0.5)
+    """
     unit = getattr(values, "unit", None)
     if unit is None:
         unit = getattr(values, "units", None)  # as other libraries of units have it

@@ -46,14 +46,37 @@ def test_a_unit_is_converted_or_refused(matcher, frame):
         lambda: matcher.identify(px, mag=frame.mag * u.Jy),
         lambda: matcher.identify(px, sigma_px=np.ones(len(px)) * u.arcsec),
         lambda: matcher.identify(px, prior=np.ones(4) * u.m, prior_error_deg=1.0),
-        lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.deg),
+        lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.s),
+        lambda: matcher.identify(px, fov_error=1.0 * u.deg),
+        lambda: starcat.calibrate(matcher.database, frame, fov_deg=(8.0 * u.deg, 16.0 * u.mag)),
+        lambda: starcat.Camera(1280, 960, fov_x_deg=3.0 * u.pix),
+        lambda: starcat.Matcher.open(matcher.database, noise_px=0.5 * u.arcsec),
+        lambda: starcat.Tracker(matcher, max_turn_deg=1.0 * u.m),
+        lambda: starcat.Tracker(matcher).identify(px, time_s=1.0 * u.km),
         lambda: starcat.Observer.at(TIME, position_km=[1, 2, 3] * u.s),
-        lambda: starcat.simulate(matcher.database, noise_px=0.5 * u.pix),
+        lambda: starcat.simulate(matcher.database, noise_px=0.5 * u.mag),
+        lambda: starcat.ingest("sao", read_limit_mag=5.0 * u.pix),
+        lambda: starcat.init(matcher.database.camera, faint_limit_mag=5.0 * u.Jy),
         lambda: expected.apparent(np.eye(3), np.ones(3) * u.m),
     ]
     for ask in refused:
         with pytest.raises(ConfigError):
             ask()
+
+
+def test_a_single_number_has_its_unit_converted(matcher, frame):
+    assert starcat.Camera(64, 64, fov_x_deg=180 * u.arcmin) == starcat.Camera(64, 64, fov_x_deg=3.0)
+    stated = starcat.Matcher(matcher.database, noise_px=0.5 * u.pix, time_limit_s=100 * u.ms)
+    assert (stated.noise_px, stated.time_limit_s) == (0.5, 0.1)
+    assert starcat.Tracker(matcher, max_turn_deg=60 * u.arcmin).max_turn_deg == 1.0
+    tracker = starcat.Tracker(matcher)
+    assert tracker.identify(frame, time_s=1.0 * u.min).ok
+    with pytest.raises(ConfigError, match=r"above 60\.0, the time of the frame before"):
+        tracker.identify(frame, time_s=59.0)
+    made = starcat.simulate(matcher.database, seed=7, noise_px=0.5 * u.pix, noise_mag=200 * u.mmag)
+    assert made[0].centroids_px.tolist() == frame.centroids_px.tolist()
+    off = matcher.identify(frame, fov_error=5 * u.percent)
+    assert off.camera == matcher.identify(frame, fov_error=0.05).camera
 
 
 def test_masked_entries_are_not_used(matcher, frame):

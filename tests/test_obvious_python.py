@@ -123,3 +123,61 @@ def test_many_answers_are_one_table(matcher, frames, dark):
     assert table["time_s"].unit == u.s
     assert np.array_equal(table["q_body_from_icrs"], answers.q_body_from_icrs, equal_nan=True)
     assert len(matcher.identify_many([]).table()) == 0
+
+
+def test_a_camera_is_calibrated_from_frames_as_from_their_files(matcher, frames, tmp_path):
+    night = tmp_path / "night"
+    night.mkdir()
+    for number, frame in enumerate(frames):
+        content = {"centroids_px": frame.centroids_px.tolist(), "mag": frame.mag.tolist()}
+        (night / f"frame{number}.json").write_text(json.dumps(content))
+    database, answers = matcher.database, matcher.identify_many(frames)
+    measured = [frame for path in sorted(night.iterdir()) for frame in starcat.read_frames(path)]
+    pixels = [{"x_px": x, "y_px": y, "mag": f.mag} for f in frames for x, y in [f.centroids_px.T]]
+    expected = starcat.calibrate(database, frames)
+    files = [night, str(night / "*.json"), sorted(night.iterdir())]
+    for given in (*files, measured, answers, iter(answers), pixels):
+        found = starcat.calibrate(database, given)
+        assert found.n_identified == len(found.frames) == len(frames)
+        assert found.camera == expected.camera
+    mixed = starcat.calibrate(database, [*frames[:3], *sorted(night.iterdir())[3:]])
+    assert mixed.camera == expected.camera
+    assert [one.name for one in mixed.frames][2:4] == ["frame 3", "frame3"]
+    for wrong in (3, [None], [pickle.loads(pickle.dumps(answers[0]))]):
+        with pytest.raises(ConfigError, match="frames"):
+            starcat.calibrate(database, wrong)
+
+
+def test_the_same_seed_gives_the_same_frames(small_artifact, frames, tmp_path):
+    for count in (1, 3):
+        some = starcat.simulate(small_artifact, count, seed=7)
+        for one, other in zip(some, frames, strict=False):
+            assert one.matrix.tolist() == other.matrix.tolist()
+            assert one.centroids_px.tolist() == other.centroids_px.tolist()
+            assert one.mag.tolist() == other.mag.tolist()
+    run("simulate", small_artifact, "-o", tmp_path / "frame.csv", "--seed", 7)
+    [written] = starcat.read_frames(tmp_path / "frame.csv")
+    assert np.abs(written.centroids_px - frames[0].centroids_px).max() <= 0.5e-4 + 1e-12
+    assert np.abs(written.mag - frames[0].mag).max() <= 0.5e-4 + 1e-12
+
+
+def test_a_prior_is_a_rotation_or_a_place_in_the_sky(matcher, frames):
+    first, second = matcher.identify(frames[0]), matcher.identify(frames[1])
+    near = matcher.identify(frames[0], prior=first.rotation(), prior_error_deg=0.5)
+    assert (near.origin, near.star_ids.tolist()) == ("tracking", first.star_ids.tolist())
+    place = first.skycoord.directional_offset_by(30 * u.deg, 0.4 * u.deg)
+    for coordinate in (place, place.galactic):
+        found = matcher.identify(frames[0], prior=coordinate, prior_error_deg=0.5)
+        assert (found.origin, found.star_ids.tolist()) == (
+            "lost_in_space", first.star_ids.tolist(),
+        )  # fmt: skip
+    for wrong, error_deg in ((place, 0.3), (second.skycoord, 20.0), (second.rotation(), 0.5)):
+        withheld = matcher.identify(frames[0], prior=wrong, prior_error_deg=error_deg)
+        assert (withheld.status, withheld.refusal.reason) == ("no_match", "prior")
+    assert starcat.Tracker(matcher).identify(frames[0], prior=place, prior_error_deg=0.5).ok
+    several = first.skycoord.__class__([1.0, 2.0] * u.deg, [3.0, 4.0] * u.deg)
+    for wrong in (several, Rotation.from_quat(np.eye(4))):
+        with pytest.raises(ConfigError, match="prior"):
+            matcher.identify(frames[0], prior=wrong, prior_error_deg=0.5)
+    with pytest.raises(ConfigError, match="prior_error_deg is missing"):
+        matcher.identify(frames[0], prior=place)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database
+    from starcat.matcher.observation import FrameLike
+    from starcat.matcher.result import MatchResult
     from starcat.pipeline.build import Built
     from starcat.pipeline.starter import Starter
     from starcat.progress import Progress
@@ -144,9 +146,10 @@ def ingest(
     from starcat.store.reading import read_catalog as read
 
     name = source_given(_text_of("source", source)).name
-    for parameter, value in (("epoch_jyear", epoch_jyear), ("read_limit_mag", read_limit_mag)):
-        if value is not None:
-            checked_number(parameter, value)
+    if epoch_jyear is not None:
+        epoch_jyear = checked_number("epoch_jyear", epoch_jyear)
+    if read_limit_mag is not None:
+        read_limit_mag = checked_number("read_limit_mag", read_limit_mag)
     return read(
         name,
         locate(name, {name: _inputs("inputs", inputs)} if inputs is not None else {}),
@@ -159,7 +162,7 @@ def ingest(
 
 def calibrate(
     artifact: Artifact | PathLike,
-    frames: PathLike | Sequence[PathLike],
+    frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
@@ -175,8 +178,10 @@ def calibrate(
     artifact : Artifact, str or path-like
         A database for about this field: what `open_artifact` (``starcat.open``) returns, or its
         folder ``<name>-<version>``.
-    frames : path or sequence of paths
-        Images or files of centroids, of one camera.
+    frames : paths, frames or results, one or a sequence of them
+        Images or files of centroids of one camera, folders of them and patterns, as ``starcat
+        identify`` takes them; or frames as `Matcher.identify` takes them, such as those of
+        `simulate` and `read_frames`; or results, which hold their frames.
     camera : Camera, optional
         To start from; the database's own by default.
     size_px : tuple of int, optional
@@ -204,14 +209,13 @@ def calibrate(
     CalibrationError
         If too few frames can be identified; says which and why.
     """
-    from starcat.calibration.files import calibrate_files
-    from starcat.images.batch import frame_files
+    from starcat.calibration.files import calibrate_files, frames_given
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
     return calibrate_files(
         Matcher.open(artifact, method),
-        frame_files([str(path) for path in paths_of("frames", frames)]),
+        frames_given(frames),
         camera=camera,
         size_px=size_px,
         fov_deg=fov_deg,
@@ -328,7 +332,7 @@ def init(
         text = f"camera is of type {type(camera).__name__}; expected a starcat.Camera"
         raise ArgumentTypeError(text, key="camera", value=camera, fields=("camera",))
     if faint_limit_mag is not None:
-        checked_number("faint_limit_mag", faint_limit_mag)
+        faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
     wanted = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
@@ -383,13 +387,16 @@ def simulate(
     from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
     known = as_database("database", database)
-    for name, value in (("noise_px", noise_px), ("noise_mag", noise_mag)):
-        if checked_number(name, value) < 0.0:
+    noises = {"noise_px": noise_px, "noise_mag": noise_mag}
+    for name, value in noises.items():
+        noises[name] = checked_number(name, value)
+        if noises[name] < 0.0:
             text = f"{name} is {value!r}; expected a finite number, 0 or larger"
             raise ConfigError(text, key=name, value=value, fields=(name,))
-    in_range("drop_probability", drop_probability, 1.0, with_zero=True)
+    drop_probability = in_range("drop_probability", drop_probability, 1.0, with_zero=True)
     false = whole_number("false_stars", false_stars, 0)
-    noise = Noise(noise_px, drop_probability, false, noise_mag=noise_mag)
+    px, mag = noises["noise_px"], noises["noise_mag"]
+    noise = Noise(px, drop_probability, false, noise_mag=mag)
     sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
     seed = whole_number("seed", seed, 0)
     return list(simulate_sequence(sky, known.camera, frames, noise, seed))

@@ -38,7 +38,7 @@ from starcat.matcher.observation import (
     as_frame,
     as_frames,
 )
-from starcat.matcher.prior import Prior, prior_of
+from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
@@ -167,7 +167,7 @@ class Matcher(Settings, _WithDatabase):
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         fov_deg: tuple[float, float] | None = None,
     ) -> MatchResult:
@@ -196,8 +196,11 @@ class Matcher(Settings, _WithDatabase):
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
         prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
-            Attitude that is expected, as ``q_body_from_icrs``, and its largest error as an angle of
-            rotation, at most 20. Only the stars near it are compared; the verification is the same.
+            Attitude that is expected, as ``q_body_from_icrs`` or as a scipy ``Rotation`` like
+            `MatchResult.rotation` returns, and its largest error as an angle of rotation, at most
+            20. Only the stars near it are compared; the verification is the same. An astropy
+            ``SkyCoord`` is the expected boresight alone: the whole sky is searched, and an
+            attitude whose boresight is farther from it than the error is withheld.
         fov_deg : pair of float, optional
             Narrowest and widest field across the width, where no more is known; with ``levels``.
 
@@ -217,6 +220,10 @@ class Matcher(Settings, _WithDatabase):
         camera = self._camera(camera)
         px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
         near = prior_of(prior, prior_error_deg)
+        if near is not None and isinstance(near, BoresightPrior):
+            found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
+                                  fov_deg=fov_deg)  # fmt: skip
+            return near.checked(found)
         if len(px) <= MAX_CENTROIDS:
             return self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
         part = brightest_of(as_frame(px, camera, mags, sigma))
@@ -372,7 +379,7 @@ class Matcher(Settings, _WithDatabase):
     def _checked_fov_error(self, fov_error: float) -> float:
         if type(fov_error) is float and fov_error == 0.0:  # in nearly all calls, so at once
             return fov_error
-        in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
+        fov_error = in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
         if not fov_error:
             return 0.0
         check_scale_free(self)

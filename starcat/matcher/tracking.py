@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcat.arguments import without_unit
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import FrameLike
-from starcat.matcher.prior import WIDEST_PRIOR_DEG, turn_of_noise_rad
+from starcat.matcher.prior import WIDEST_PRIOR_DEG, PriorLike, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
 
 FLOOR = 2.0
@@ -81,7 +82,7 @@ class Tracker:
                 value=matcher,
                 fields=("matcher",),
             )
-        turn_deg: object = self.max_turn_deg
+        turn_deg = self.max_turn_deg = without_unit("max_turn_deg", self.max_turn_deg)
         if (
             not isinstance(turn_deg, int | float | np.floating)
             or not 0.0 < turn_deg <= WIDEST_PRIOR_DEG
@@ -104,7 +105,7 @@ class Tracker:
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
@@ -145,7 +146,7 @@ class Tracker:
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
@@ -212,7 +213,7 @@ class Tracker:
     def _next_time(self, time_s: float | None) -> float:
         if time_s is None:
             return 0.0 if math.isinf(self._time) else self._time + 1.0
-        now: object = time_s
+        now = without_unit("time_s", time_s)
         if not isinstance(now, int | float | np.floating) or not self._time < now < math.inf:
             raise ConfigError(
                 f"time_s is {now!r}; expected a number above {self._time}, the time of the frame "
