@@ -170,6 +170,22 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return number
 
 
+def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
+    """Return the error of an argument of another type than the parameter takes."""
+    return ArgumentTypeError(
+        f"{name} is of type {type(value).__name__}; expected {expected}",
+        key=name,
+        value=value,
+        fields=(name,),
+    )
+
+
+def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Check that an argument is of a type; `ArgumentTypeError` if it is of another one."""
+    if not isinstance(value, kind):
+        raise wrong_type(name, value, expected)
+
+
 def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)") -> Path:
     """Return an argument that has to be a path.
 
@@ -181,12 +197,7 @@ def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)
     try:
         return Path(os.fsdecode(os.fspath(value)))
     except TypeError:
-        raise ArgumentTypeError(
-            f"{name} is of type {type(value).__name__}; expected {expected}",
-            key=name,
-            value=value,
-            fields=(name,),
-        ) from None
+        raise wrong_type(name, value, expected) from None
 
 
 def paths_of(name: str, value: Any) -> list[Path]:

@@ -13,7 +13,7 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import database_path, path_of, paths_of, whole_number
+from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
@@ -92,6 +92,7 @@ def build(
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
+    check_type("inputs", inputs or {}, Mapping, "a mapping of the names of sources to paths")
     given = {source: _inputs("inputs", files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
@@ -210,9 +211,17 @@ def calibrate(
         If too few frames can be identified; says which and why.
     """
     from starcat.calibration.files import calibrate_files, frames_given
+    from starcat.geometry.camera import Camera
+    from starcat.geometry.distortion import checked_pair
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
+    if camera is not None:
+        check_type("camera", camera, Camera, "a starcat.Camera")
+    if size_px is not None:
+        checked_pair("size_px", size_px)
+        width_px, height_px = (whole_number("size_px", side, 1) for side in size_px)
+        size_px = width_px, height_px
     return calibrate_files(
         Matcher.open(artifact, method),
         frames_given(frames),
@@ -328,9 +337,8 @@ def init(
     from starcat.pipeline.starter import starter_spec, write_starter
     from starcat.specs.build_spec import CameraSpec
 
-    if not isinstance(camera, Camera):
-        text = f"camera is of type {type(camera).__name__}; expected a starcat.Camera"
-        raise ArgumentTypeError(text, key="camera", value=camera, fields=("camera",))
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("name", name, str, "text")
     if faint_limit_mag is not None:
         faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
     wanted = CameraSpec(
@@ -474,6 +482,15 @@ def export(
         known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
         text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
         raise ArgumentTypeError(text, key=unknown[0], value=options[unknown[0]])
+    for name in ("max_partition_rows", "max_bytes"):
+        if options.get(name) is not None:
+            options[name] = whole_number(name, options[name], 1)
+    if "sign" in options:
+        options["sign"] = paths_of("sign", options["sign"])
+    if options.get("products") is not None:
+        products = options["products"]
+        check_type("products", products, Iterable, "a sequence of names")
+        options["products"] = [products] if isinstance(products, str) else list(products)
     return run(**options)
 
 

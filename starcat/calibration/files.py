@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.arguments import columns_of, path_of
+from starcat.arguments import columns_of, path_of, wrong_type
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration, calibrate_frames
 from starcat.calibration.fit import PARAMETERS
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.images.batch import frame_files
@@ -54,7 +54,7 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
     if _is_file(frames) or _is_one_frame(frames):
         frames = [frames]
     if not isinstance(frames, Iterable):
-        raise _no_frames(frames)
+        raise wrong_type("frames", frames, _FRAMES)
     given: list[Path | MeasuredFrame] = []
     for number, one in enumerate(frames, start=1):
         if _is_file(one):
@@ -71,7 +71,7 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
             name = str(getattr(frame, "name", "") or f"frame {number}")
             given.append(MeasuredFrame(name, *as_arrays(frame)))
         else:
-            raise _no_frames(one)
+            raise wrong_type(f"frame {number} of frames", one, _FRAMES)
     return list(dict.fromkeys(given))
 
 
@@ -85,14 +85,7 @@ def _is_one_frame(value: Any) -> bool:
     return isinstance(value, MatchResult) or is_frame(value) or columns_of(value) is not None
 
 
-def _no_frames(value: object) -> ArgumentTypeError:
-    return ArgumentTypeError(
-        f"frames has a {type(value).__name__}; expected files, folders, patterns, or frames as "
-        "starcat.simulate and starcat.read_frames return them",
-        key="frames",
-        value=value,
-        fields=("frames",),
-    )
+_FRAMES = "files, folders, patterns, or frames of starcat.simulate or starcat.read_frames"
 
 
 def calibrate_files(

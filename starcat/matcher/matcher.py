@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import HasFolder, database_path, whole_number
+from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
@@ -76,6 +76,10 @@ class Matcher(Settings, _WithDatabase):
     """
 
     def __post_init__(self) -> None:
+        check_type(
+            "database", self.database, Database,
+            "the database of a matcher; open one with starcat.Matcher.open",
+        )  # fmt: skip
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
             text = "engine 'numpy' needs a database; an onboard image has no products"
@@ -300,12 +304,8 @@ class Matcher(Settings, _WithDatabase):
     def _camera(self, camera: Camera | None) -> Camera:
         if camera is None:
             return self.database.camera
-        if not isinstance(camera, Camera):
-            text = (
-                f"camera is of type {type(camera).__name__}; expected a starcat.Camera. Give "
-                "magnitudes by name: identify(centroids_px, mag=...)"
-            )
-            raise ConfigError(text, key="camera", value=camera)
+        expected = "a starcat.Camera. Give magnitudes by name: identify(centroids_px, mag=...)"
+        check_type("camera", camera, Camera, expected)
         return camera
 
     def _identify_file(self, path: Path, camera: Camera | None) -> MatchResult:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arguments import columns_of, numbers_of
+from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
@@ -220,12 +220,7 @@ def _sequence(name: str, values: Any) -> Sequence[Any]:
     if not isinstance(values, str | bytes) and columns_of(values) is None:
         with suppress(TypeError):
             return values if hasattr(values, "__len__") else list(values)
-    raise ArgumentTypeError(
-        f"{name} is of type {type(values).__name__}; expected a sequence with one array per frame",
-        key=name,
-        value=values,
-        fields=(name,),
-    )
+    raise wrong_type(name, values, "a sequence with one array per frame")
 
 
 def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:

@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array, Matrix
+from starcat.arguments import wrong_type
+from starcat.arrays import Matrix
 from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame, HasCentroids
+from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.stars import (
     ARCSEC,
@@ -384,7 +385,7 @@ class MatchResult:
             )
         return tuple(told)
 
-    def with_noise(self, sigma_px: Array) -> MatchResult:
+    def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
 
         ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
@@ -392,17 +393,22 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
+        if sigma is None:
+            raise ConfigError(
+                "sigma_px is missing; give the noise of each centroid", key="sigma_px"
+            )
         px = np.column_stack([stars.x_px, stars.y_px])
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
             self.database.directions[stars.star_index],
-            sigma_px[stars.spot],
+            sigma[stars.spot],
         )
         return replace(
             self,
             matrix=matrix,
             residual_arcsec=residual_rad * ARCSEC,
-            frame=replace(self.frame, sigma_px=sigma_px),
+            frame=replace(self.frame, sigma_px=sigma),
         )
 
     def rotation(self) -> Rotation:
@@ -447,6 +453,8 @@ class MatchResult:
         listed = frame or self.frame
         if listed is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        if not is_frame(listed):
+            raise wrong_type("frame", listed, "a frame, as starcat.read_frames returns them")
         return {**_facts(self), "stars": _star_rows(self, listed)}
 
     def plot(

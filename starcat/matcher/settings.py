@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any, Literal, get_args
 
-from starcat.arguments import without_unit
+from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
 
 Engine = Literal["auto", "c", "numpy"]
@@ -158,6 +158,7 @@ class Settings:
     time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
+        check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
         for name, most in LARGEST.items():
             if getattr(self, name) is not None:
                 self._take(name, most)

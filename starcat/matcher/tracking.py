@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import without_unit
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.arguments import check_type, without_unit
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -74,14 +74,7 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        matcher: object = self.matcher
-        if not isinstance(matcher, Matcher):
-            raise ArgumentTypeError(
-                f"matcher is of type {type(matcher).__name__}; expected a starcat.Matcher",
-                key="matcher",
-                value=matcher,
-                fields=("matcher",),
-            )
+        check_type("matcher", self.matcher, Matcher, "a starcat.Matcher")
         turn_deg = self.max_turn_deg = without_unit("max_turn_deg", self.max_turn_deg)
         if (
             not isinstance(turn_deg, int | float | np.floating)
@@ -208,6 +201,7 @@ class Tracker:
         MatchResult
             As `identify` gives it.
         """
+        check_type("frames", frames, Iterable, "an iterable of frames")
         return (self.identify(frame) for frame in frames)
 
     def _next_time(self, time_s: float | None) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import numbers_of
+from starcat.arguments import check_type, numbers_of, wrong_type
 from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -69,6 +69,10 @@ def identify_in_time(
         not identified is asked again without one or two of its three brightest spots; such an
         answer counts if planets are there, with the probability of all these questions.
     """
+    if not callable(identify):
+        raise wrong_type("identify", identify, "a function, such as Matcher.identify")
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("observer", observer, Observer, "a starcat.Observer")
     database = as_database("database", database)
     given = as_frame(centroids_px, camera, mag)
     frame, frame_mag = given.centroids_px, given.mag
@@ -276,6 +280,9 @@ def sky_in_time(
     SkyInTime or None
         None unless the frame is identified.
     """
+    check_type("result", result, MatchResult, "a MatchResult, as Matcher.identify returns it")
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("observer", observer, Observer, "a starcat.Observer")
     if result.status != "identified":
         return None
     database = as_database("database", database)
