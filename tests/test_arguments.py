@@ -142,7 +142,7 @@ def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
         ]
     [frame] = starcat.simulate(opened, seed=7)
     observer = starcat.Observer.at(TIME)
-    asked = opened, frame.centroids_px, matcher.database.camera, observer
+    asked = opened, frame, matcher.database.camera, observer
     found = starcat.identify_in_time(matcher.identify, *asked)
     assert starcat.sky_in_time(found, *asked)
 
@@ -156,6 +156,8 @@ WRONG = [
     lambda db: starcat.Camera(1280, 960, 100.0, fov_x_deg=3.0),
     lambda db: starcat.Camera(1280, 960, 100.0, distortion=Other()),
     lambda db: starcat.Camera(1280, 960, 100.0, principal_point_px=Other()),
+    lambda db: starcat.Matcher(db),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, selection=3),
     lambda db: starcat.Matcher.open(Other()),
     lambda db: starcat.Matcher.open(db, Other()),
     lambda db: starcat.Matcher.open(db).identify(Other()),
@@ -168,6 +170,10 @@ WRONG = [
     lambda db: starcat.Observer.at(TIME, position_km=Other()),
     lambda db: starcat.build(Other()),
     lambda db: starcat.build({}),
+    lambda db: starcat.build(starcat.preset("gaia-12deg"), inputs=5),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), size_px="x"),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), size_px=3),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), camera=Other()),
     lambda db: starcat.calibrate(db, Other()),
     lambda db: starcat.calibrate(db, [Other()]),
     lambda db: starcat.connect(Other()),
@@ -175,11 +181,19 @@ WRONG = [
     lambda db: starcat.export(db, "csv", Other()),
     lambda db: starcat.export(db, "csv", "x", colour="red"),
     lambda db: starcat.export(db, Other()),
+    lambda db: starcat.export(db, "csv", products=5),
+    lambda db: starcat.export(db, "hats", max_partition_rows="x"),
+    lambda db: starcat.export(db, "onboard", max_bytes="x"),
+    lambda db: starcat.export(db, "onboard", sign=5),
     lambda db: starcat.identify_in_time(Other(), Other(), [[1, 2]], None, None),
+    lambda db: starcat.identify_in_time(print, db, [[1, 2]], Other(), starcat.Observer.at(TIME)),
+    lambda db: starcat.identify_in_time(print, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
+    lambda db: starcat.sky_in_time(None, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
     lambda db: starcat.ingest(Other()),
     lambda db: starcat.ingest("sao", Other()),
     lambda db: starcat.ingest("sao", epoch_jyear="soon"),
     lambda db: starcat.init(Other()),
+    lambda db: starcat.init(starcat.Camera(9, 9, 9.0), 5),
     lambda db: starcat.learn(db, Other()),
     lambda db: starcat.open(Other()),
     lambda db: starcat.preset(Other()),
@@ -197,6 +211,10 @@ WRONG = [
     lambda db: starcat.simulate(db, seed=-1),
     lambda db: starcat.simulate(Other()),
     lambda db: starcat.Tracker(Other()),
+    lambda db: starcat.Tracker(starcat.Matcher.open(db)).follow(5),
+    lambda db: starcat.Matcher.open(db).identify([[1, 2]]).to_dict(5),
+    lambda db: starcat.Matcher.open(db).identify(starcat.simulate(db)[0]).with_noise("x"),
+    lambda db: starcat.Matcher.open(db).identify([[1, 2]]).plot(5),
     lambda db: starcat.verify(Other()),
 ]
 
