@@ -114,7 +114,7 @@ def without_unit(name: str, values: Any) -> Any:
     Examples
     --------
     >>> import astropy.units as u
-    >>> without_unit("fov_x_deg", 30.0 * u.arcmin), without_unit("fov_x_deg", 0.5)
+    >>> float(without_unit("fov_x_deg", 30.0 * u.arcmin)), without_unit("fov_x_deg", 0.5)
     (0.5, 0.5)
     """
     unit = getattr(values, "unit", None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
 
 import astropy.units as u
 import numpy as np
@@ -181,3 +182,17 @@ def test_a_prior_is_a_rotation_or_a_place_in_the_sky(matcher, frames):
             matcher.identify(frames[0], prior=wrong, prior_error_deg=0.5)
     with pytest.raises(ConfigError, match="prior_error_deg is missing"):
         matcher.identify(frames[0], prior=place)
+
+
+def test_a_library_that_is_missing_is_named(matcher, frames, monkeypatch):
+    found = matcher.identify(frames[0])
+    for library in ("scipy.spatial.transform", "matplotlib", "astropy.table"):
+        monkeypatch.setitem(sys.modules, library, None)
+    many = matcher.identify_many(frames)
+    for ask, name in (
+        (found.rotation, "scipy"),
+        (found.plot, "matplotlib"),
+        (many.table, "astropy"),
+    ):
+        with pytest.raises(ConfigError, match=name):
+            ask()
