@@ -62,7 +62,6 @@ def draw_result(
             f"image has the shape {pixels.shape}; expected {camera.height_px} rows of "
             f"{camera.width_px} pixels, as the camera has",
             key="image",
-            fields=("image",),
         )
     path = None if output is None else path_of("output", output)
     named = MeasuredFrame(name, frame.centroids_px, frame.mag)
