@@ -69,7 +69,7 @@ def a_frame(
 def answer(sky: Database, **stated: object) -> tuple[SimulatedFrame, MatchResult]:
     frame = a_frame(sky, sky.camera, Noise(0.4, 0.1, 3, noise_mag=0.2))
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
-    return frame, matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    return frame, matcher.identify(frame.centroids_px, mag=frame.mag)
 
 
 def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:

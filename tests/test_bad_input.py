@@ -650,7 +650,7 @@ def answers(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], Cal
         sky, eye = matcher.database, matcher.database.camera
         [frame] = simulate_frames(sky.directions, eye, 1, Noise(0.1), 1, mag=sky.mag)
         measured = MeasuredFrame("frame", frame.centroids_px, frame.mag)
-        result = matcher.identify(frame.centroids_px, eye, magnitudes=frame.mag)
+        result = matcher.identify(frame.centroids_px, eye, mag=frame.mag)
         content = FrameAnswer(measured, result).content()
         change(content)
         place.write("a.ndjson", json.dumps(content) + "\n")

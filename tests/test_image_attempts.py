@@ -66,7 +66,7 @@ def is_right(answer, matrix):
 def first_search(matcher, path):
     [frame] = measure_picture(path).frames
     camera = matcher.database.camera
-    return matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=0.05)
+    return matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
 
 
 # Attempts
@@ -110,7 +110,7 @@ def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
     write_image(path, noisy(*spots, SIZE, 1).astype(np.float32))
     [answer] = identify_file(path, matcher)
     frame, camera = answer.frame, matcher.database.camera
-    alone = matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=0.05)
+    alone = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
     chance = answer.result.false_match_probability
     assert chance == pytest.approx(MAX_SEARCHES * alone.false_match_probability)
 
@@ -132,7 +132,7 @@ def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
 
 def test_an_answer_is_withheld_above_the_limit_of_all_searches(matcher):
     px, mag, _ = stars_of(matcher, 2)
-    found = matcher.identify(px, magnitudes=mag)
+    found = matcher.identify(px, mag=mag)
     almost = replace(found, false_match_probability=1e-10)
     assert counted(almost, 1e-9).false_match_probability == pytest.approx(MAX_SEARCHES * 1e-10)
     assert counted(replace(found, false_match_probability=2e-10), 1e-9) is None

@@ -46,7 +46,7 @@ def identified(database, frames, path):
     matcher = Matcher(database)
     with path.open("w") as file:
         for frame in frames:
-            result = matcher.identify(frame.centroids_px, database.camera, magnitudes=frame.mag)
+            result = matcher.identify(frame.centroids_px, database.camera, mag=frame.mag)
             file.write(json.dumps(FrameAnswer(frame, result).content()) + "\n")
     return path
 

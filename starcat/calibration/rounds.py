@@ -160,7 +160,7 @@ def identify_part(
             away = np.hypot(*(px[rows] - 0.5 * np.array([middle.width_px, middle.height_px])).T)
             rows = np.sort(rows[np.argsort(away if frame.mag is None else frame.mag[rows])[:few]])
         mag = None if frame.mag is None else frame.mag[rows]
-        result = matcher.identify(px[rows], middle, magnitudes=mag, fov_error=fov_error)
+        result = matcher.identify(px[rows], middle, mag=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))
     return IdentifiedFrame(tuple(results), camera, matcher.tolerance_px)
 

@@ -87,6 +87,7 @@ def simulate_command(
     output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
+    noise_mag: Annotated[float, typer.Option(min=0, max=10, help="Noise of a magnitude.")] = 0.2,
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are no stars.")] = 0,
     replace: Replace = False,
     json: opt.Json = False,
@@ -95,17 +96,17 @@ def simulate_command(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
+    from starcat.api.functions import simulate
     from starcat.cli.matches import simulated_facts
     from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
-    from starcat.simulation.simulate import Noise, simulate_frames
 
     expect_free(output, replace=replace)
     database = open_database(artifact)
-    noise = Noise(noise_px, false_stars=false_stars)
-    eye = database.camera
-    frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
-    write_simulated(output, frame, eye, seed)
+    [frame] = simulate(
+        database, noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, seed=seed
+    )
+    write_simulated(output, frame, database.camera, seed)
     told = simulated_facts(frame, output)
     if json:
         print_json(told)

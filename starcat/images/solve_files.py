@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -116,7 +116,7 @@ class FrameAnswer:
 
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
-        found = {"frame": self.frame.name, **facts(self.result), "stars": self._stars()}
+        found = {"frame": self.frame.name, **self.result.to_dict(self.frame)}
         if self.spots is not None and self.spots.streak is not None:
             found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
         if self.attempt is not None:
@@ -125,67 +125,6 @@ class FrameAnswer:
         if self.observer is not None:
             found["in_time"] = None if self.sky is None else self.sky.content()
         return found
-
-    def _stars(self) -> list[Content]:
-        reasons, stars = dict(self.result.dropped), self.result.stars
-        row_of = {spot: row for row, spot in enumerate(stars.spot.tolist())}
-        numbers = (
-            *("mag", "ra_deg", "dec_deg"),
-            *("dx_px", "dy_px", "separation_arcsec", "difference_mag"),
-        )
-        columns = {name: getattr(stars, name).tolist() for name in numbers}
-        content, given = [], self.frame.mag
-        for number, (x, y) in enumerate(self.frame.centroids_px.tolist()):
-            seen = None if given is None else _or_none(float(given[number]))
-            one: Content = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
-            one |= {"star": None, "mag": None}
-            row = row_of.get(number)
-            if row is not None:
-                one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
-                one |= {name: _or_none(column[row]) for name, column in columns.items()}
-            if number in reasons:
-                one["dropped"] = reasons[number]
-            content.append(one)
-        return content
-
-
-def facts(result: MatchResult) -> Content:
-    """Return what an answer says of the whole frame, as JSON has it."""
-    found: Content = {"status": result.status, "origin": result.origin}
-    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
-    if result.ok:
-        camera, database = result.camera, result.database
-        found |= {
-            "database": None if database is None else database.name,
-            "camera": None if camera is None else asdict(camera),
-            "boresight_ra_deg": result.boresight_ra_deg,
-            "boresight_dec_deg": result.boresight_dec_deg,
-            "roll_deg": result.roll_deg,
-            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
-            "covariance_arcsec2": [
-                [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
-            ],
-            "residual_arcsec": result.residual_arcsec,
-            "reduced_chi_square": _or_none(result.reduced_chi_square),
-            "false_match_probability": result.false_match_probability,
-            "focal_length_px": None if camera is None else camera.focal_length_px,
-            "focal_length_error_px": result.focal_length_error_px,
-        }
-    elif result.refusal is not None:
-        why = result.refusal
-        found["refusal"] = {
-            "reason": why.reason,
-            "words": why.message,
-            "advice": why.hint,
-            "n_matched": why.n_matched,
-            "false_match_probability": why.false_match_probability,
-            "share": why.share,
-        }
-    return {**found, "time_s": _or_none(result.time_s)}
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -326,7 +265,7 @@ class FileAnswers:
         def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
             identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
             if observer is None:
-                return identify(frame.centroids_px, magnitudes=frame.mag)
+                return identify(frame.centroids_px, mag=frame.mag)
             from starcat.sky.in_time import identify_in_time
 
             return identify_in_time(
@@ -335,7 +274,7 @@ class FileAnswers:
                 frame.centroids_px,
                 camera,
                 observer,
-                magnitudes=frame.mag,
+                mag=frame.mag,
                 tolerance_px=matcher.tolerance_px,
                 max_false_match_probability=matcher.max_false_match_probability,
             )

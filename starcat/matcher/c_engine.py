@@ -268,7 +268,7 @@ class Search:
         arrays = (
             ffi.from_buffer("int64_t[]", starts),
             _double_pointer(frames.centroids_px),
-            _double_pointer(frames.magnitudes),
+            _double_pointer(frames.mag),
             _double_pointer(frames.sigma_px),
             ffi.from_buffer("starcat_answer[]", records),
             ffi.from_buffer("int32_t[]", star_index),

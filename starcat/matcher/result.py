@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
+import os
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array, Matrix
+from starcat.arguments import wrong_type
+from starcat.arrays import Matrix
 from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame
+from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.stars import (
     ARCSEC,
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
     from astropy.wcs import WCS
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
 
 Reason = Literal[
     "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "mirrored",
@@ -196,6 +200,9 @@ class MatchResult:
         Only ``identified`` comes with stars and an attitude.
     star_index : ndarray of int32, shape (N,)
         Row of the database, -1 where none.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, body from ICRS: ``v_body = matrix @ v_icrs``, with x right, y down and z along
+        the boresight. NaN unless identified.
     residual_arcsec : float
         Root mean square angle between matched centroids and their stars.
     false_match_probability : float
@@ -225,7 +232,7 @@ class MatchResult:
 
     status: Status
     star_index: NDArray[np.int32]
-    matrix: Matrix  # attitude, ``body = matrix @ icrs``; NaN unless identified
+    matrix: Matrix
     residual_arcsec: float
     false_match_probability: float
     dropped: Dropped = ()
@@ -281,7 +288,8 @@ class MatchResult:
     def q_body_from_icrs(self) -> NDArray[np.float64]:
         """Attitude [x, y, z, w], shape (4,); NaN unless identified.
 
-        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components;
+        `rotation` returns it.
         """
         if self._record is not None:
             return np.ndarray(4, np.float64, self._record, Q_AT)
@@ -378,7 +386,7 @@ class MatchResult:
             )
         return tuple(told)
 
-    def with_noise(self, sigma_px: Array) -> MatchResult:
+    def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
 
         ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
@@ -386,18 +394,101 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
+        if sigma is None:
+            raise ConfigError(
+                "sigma_px is missing; give the noise of each centroid", key="sigma_px"
+            )
         px = np.column_stack([stars.x_px, stars.y_px])
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
             self.database.directions[stars.star_index],
-            sigma_px[stars.spot],
+            sigma[stars.spot],
         )
         return replace(
             self,
             matrix=matrix,
             residual_arcsec=residual_rad * ARCSEC,
-            frame=replace(self.frame, sigma_px=sigma_px),
+            frame=replace(self.frame, sigma_px=sigma),
         )
+
+    def rotation(self) -> Rotation:
+        """Return the attitude as scipy has it: ``rotation().apply(v_icrs)`` is ``v_body``.
+
+        Returns
+        -------
+        scipy.spatial.transform.Rotation
+            Of `matrix`. Its ``as_quat()`` is [-x, -y, -z, w] for `q_body_from_icrs` [x, y, z, w],
+            or its negative: scipy uses the other convention of quaternions.
+
+        Raises
+        ------
+        NotIdentifiedError
+            Unless identified.
+        ConfigError
+            If scipy is not installed.
+        """
+        self._expect_ok("attitude")
+        return sky_objects.rotation(self.matrix)
+
+    def to_dict(self, frame: HasCentroids | None = None) -> dict[str, Any]:
+        """Return the result as ``starcat identify --json`` prints it.
+
+        Parameters
+        ----------
+        frame : frame, optional
+            The frame to list in ``stars``, with as many centroids; by default the frame that was
+            searched. A frame in which planets were found was searched without their centroids.
+
+        Returns
+        -------
+        dict
+            Numbers, texts, lists, dicts and None only, so that ``json.dumps`` writes it: what is
+            NaN is None. ``stars`` has one entry per centroid, in the order of the frame.
+
+        Raises
+        ------
+        ConfigError
+            If the result does not hold its frame, as after pickling, and none is given.
+        """
+        listed = frame or self.frame
+        if listed is None:
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        if not is_frame(listed):
+            raise wrong_type("frame", listed, "a frame, as starcat.read_frames returns them")
+        return {**_facts(self), "stars": _star_rows(self, listed)}
+
+    def plot(
+        self,
+        output: str | os.PathLike[str] | None = None,
+        *,
+        image: ArrayLike | None = None,
+        name: str = "",
+    ) -> Figure:
+        """Draw the frame with its stars circled and named, as ``starcat identify --picture``.
+
+        Parameters
+        ----------
+        output : str or path-like, optional
+            PNG or SVG file to write; the suffix decides.
+        image : array_like, shape (height, width), optional
+            The picture that the centroids were found in; by default the centroids are drawn on a
+            dark sky.
+        name : str, optional
+            Name of the frame, with which the title begins.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Which a notebook shows.
+
+        Raises
+        ------
+        ConfigError
+            If the result does not hold its frame, as after pickling, the image has another size
+            than the camera, the output is neither PNG nor SVG, or matplotlib is not installed.
+        """
+        return sky_objects.plot(self, output, image, name)
 
     def table(self) -> QTable:
         """Return the stars as an astropy table.
@@ -419,7 +510,9 @@ class MatchResult:
         if self.ok:
             facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
             facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
-        return sky_objects.sky_object_table(self.stars, facts)
+        stars = {one.name: getattr(self.stars, one.name) for one in fields(MatchedStars)}
+        stars["star"] = np.array(self.stars.star, dtype=np.str_)
+        return sky_objects.sky_object_table(stars, facts)
 
     @property
     def skycoord(self) -> SkyCoord:
@@ -518,6 +611,70 @@ class MatchResult:
             for row in zip(*columns.values(), strict=True)
         )
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+def _facts(result: MatchResult) -> dict[str, Any]:
+    """Return what an answer says of the whole frame, as JSON has it."""
+    found: dict[str, Any] = {"status": result.status, "origin": result.origin}
+    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
+    if result.ok:
+        camera, database = result.camera, result.database
+        found |= {
+            "database": None if database is None else database.name,
+            "camera": None if camera is None else _camera_facts(camera),
+            "boresight_ra_deg": result.boresight_ra_deg,
+            "boresight_dec_deg": result.boresight_dec_deg,
+            "roll_deg": result.roll_deg,
+            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
+            "covariance_arcsec2": [
+                [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
+            ],
+            "residual_arcsec": result.residual_arcsec,
+            "reduced_chi_square": _or_none(result.reduced_chi_square),
+            "false_match_probability": result.false_match_probability,
+            "focal_length_px": None if camera is None else camera.focal_length_px,
+            "focal_length_error_px": result.focal_length_error_px,
+        }
+    elif result.refusal is not None:
+        why = result.refusal
+        found["refusal"] = {
+            "reason": why.reason,
+            "words": why.message,
+            "advice": why.hint,
+            "n_matched": why.n_matched,
+            "false_match_probability": why.false_match_probability,
+            "share": why.share,
+        }
+    return {**found, "time_s": _or_none(result.time_s)}
+
+
+def _camera_facts(camera: Camera) -> dict[str, Any]:
+    return {**asdict(camera), "principal_point_px": list(camera.principal_point_px)}
+
+
+def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]:
+    """Return one entry per centroid of a frame, with its star if it has one."""
+    reasons, stars = dict(result.dropped), result.stars
+    row_of = {spot: row for row, spot in enumerate(stars.spot.tolist())}
+    names = "mag", "ra_deg", "dec_deg", "dx_px", "dy_px", "separation_arcsec", "difference_mag"
+    columns = {name: getattr(stars, name).tolist() for name in names}
+    rows, mag = [], getattr(frame, "mag", None)
+    for number, (x, y) in enumerate(frame.centroids_px.tolist()):
+        seen = None if mag is None else _or_none(float(mag[number]))
+        one: dict[str, Any] = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
+        one |= {"star": None, "mag": None}
+        row = row_of.get(number)
+        if row is not None:
+            one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
+            one |= {name: _or_none(column[row]) for name, column in columns.items()}
+        if number in reasons:
+            one["dropped"] = reasons[number]
+        rows.append(one)
+    return rows
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 NOTABLE_CHI_SQUARE = 2.0
