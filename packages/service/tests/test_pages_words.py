@@ -13,7 +13,7 @@ from PIL import Image
 from services import DATABASE, client_of
 from services import SPEC as SMALL
 
-from starcat.matcher.result import HINTS
+from starcat.matcher.refusal import HINTS
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_ingest
 from starcat_service.pages.wording import advice_in_page_words, in_page_words
