@@ -12,7 +12,7 @@ LACKING = 77
 
 BENCHMARKS = [
     "acquisition", "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines",
-    "false_matches", "fields", "hostile", "ingest", "instructions", "interrupts",
+    "false_matches", "fields", "first_camera", "hostile", "ingest", "instructions", "interrupts",
     "matcher --of starcat", "matcher --of cedar-solve", "matcher --of tetra3rs",
     "matcher --of ruststartracker", "other_fields", "photographs", "pictures", "products", "scale",
     "service", "service_load", "sql", "tracking", "votable",

@@ -29,8 +29,9 @@ from starcat.specs.camera_file import camera_toml
 ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
 """Distances within which a centroid is a star, in the rounds of fitting the lens."""
 
-SMALLEST_ERROR = 1e-4
-"""Relative error of a field that is stated at least: distortion is in it, the noise is not."""
+ERROR_OF_LENS = 0.005
+"""Relative error of the field of one picture that its distortion makes: it depends on where on the
+detector the stars are. Fields of an IMX219 with 7 % of distortion in the corner scatter so."""
 
 BRIGHT = 15
 """Stars at least that tell how many of the bright ones are seen."""
@@ -63,20 +64,24 @@ class FirstCamera:
         """Whether they support any."""
         return len(self.fit.free) > 1
 
-    def remarks(self, limit_mag: float, band: str) -> list[str]:
+    def remarks(self, limit_mag: float, band: str, *, is_stated: bool) -> list[str]:
         """Return where the values of a spec come from and how well they are known, in lines."""
         count, stars = len(self.names), len(self.fit.seen)
         named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
         seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
+        origin = "what the pictures reach"
+        if limit_mag > round(self.reach_mag, 2):
+            origin = "deeper than the pictures, for 10 stars in nearly all fields"
+        if is_stated:
+            origin = "as stated"
         lines = [
             f"From {self.n_files} pictures or files of centroids, {count} of them identified: "
             f"{named}.",
             f"camera.fov_x_deg = {self.camera.fov_x_deg:.4f} +- {self.fov_error_deg:.4f}: of a "
             "lens without distortion, from the stars of the pictures.",
-            f"selection.faint_limit_mag = {limit_mag:g}: stars of {band} = {seen} are seen half "
-            f"as often as bright ones (from {self.n_reach} stars, +- {self._reach_error:.2f});",
-            "  a spec goes no deeper than that, nor than is needed for 10 stars in 99.5 % of all "
-            "fields.",
+            f"selection.faint_limit_mag = {limit_mag:g}: {origin}. Stars of {band} = {seen} are",
+            f"  seen half as often as bright ones (+- {self._reach_error:.2f}, from {self.n_reach} "
+            "stars).",
             f"self_test.noise_px = {self.noise_px:g} +- "
             f"{self.fit.noise_px / math.sqrt(2.0 * max(1, 2 * stars - 4)):.2g}: centroids about "
             f"the fitted lens, on each axis, from {stars} stars.",
@@ -146,7 +151,8 @@ def _camera_of(
     errors = [one.result.focal_length_error_px or 0.0 for one in found]
     middle = cameras[0].with_focal_length(float(np.median(focal_px)))
     spread = 1.2533 * float(np.std(focal_px)) / math.sqrt(len(found))
-    error = max(spread, min(errors), SMALLEST_ERROR * middle.focal_length_px)
+    of_lens = ERROR_OF_LENS * middle.focal_length_px / math.sqrt(len(found))
+    error = max(spread, min(errors), of_lens)
     fit, reach_mag, seen = _lens_and_reach(matcher, found, middle)
     faintest = float(matcher.database.mag.max())
     return FirstCamera(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -160,7 +159,7 @@ def init_command(
                 "--from finds the field of view; leave out --fov-x-deg, --focal-mm and --pixel-um"
             )
         with progress_bars() as progress:
-            starter, remarks = _from_photos(
+            starter, remarks = starter_of_photos(
                 [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress
             )
         write_starter(starter, file, replace=replace, remarks=remarks)
@@ -182,7 +181,7 @@ def init_command(
     print_starter(starter, file, as_json=json)
 
 
-def _from_photos(
+def starter_of_photos(
     photos: Sequence[str],
     name: str,
     size: str | None,
@@ -206,12 +205,13 @@ def _from_photos(
     camera = CameraSpec(
         width_px=width, height_px=height, fov_x_deg=round(found.camera.fov_x_deg, 4)
     )
-    reach = math.inf if found.is_deeper else found.reach_mag
-    starter = starter_spec(name, camera, faint_limit, progress, reach_mag=reach)
+    starter = starter_spec(name, camera, faint_limit, progress, reach_mag=found.reach_mag)
     spec = starter.spec
     test = spec.self_test.model_copy(update={"noise_px": found.noise_px})
     starter = dataclasses.replace(starter, spec=spec.model_copy(update={"self_test": test}))
-    return starter, found.remarks(spec.selection.faint_limit_mag, starter.band)
+    return starter, found.remarks(
+        spec.selection.faint_limit_mag, starter.band, is_stated=faint_limit is not None
+    )
 
 
 def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -> CameraSpec:

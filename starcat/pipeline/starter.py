@@ -148,11 +148,11 @@ def starter_spec(
     *,
     sky: pa.Table | None = None,
     most_field_stars: int = MAX_LOOKED_AT,
-    reach_mag: float = np.inf,
+    reach_mag: float = -np.inf,
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky.
 
-    Unless a limit is given, it is one with enough stars, but none fainter than ``reach_mag``.
+    Unless a limit is given, it is one with enough stars, or ``reach_mag`` if that is fainter.
     """
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
@@ -167,7 +167,7 @@ def starter_spec(
     if limit is None:
         exposure = camera.exposure.exposure(response)
         seen = np.inf if exposure is None else exposure.limit_mag(USUAL_SIGNAL_TO_NOISE)
-        limit = min(enough_limit(sky, shape), round(min(float(seen), reach_mag), 2))
+        limit = min(max(enough_limit(sky, shape), round(reach_mag, 2)), round(float(seen), 2))
     check_tiling(int(np.searchsorted(mag, limit, side="right")), shape, None, most_field_stars)
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
