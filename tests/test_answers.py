@@ -26,7 +26,8 @@ from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
-from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
+from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
+from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 

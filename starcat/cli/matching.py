@@ -130,7 +130,7 @@ def identify_command(
     noise_mag: MagnitudeNoise = None,
     max_false_match_probability: Certainty = 1e-9,
     fov_error: opt.FovError = None,
-    fov: opt.FieldRange = None,
+    fov: opt.Field = None,
     size: opt.FrameSize = None,
     min_share: opt.MinShare = None,
     max_steps: opt.MaxSteps = None,
@@ -244,8 +244,7 @@ def _print_file_answers(
         expect_room_for_wcs(wcs, answers.path, is_picture=answers.is_image)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
-    is_any = tally.identified > 0
-    for note in answers.notes(tally.first, is_any_identified=is_any, flip="--flip or --no-flip"):
+    for note in answers.notes(tally.first):
         say(note)
     if tally.first is not None and picture is not None:
         answers.draw(picture, tally.first)

@@ -89,6 +89,13 @@ FieldRange = Annotated[
     str | None,
     typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
 ]
+Field = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DEG|LOW:HIGH",
+        help="Field across the width in place of the camera's, degrees, or the range of it.",
+    ),
+]
 Time = Annotated[
     str | None,
     typer.Option(metavar="UTC", help="When, such as 2026-11-22T10:00:00: aberration, planets."),
@@ -228,8 +235,8 @@ def size_in_px(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def field_range(text: str | None) -> tuple[float, float] | None:
-    """Return the smallest and the largest field of a ``--fov``."""
+def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
+    """Return the smallest and the largest field of a ``--fov``; of one field twice the same."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
@@ -239,6 +246,10 @@ def field_range(text: str | None) -> tuple[float, float] | None:
         about = float(low)
     except ValueError:
         raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+    if may_be_one:
+        if 0.0 < about < 180.0:
+            return about, about
+        raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
         f"--fov {text!r} is one field of view; write the range that is possible, such as "
         f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
@@ -276,11 +287,12 @@ def unknown_field(
     size: str | None, fov: str | None, fov_error: str | None
 ) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
     """Return what is stated of frames whose field of view is not known."""
-    if fov is not None and fov_error is not None:
+    fields = field_range(fov, may_be_one=True)
+    if fields is not None and fields[0] != fields[1] and fov_error is not None:
         raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
     if size is not None and fov is None:
         raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
-    return None if size is None else size_in_px(size), field_range(fov)
+    return None if size is None else size_in_px(size), fields
 
 
 def share_of_percent(text: str | None) -> float | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,6 +31,7 @@ from starcat.cli.options import (
     chosen_spec,
     field_range,
     inputs_by_source,
+    size_in_px,
 )
 from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
@@ -36,6 +39,7 @@ from starcat.errors import ConfigError
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
     from starcat.pipeline.starter import Starter
+    from starcat.progress import Progress
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 app = typer.Typer()
@@ -100,9 +104,20 @@ def estimate_command(
 @app.command("init")
 def init_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
+    more: Annotated[
+        list[str] | None, typer.Argument(metavar="[PHOTO...]", help="Further ones of --from.")
+    ] = None,
     size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
-    ],
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
+    ] = None,
+    photos: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            metavar="PHOTO...",
+            help="Pictures or centroids that tell the camera: files, folders, patterns.",
+        ),
+    ] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
     pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
     fov_x_deg: Annotated[
@@ -141,6 +156,22 @@ def init_command(
     from starcat.pipeline.starter import starter_spec, write_starter
 
     fields = field_range(fov_range)
+    if photos:
+        if fov_x_deg is not None or focal_mm is not None or pixel_um is not None:
+            raise ConfigError(
+                "--from finds the field of view; leave out --fov-x-deg, --focal-mm and --pixel-um"
+            )
+        with progress_bars() as progress:
+            starter, remarks = starter_of_photos(
+                [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress
+            )
+        write_starter(starter, file, replace=replace, remarks=remarks)
+        print_starter(starter, file, as_json=json, remarks=remarks)
+        return
+    if more:
+        raise ConfigError(f"{more[0]!r} is not an option; pictures of the camera go with --from")
+    if size is None:
+        raise ConfigError("give the size of the detector, --size 1280x960, or pictures, --from")
     if fields is not None:
         if fov_x_deg is not None:
             raise ConfigError("give either --fov-range or --fov-x-deg, not both")
@@ -151,6 +182,39 @@ def init_command(
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
+
+
+def starter_of_photos(
+    photos: Sequence[str],
+    name: str,
+    size: str | None,
+    fields: tuple[float, float] | None,
+    faint_limit: float | None,
+    progress: Progress,
+) -> tuple[Starter, list[str]]:
+    """Return the spec of the camera that took pictures, and where its values come from."""
+    from starcat.calibration.first_camera import first_camera
+    from starcat.images.batch import files_of
+    from starcat.matcher.matcher import Matcher
+    from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+    from starcat.pipeline.starter import starter_spec
+    from starcat.specs.build_spec import CameraSpec
+
+    paths = files_of(photos)
+    matcher = Matcher.open(blind_database(progress))
+    size_px = None if size is None else size_in_px(size)
+    found = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
+    width, height = found.camera.width_px, found.camera.height_px
+    camera = CameraSpec(
+        width_px=width, height_px=height, fov_x_deg=round(found.camera.fov_x_deg, 4)
+    )
+    starter = starter_spec(name, camera, faint_limit, progress, reach_mag=found.reach_mag)
+    spec = starter.spec
+    test = spec.self_test.model_copy(update={"noise_px": found.noise_px})
+    starter = dataclasses.replace(starter, spec=spec.model_copy(update={"self_test": test}))
+    return starter, found.remarks(
+        spec.selection.faint_limit_mag, starter.band, is_stated=faint_limit is not None
+    )
 
 
 def with_sensor(
@@ -198,14 +262,19 @@ def print_preset(spec: BuildSpec) -> None:
     print_facts(f"{spec.name} {spec.version}", facts)
 
 
-def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
+def print_starter(
+    starter: Starter, path: Path, *, as_json: bool, remarks: Sequence[str] = ()
+) -> None:
     """Print what a first spec gives, and what to think of before it is kept."""
     from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
 
     figures = starter.figures
     if as_json:
-        print_json({"file": str(path), **asdict(figures)})
+        told = {"remarks": list(remarks)} if remarks else {}
+        print_json({"file": str(path), **told, **asdict(figures)})
         return
+    for line in remarks:
+        say(line)
     camera = starter.spec.camera.camera()
     columns = {
         f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",

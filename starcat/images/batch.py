@@ -153,7 +153,7 @@ def identify_files(
             yield BatchItem(path, error=error, small=measured.small)
             continue
         first = next(iter(found), None)
-        notes = answers.notes(first, is_any_identified=True)
+        notes = answers.notes(first)
         yield BatchItem(path, found, notes=tuple(notes), small=measured.small)
 
 

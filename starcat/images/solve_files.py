@@ -27,7 +27,7 @@ from starcat.images.attempts import (
     is_new,
 )
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
-from starcat.images.spots import FOV_ERROR, Search, look_again, weighed
+from starcat.images.spots import weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_centroid_files,
@@ -36,6 +36,7 @@ from starcat.matcher.centroids import (
     upside_down,
 )
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
@@ -158,30 +159,38 @@ class FileAnswers:
 
     def _answer(self, frame: MeasuredFrame, search: Search, fov_error: float) -> FrameAnswer:
         observer, spots = self.local.observer, self.measured.spots
-        result = search(frame, fov_error)
+        result = search(frame, fov_error, None, math.inf)
         if not result.ok and fov_error and self.options.fov_error is None:
             # Few stars may determine the attitude of the camera as it was described, and no more.
-            exact = search(frame, 0.0)
+            exact = search(frame, 0.0, None, math.inf)
             result = exact if exact.ok else result
         if spots is not None:
             result = weighed(result, spots.sigma_px)
         if not result.ok and (again := self._answer_again(result, frame, search, fov_error)):
             return again
-        is_searched = result.status == "no_match" and not _is_limited(result)
-        if is_searched and self._is_lost_in_space:
-            result = look_again(
-                search, frame, self.camera, result, fov_error,
-                is_scale_free=self._is_scale_free, flip=self.options.flip,
-            )  # fmt: skip
+        if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
+            result = self._explained(result, frame, search, fov_error)
         return FrameAnswer(frame, result, observer, spots)
+
+    def _explained(
+        self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
+    ) -> MatchResult:
+        """Return a refused answer with what a second look has found."""
+        if self.local.track or self.options.prior_q is not None:
+            return refused
+        return explained(
+            refused, frame, self.camera, search, fov_error=fov_error,
+            with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
+            limit=self.matcher.max_false_match_probability,
+            searches=MAX_SEARCHES if self.is_image else SEARCHES,
+        )  # fmt: skip
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
     ) -> FrameAnswer | None:
         """Return the answer to an image that is measured once more; None if there is none."""
         limit, is_limited = self.matcher.max_false_match_probability, _is_limited(refused)
-        own_limit = self.options.time_limit_s is not None or self.options.max_steps is not None
-        if not self.is_image or (is_limited and own_limit):
+        if not self.is_image or (is_limited and self._has_own_limit):
             return None
         searched = [first.centroids_px]
         end_s = time.monotonic() + (self.options.time_limit_s or math.inf)
@@ -195,7 +204,7 @@ class FileAnswers:
             if spots is None or (attempt.number > 2 and not is_new(frame.centroids_px, searched)):
                 continue
             searched.append(frame.centroids_px)
-            result = counted(search(frame, fov_error), limit)
+            result = counted(search(frame, fov_error, None, math.inf), limit)
             if result is not None:
                 result = weighed(result, spots.sigma_px)
                 return FrameAnswer(frame, result, self.local.observer, spots, attempt)
@@ -236,6 +245,10 @@ class FileAnswers:
             )
 
     @property
+    def _has_own_limit(self) -> bool:
+        return self.options.time_limit_s is not None or self.options.max_steps is not None
+
+    @property
     def _is_lost_in_space(self) -> bool:
         """Whether the whole sky is searched with one camera."""
         options = self.options
@@ -254,15 +267,21 @@ class FileAnswers:
 
     def _search(self, tracker: Tracker | None) -> Search:
         """Return how a frame is identified with an error of the focal length."""
-        matcher, camera, observer = self.matcher, self.camera, self.local.observer
-        way = self._way(tracker)
+        matcher, observer = self.matcher, self.local.observer
+        self._check_way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
                 "track=True does not tell planets from stars; leave out time, or track=True",
                 fields=("track=True", "time"),
             )
 
-        def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
+        def search(
+            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
+        ) -> MatchResult:
+            camera = other or self.camera
+            is_range = self.options.fov_deg is not None
+            hurried = matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
+            way = self._way(tracker, hurried)
             identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
             if observer is None:
                 return identify(frame.centroids_px, mag=frame.mag)
@@ -281,25 +300,26 @@ class FileAnswers:
 
         return search
 
-    def _way(self, tracker: Tracker | None) -> Callable[..., MatchResult]:
-        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
+    def _check_way(self, tracker: Tracker | None) -> None:
         options = self.options
-        if options.prior_q is None and tracker is None:
-            return partial(self.matcher.identify, fov_deg=options.fov_deg)
-        if options.fov_deg is not None:
+        if options.fov_deg is not None and (options.prior_q is not None or tracker is not None):
             raise ConfigError(
                 "fov_deg is for frames of an unknown camera; leave out track=True and prior_q",
                 fields=("fov_deg", "track=True", "prior_q"),
             )
+
+    def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
+        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
+        options = self.options
         if tracker is not None:
             return tracker.attempt
-        prior, error_deg = list(options.prior_q or ()), options.prior_error_deg
-        return partial(self.matcher.identify, prior=prior, prior_error_deg=error_deg)
+        if options.prior_q is None:
+            return partial(matcher.identify, fov_deg=options.fov_deg)
+        prior, error_deg = list(options.prior_q), options.prior_error_deg
+        return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
 
-    def notes(
-        self, first: FrameAnswer | None, *, is_any_identified: bool, flip: str = "flip"
-    ) -> list[str]:
-        """Return what a user should know beside the answers; ``flip`` is what to try."""
+    def notes(self, first: FrameAnswer | None) -> list[str]:
+        """Return what a user should know beside the answers."""
         unknown = said_of_columns([first.frame]) if first else None
         notes = [unknown] if unknown else []
         if first and first.spots is not None and first.spots.streak is not None:
@@ -313,10 +333,6 @@ class FileAnswers:
                 f"{first.attempt.words}; the chance of a false match counts all "
                 f"{MAX_SEARCHES} searches that an image can have."
             )
-        refusal = None if first is None else first.result.refusal
-        is_said = refusal is not None and refusal.reason == "mirrored" and refusal.flip is not None
-        if self.is_image and not is_any_identified and not is_said:
-            notes.append(f"An image that was read upside down is never identified: try {flip}.")
         return notes
 
     def draw(self, path: Path, answer: FrameAnswer) -> None:
@@ -393,6 +409,10 @@ def answers_of(
         camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
+        if options.is_one_field:
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=options.fov_deg[0])
+            camera = camera.with_focal_length(flat.focal_length_px)
+            options = options.model_copy(update={"fov_deg": None, "size_px": None})
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
@@ -467,4 +487,6 @@ def _camera_of_size(
                 key="size",
                 fields=("size_px",),
             )
+    if (width, height) == (known.width_px, known.height_px):
+        return known
     return Camera(width, height, fov_x_deg=known.fov_x_deg)

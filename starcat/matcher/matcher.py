@@ -23,10 +23,16 @@ from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_number
 from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.centroids import MAX_CENTROIDS, brightest_of, brightest_of_frames
+from starcat.matcher.centroids import (
+    MAX_CENTROIDS,
+    MeasuredFrame,
+    brightest_of,
+    brightest_of_frames,
+)
 from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
@@ -38,12 +44,14 @@ from starcat.matcher.observation import (
     as_frame,
     as_frames,
 )
+from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
     MAX_STEPS,
     MIN_SHARE,
+    SCALE_FREE,
     Engine,
     Settings,
     TriangleOrder,
@@ -173,7 +181,8 @@ class Matcher(Settings, _WithDatabase):
         fov_error: float = 0.0,
         prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
-        fov_deg: tuple[float, float] | None = None,
+        fov_deg: float | tuple[float, float] | None = None,
+        explain: bool = False,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -205,8 +214,13 @@ class Matcher(Settings, _WithDatabase):
             20. Only the stars near it are compared; the verification is the same. An astropy
             ``SkyCoord`` is the expected boresight alone: the whole sky is searched, and an
             attitude whose boresight is farther from it than the error is withheld.
-        fov_deg : pair of float, optional
-            Narrowest and widest field across the width, where no more is known; with ``levels``.
+        fov_deg : float or pair of float, optional
+            Field across the width in place of the camera's, of a lens without distortion; or the
+            narrowest and the widest possible, where no more is known, with the product ``levels``.
+        explain : bool, default False
+            Whether a frame that is not identified is tried mirrored, and in fields of half to
+            twice the stated one, for 2 seconds at most. What explains it is in
+            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``.
 
         Returns
         -------
@@ -222,6 +236,9 @@ class Matcher(Settings, _WithDatabase):
         if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
             return self._identify_file(Path(centroids_px), camera)
         camera = self._camera(camera)
+        if fov_deg is not None and not isinstance(fov_deg, tuple | list):
+            checked_number("fov_deg", fov_deg)
+            camera, fov_deg = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg), None
         px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if near is not None and isinstance(near, BoresightPrior):
@@ -229,11 +246,46 @@ class Matcher(Settings, _WithDatabase):
                                   fov_deg=fov_deg)  # fmt: skip
             return near.checked(found)
         if len(px) <= MAX_CENTROIDS:
-            return self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
-        part = brightest_of(as_frame(px, camera, mags, sigma))
-        few = part.frame
-        searched = few.centroids_px, camera, few.mag, few.sigma_px
-        return part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+            found = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
+        else:
+            part = brightest_of(as_frame(px, camera, mags, sigma))
+            few = part.frame
+            searched = few.centroids_px, camera, few.mag, few.sigma_px
+            found = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+        if not explain or found.status != "no_match" or near is not None or fov_deg is not None:
+            return found
+        return self._explained(
+            found, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
+        )
+
+    def _explained(
+        self, refused: MatchResult, frame: MeasuredFrame, camera: Camera, fov_error: float
+    ) -> MatchResult:
+        def search(
+            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
+        ) -> MatchResult:
+            eye = other or camera
+            return self.within(time_limit_s, eye, fov_error).identify(
+                frame.centroids_px, eye,
+                mag=frame.mag, sigma_px=frame.sigma_px, fov_error=fov_error,
+            )  # fmt: skip
+
+        return explained(
+            refused, frame, camera, search, fov_error=fov_error,
+            with_fields=self.method in SCALE_FREE, limit=self.max_false_match_probability,
+        )  # fmt: skip
+
+    def within(
+        self, time_limit_s: float, camera: Camera, fov_error: float, *, is_range: bool = False
+    ) -> Self:
+        """Return a matcher whose searches with numpy end after a time; C has its own limit.
+
+        ``is_range`` is whether it is to search a range of fields, which C does not.
+        """
+        in_c = not is_range and self._in_c(camera, fov_error) is not None
+        if in_c or time_limit_s >= self.time_limit_s:
+            return self
+        return replace(self, time_limit_s=time_limit_s)
 
     def _search(
         self,

@@ -24,7 +24,8 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import Pose
-from starcat.matcher.result import MatchResult, Refusal, no_match
+from starcat.matcher.refusal import Refusal
+from starcat.matcher.result import MatchResult, no_match
 from starcat.matcher.settings import LOOKUP, REACH, in_range
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify_candidates

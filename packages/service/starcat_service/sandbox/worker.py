@@ -62,12 +62,11 @@ def identify_confined(
         found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
-    is_any = any(answer.result.ok for answer in found)
     return {
         "database": answers.matcher.database.name,
         "method": answers.matcher.method,
         "frames": [answer.content() for answer in found],
-        "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
+        "notes": answers.notes(found[0] if found else None),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
         "size_px": [answers.camera.width_px, answers.camera.height_px],
     }
