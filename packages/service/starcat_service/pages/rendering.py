@@ -27,6 +27,7 @@ NAVIGATION = (
     ("/jobs", "Jobs"),
     ("/databases", "Databases"),
     ("/identify", "Identify"),
+    ("/catalogs", "Catalogs"),
     ("/releases", "Releases"),
     ("/docs", "Help"),
 )
