@@ -19,8 +19,7 @@ MAX_DAYS = 366.0
 """Validity of tokens that are created over HTTP; the command line sets no limit."""
 
 TokenId = Annotated[
-    str,
-    Path(pattern="^[0-9a-f]{8}$", description="Id of a token.", examples=["0123abcd"]),
+    str, Path(pattern="^[0-9a-f]{8}$", description="Id of a token.", examples=["0123abcd"])
 ]
 
 
