@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
-from html import escape
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -39,7 +39,7 @@ from starcat_service.pages.facts import (
 )
 from starcat_service.pages.jobs import evaluation_of
 from starcat_service.pages.notebook import Notebook, database_code, difference_code, query_code
-from starcat_service.pages.rendering import page_router, page_url, render
+from starcat_service.pages.rendering import ENVIRONMENT, page_router, page_url, render
 from starcat_service.pages.sky import CACHED, sky_view
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
@@ -225,16 +225,16 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
         raise TargetMissing(f"{database.title} has no report; build it again to get one")
     headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
-    # It has no head of the service: a line above it leads back.
-    page = path.read_bytes().replace(b"<body>", b"<body>" + _way_back(database).encode(), 1)
+    head = ENVIRONMENT.get_template("report_head.html").render(database=database)
+    page = path.read_bytes().replace(b"<body>", b"<body>" + head.encode(), 1)
+    page = _COUNT.sub(
+        lambda found: found[0].replace(b",", "\N{NARROW NO-BREAK SPACE}".encode()), page
+    )
     return Response(page, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _way_back(database: ListedDatabase) -> str:
-    return (
-        f'<p><a href="/databases/{database.id}">← {escape(database.name)} '
-        f'{escape(database.version)}</a> · <a href="/databases">Databases</a></p>'
-    )
+_COUNT = re.compile(rb"(?<=>)\d{1,3}(,\d{3})+(?=<)")
+"""A count as reports write it; pages have a thin space between thousands."""
 
 
 @router.get("/databases/{database_id}/compare")
