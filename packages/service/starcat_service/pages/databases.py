@@ -33,6 +33,7 @@ from starcat_service.pages.downloads import image_choices
 from starcat_service.pages.facts import (
     database_rows,
     products_of,
+    readable_report,
     rejections_of,
     report_of,
     star_fact_columns,
@@ -285,7 +286,7 @@ def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:
     newest = service.jobs.all(kind="evaluate", state="done", database=database.id, most=1)
     return {
         "row": database_rows(service, database)[0],
-        "coverage": report_of(database).get("coverage"),
+        "coverage": readable_report(database).get("coverage"),
         "map": sky_map(fields_of(database), FIXED_BINS),
         "measured": evaluation_of(newest[0] if newest else None)["rates"],
     }
