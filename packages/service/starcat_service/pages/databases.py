@@ -248,6 +248,7 @@ async def compare(
 ) -> Response:
     """Show what differs between this database and a later or other one."""
     difference = None
+    other = other or await run_in_threadpool(_another_version, service, database_id)
     if other:
         # In its turn among the queries: it reads whole tables.
         sides = await run_in_threadpool(_older_first, service, database_id, other)
@@ -264,13 +265,12 @@ def _comparison(
     others.sort(key=lambda one: one.name != database.name)  # its other versions first
     earlier, later = _older_first(service, database_id, other) if other else (database, None)
     code = later and difference_code(page_url(request, service), earlier.id, later.id)
-    versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
         "compare.html",
         **_head(service, database, "compare"),
         others=others,
-        suggested=other or (versions[-1] if versions else ""),
+        suggested=other,
         earlier=earlier,
         later=later,
         difference=difference,
@@ -279,6 +279,13 @@ def _comparison(
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
     )
+
+
+def _another_version(service: Service, database_id: str) -> str:
+    """Return the id of the newest other version of a database; empty if there is none."""
+    database = service.library.database(database_id)
+    others = [one for one in service.library.databases() if one.id != database.id]
+    return next((one.id for one in reversed(others) if one.name == database.name), "")
 
 
 def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:
