@@ -299,6 +299,10 @@ def test_an_answer_of_sql_is_in_the_sky_and_in_its_address(page):
     page.get_by_text("In the sky").click()
     sky_of(page)
     assert page.evaluate("document.querySelector('#answer .skyview').sky.marks.length") == 8
+    page.goto(f"/databases/{DATABASE}/sql")
+    page.get_by_text("Recent queries").click()
+    page.locator("#recent a", has_text="LIMIT 8").click()
+    page.locator("#answer-count", has_text="8 rows").wait_for()
 
 
 ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",

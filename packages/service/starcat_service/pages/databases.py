@@ -274,7 +274,7 @@ def _comparison(
         earlier=earlier,
         later=later,
         difference=difference,
-        sides=[_side(service, one) for one in (earlier, later) if later],
+        sides=[_side(service, one) for one in (earlier, later)] if later else [],
         notebook=Notebook(f"{earlier.title}-{later.title}", code) if later and code else None,
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
