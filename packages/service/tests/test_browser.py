@@ -290,6 +290,8 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
         "/jobs",
         "/databases",
         "/identify",
+        "/catalogs",
+        "/jobs?q=browser",
         "/releases",
         "/sign-in",
         "/api/docs",
