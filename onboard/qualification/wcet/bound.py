@@ -29,7 +29,7 @@ MOST_LOOK_UPS = 5000  # of one search by triangles
 MOST_LEADERS = 72
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
 MOST_MORE_FITS = 5  # of a try: smaller reaches, wider ones, other scales, if four centroids matched
-VERIFY = ("band", "star", "try", "iteration", "rival", "bound")
+VERIFY = ("band", "star", "try", "iteration", "rival", "bound", "miss")
 VOTES = ("reference", "ballot")
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
@@ -332,6 +332,8 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
             bound = total(costs, "bound", **v)
             found("bound", bound, paid)
             tries.append((cost + bound, steps + paid, MOST_MORE_FITS))
+            if matched < within:
+                found("miss", total(costs, "miss", **v), n * within)
         else:
             tries.append((cost, steps, 0))
     low, high = 0.0, 1e6
