@@ -122,9 +122,9 @@ class Handler(BaseHTTPRequestHandler):
         for place in range(0, len(rest), 4096) if remote.pause_s else ():
             time.sleep(remote.pause_s)
             self.wfile.write(rest[place : place + 4096])
+        request.sent = len(rest)  # before the client can have all of it, and asks
         if not remote.pause_s:
             self.wfile.write(rest)
-        request.sent = len(rest)
         if remote.stall and remote.stalls:
             remote.stalls -= 1
             self.wfile.flush()
