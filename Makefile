@@ -116,8 +116,8 @@ docs: $(READY) ## rewrite the generated pages of docs/, build the site in dist/d
 	$(BIN)/python tests/builders/star_page.py
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
 
-pictures: $(READY) ## draw the pictures of README.md again
-	$(BIN)/python tests/builders/pictures.py
+pictures: $(READY) ## draw the pictures of the documentation again
+	$(BIN)/python tests/builders/figures.py
 
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
 	$(BIN)/python tests/builders/golden.py
