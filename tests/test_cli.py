@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from every_command import every_command
 from typer.main import get_command
 
 import starcat as package

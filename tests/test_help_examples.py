@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from every_command import every_command
 
 from starcat.cli.options import chosen_spec
 from starcat.images.solve_files import identify_file

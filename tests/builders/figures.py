@@ -77,7 +77,7 @@ def draw_flow(path: Path) -> None:
 def draw_frame(folder: Path, path: Path) -> None:
     """Draw a frame, its stars and the triangles of its brightest stars."""
     matcher = starcat.Matcher.open(folder)
-    [frame] = starcat.simulate(folder, seed=7, false_stars=4)
+    [frame] = starcat.simulate(folder, seed=11, false_stars=4)
     result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
     known, px = result.star_index >= 0, frame.centroids_px
     figure = Figure(figsize=(5.2, 5.2), layout="constrained")
