@@ -334,8 +334,8 @@ def artifact_version(
         with h5py.File(artifact / "database.h5", "r+") as file:
             file.attrs["version"] = version
             file.attrs["spec"] = json.dumps(spec, sort_keys=True)
-        for path in (artifact / "report").iterdir():
-            path.write_bytes(path.read_bytes() + f"<!-- {version} -->".encode())
+        page = artifact / "report" / "index.html"
+        page.write_bytes(page.read_bytes() + f"<!-- {version} -->".encode())
         seal(artifact, lambda manifest: manifest.update(version=version, spec=spec))
         return artifact
 

@@ -24,7 +24,7 @@ FLOAT64 = np.dtype(np.float64)
 # Units by the ends of parameter names; the longer end comes first, as "_km_s" ends with "_s".
 UNITS = {
     "_km_s": "km / s", "_km": "km", "_arcsec": "arcsec", "_mas": "mas", "_deg": "deg",
-    "_rad": "rad", "_px": "pix", "_mag": "mag", "magnitudes": "mag", "mag": "mag", "_s": "s",
+    "_rad": "rad", "_px": "pix", "mag": "mag", "_s": "s",
 }  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
         return values
     mask = getattr(values, "mask", None)  # of a pandas column, a method
-    plain = _in_unit(name, values)
+    plain = without_unit(name, values)
     try:
         raw = np.asarray(plain)
         if raw.dtype.kind == "O":
@@ -103,8 +103,20 @@ def _number(value: Any) -> float:
     return float(value)
 
 
-def _in_unit(name: str, values: Any) -> Any:
-    """Return values without their unit, converted to that of the parameter."""
+def without_unit(name: str, values: Any) -> Any:
+    """Return a number or numbers without their unit, converted to the unit of the parameter.
+
+    Raises
+    ------
+    ConfigError
+        If the unit cannot be converted.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> float(without_unit("fov_x_deg", 30.0 * u.arcmin)), without_unit("fov_x_deg", 0.5)
+    (0.5, 0.5)
+    """
     unit = getattr(values, "unit", None)
     if unit is None:
         unit = getattr(values, "units", None)  # as other libraries of units have it
@@ -158,6 +170,22 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return number
 
 
+def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
+    """Return the error of an argument of another type than the parameter takes."""
+    return ArgumentTypeError(
+        f"{name} is of type {type(value).__name__}; expected {expected}",
+        key=name,
+        value=value,
+        fields=(name,),
+    )
+
+
+def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
+    """Check that an argument is of a type; `ArgumentTypeError` if it is of another one."""
+    if not isinstance(value, kind):
+        raise wrong_type(name, value, expected)
+
+
 def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)") -> Path:
     """Return an argument that has to be a path.
 
@@ -169,12 +197,7 @@ def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)
     try:
         return Path(os.fsdecode(os.fspath(value)))
     except TypeError:
-        raise ArgumentTypeError(
-            f"{name} is of type {type(value).__name__}; expected {expected}",
-            key=name,
-            value=value,
-            fields=(name,),
-        ) from None
+        raise wrong_type(name, value, expected) from None
 
 
 def paths_of(name: str, value: Any) -> list[Path]:

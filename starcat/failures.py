@@ -65,6 +65,7 @@ def failure_of(
         message = shown(worded(error, name_of), MAX_MESSAGE)
         return Failure(error.exit_code, kind, message, hint_in(message))
     if isinstance(error, TyperException):
+        _put_plainly(error)
         return Failure(
             error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
         )
@@ -90,6 +91,7 @@ OPTIONS = {
     "inputs": "input",
     "keep_out_deg": "keep-out",
     "memory_bytes": "memory",
+    "products": "product",
     "size_px": "size",
     "values": "set",
 }
@@ -147,7 +149,48 @@ def validation_message(error: ValidationFailure, *, show_input: bool = False) ->
     key = ".".join(str(step)[:100] for step in first["loc"][:10])
     found = show_input and first["type"] not in ("missing", "json_invalid")
     value = f" (found {str(first['input'])[:80]!r})" if found else ""
-    return Invalid(key, first["msg"].removeprefix("Value error, ") + value)
+    return Invalid(key, expected_words(first) + value)
+
+
+_EXPECTED = {
+    "greater_than_equal": "at least {ge:,}",
+    "greater_than": "more than {gt:,}",
+    "less_than_equal": "at most {le:,}",
+    "less_than": "less than {lt:,}",
+    "string_type": "a text in quotes",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "model_type": "a table",
+    "dict_type": "a table",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+}
+_LIBRARY_WORDS = re.compile(r"^\w+ should (be|have) (a valid )?")
+
+
+def expected_words(error: Mapping[str, Any]) -> str:
+    """Return what was expected of a value that pydantic has refused.
+
+    Examples
+    --------
+    >>> expected_words({"type": "less_than", "msg": "...", "ctx": {"lt": 120.0}})
+    'expected less than 120'
+    >>> expected_words({"type": "literal_error", "msg": "Input should be 'csv' or 'fits'"})
+    "expected 'csv' or 'fits'"
+    """
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "missing":
+        return kind
+    if kind == "string_pattern_mismatch":
+        from starcat.sections import PATTERN_WORDS
+
+        return f"expected {PATTERN_WORDS.get(context['pattern'], 'other characters')}"
+    if kind in _EXPECTED:
+        return f"expected {_EXPECTED[kind].format(**context)}".removesuffix(".0")
+    return _LIBRARY_WORDS.sub("expected ", str(error["msg"]).removeprefix("Value error, "))
 
 
 def shown(text: str, most: int) -> str:
@@ -189,6 +232,14 @@ def hint_in(message: str) -> str | None:
         level.append(depth)
     ends = [found for found in _SENTENCE.finditer(message) if level[found.start()] <= 0]
     return message[ends[-1].end() :].strip() or None if ends else None
+
+
+def _put_plainly(error: TyperException) -> None:
+    """Have a refused option say what was typed and what was expected."""
+    errors = getattr(error.__cause__, "errors", None)
+    if errors is not None:
+        first = errors()[0]
+        error.message = f"found {str(first['input'])[:80]!r}; {expected_words(first)}"
 
 
 def _usage(error: TyperException) -> str | None:

@@ -82,4 +82,16 @@ PlanarDeg = Annotated[float, Field(ge=0.001, le=80.0)]
 SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
 """The name of a catalog. It is never a path, because anybody may send a spec to a service."""
 
+PATTERN_WORDS = {
+    NAME_PATTERN: "1 to 64 lower-case letters, digits and '-', such as gaia-12deg",
+    SOURCE_NAME: "1 to 64 letters, digits, '_' and '-', such as gaia",
+    r"^[a-z0-9][a-z0-9_-]{0,31}$": "1 to 32 small letters, digits, '_' and '-', such as survey",
+    r"^[a-z][a-z0-9_]*$": "small letters, digits and '_', such as v_mag",
+    r"^[0-9A-Za-z][0-9A-Za-z._-]{0,31}$": "1 to 32 letters, digits, '.', '_' and '-'",
+    r"^$|^[a-z_][a-z0-9_.]*:[a-z_][a-z0-9_]*$": "module:function",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in lower case",
+    VERSION_PATTERN: "MAJOR.MINOR.PATCH, such as 1.0.1",
+}
+"""What texts look like that match a pattern, for messages."""
+
 CatalogName = Annotated[str, StringConstraints(pattern=SOURCE_NAME)]

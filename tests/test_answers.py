@@ -26,7 +26,8 @@ from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
-from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
+from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
+from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
@@ -69,7 +70,7 @@ def a_frame(
 def answer(sky: Database, **stated: object) -> tuple[SimulatedFrame, MatchResult]:
     frame = a_frame(sky, sky.camera, Noise(0.4, 0.1, 3, noise_mag=0.2))
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
-    return frame, matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    return frame, matcher.identify(frame.centroids_px, mag=frame.mag)
 
 
 def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:

@@ -37,18 +37,26 @@ def test_a_unit_is_converted_or_refused(matcher, frame):
     assert np.allclose(found.position_au, expected.position_au, rtol=1e-15)
     assert np.allclose(found.velocity_km_s, expected.velocity_km_s, rtol=1e-14)
     px = frame.centroids_px
-    same = matcher.identify(px * u.pix, magnitudes=frame.mag * u.mag)
+    same = matcher.identify(px * u.pix, mag=frame.mag * u.mag)
     assert same.star_index.tolist() == matcher.identify(px).star_index.tolist()
     refused = [
         lambda: matcher.identify(px * u.deg),
         lambda: matcher.identify_many([px, px * u.deg]),
         lambda: matcher.identify([[1.0 * u.deg, 2.0 * u.deg]]),
-        lambda: matcher.identify(px, magnitudes=frame.mag * u.Jy),
+        lambda: matcher.identify(px, mag=frame.mag * u.Jy),
         lambda: matcher.identify(px, sigma_px=np.ones(len(px)) * u.arcsec),
         lambda: matcher.identify(px, prior=np.ones(4) * u.m, prior_error_deg=1.0),
-        lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.deg),
+        lambda: matcher.identify(px, prior=same.q_body_from_icrs, prior_error_deg=1.0 * u.s),
+        lambda: matcher.identify(px, fov_error=1.0 * u.deg),
+        lambda: starcat.calibrate(matcher.database, frame, fov_deg=(8.0 * u.deg, 16.0 * u.mag)),
+        lambda: starcat.Camera(1280, 960, fov_x_deg=3.0 * u.pix),
+        lambda: starcat.Matcher.open(matcher.database, noise_px=0.5 * u.arcsec),
+        lambda: starcat.Tracker(matcher, max_turn_deg=1.0 * u.m),
+        lambda: starcat.Tracker(matcher).identify(px, time_s=1.0 * u.km),
         lambda: starcat.Observer.at(TIME, position_km=[1, 2, 3] * u.s),
-        lambda: starcat.simulate(matcher.database, noise_px=0.5 * u.pix),
+        lambda: starcat.simulate(matcher.database, noise_px=0.5 * u.mag),
+        lambda: starcat.ingest("sao", read_limit_mag=5.0 * u.pix),
+        lambda: starcat.init(matcher.database.camera, faint_limit_mag=5.0 * u.Jy),
         lambda: expected.apparent(np.eye(3), np.ones(3) * u.m),
     ]
     for ask in refused:
@@ -56,17 +64,32 @@ def test_a_unit_is_converted_or_refused(matcher, frame):
             ask()
 
 
+def test_a_single_number_has_its_unit_converted(matcher, frame):
+    assert starcat.Camera(64, 64, fov_x_deg=180 * u.arcmin) == starcat.Camera(64, 64, fov_x_deg=3.0)
+    stated = starcat.Matcher(matcher.database, noise_px=0.5 * u.pix, time_limit_s=100 * u.ms)
+    assert (stated.noise_px, stated.time_limit_s) == (0.5, 0.1)
+    assert starcat.Tracker(matcher, max_turn_deg=60 * u.arcmin).max_turn_deg == 1.0
+    tracker = starcat.Tracker(matcher)
+    assert tracker.identify(frame, time_s=1.0 * u.min).ok
+    with pytest.raises(ConfigError, match=r"above 60\.0, the time of the frame before"):
+        tracker.identify(frame, time_s=59.0)
+    made = starcat.simulate(matcher.database, seed=7, noise_px=0.5 * u.pix, noise_mag=200 * u.mmag)
+    assert made[0].centroids_px.tolist() == frame.centroids_px.tolist()
+    off = matcher.identify(frame, fov_error=5 * u.percent)
+    assert off.camera == matcher.identify(frame, fov_error=0.05).camera
+
+
 def test_masked_entries_are_not_used(matcher, frame):
     px = np.ma.array(frame.centroids_px, mask=False)
     px[0] = np.ma.masked
     mag = MaskedColumn(frame.mag, unit="mag", mask=np.arange(len(frame.mag)) == 1)
-    found = matcher.identify(px, magnitudes=mag)
+    found = matcher.identify(px, mag=mag)
     assert found.ok
     assert found.star_index[0] == -1
     assert found.dropped == ((0, "not_finite"),)
     assert matcher.identify_many([px])[0].dropped == ((0, "not_finite"),)
-    assert np.isnan(numbers_of("magnitudes", mag, "(N,)")[1])
-    assert np.isnan(numbers_of("magnitudes", [3.0, None], "(N,)")[1])
+    assert np.isnan(numbers_of("mag", mag, "(N,)")[1])
+    assert np.isnan(numbers_of("mag", [3.0, None], "(N,)")[1])
 
 
 @pytest.mark.parametrize(
@@ -90,11 +113,11 @@ def test_tables_are_read_by_the_names_of_their_columns(matcher, frame):
         pandas.DataFrame(columns),
         np.rec.fromarrays(list(columns.values()), names=list(columns)),
     ]
-    expected = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    expected = matcher.identify(frame.centroids_px, mag=frame.mag)
     for table in tables:
         found = matcher.identify(table)
         assert found.star_index.tolist() == expected.star_index.tolist()
-        assert found.frame.magnitudes.tolist() == frame.mag.tolist()
+        assert found.frame.mag.tolist() == frame.mag.tolist()
     many = matcher.identify_many(tables)
     assert [one.star_index.tolist() for one in many] == [expected.star_index.tolist()] * len(tables)
     for lacking in (Table({"x": x, "y_px": y}), pandas.DataFrame({"x": x, "y": y})):
@@ -119,7 +142,7 @@ def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
         ]
     [frame] = starcat.simulate(opened, seed=7)
     observer = starcat.Observer.at(TIME)
-    asked = opened, frame.centroids_px, matcher.database.camera, observer
+    asked = opened, frame, matcher.database.camera, observer
     found = starcat.identify_in_time(matcher.identify, *asked)
     assert starcat.sky_in_time(found, *asked)
 
@@ -133,6 +156,8 @@ WRONG = [
     lambda db: starcat.Camera(1280, 960, 100.0, fov_x_deg=3.0),
     lambda db: starcat.Camera(1280, 960, 100.0, distortion=Other()),
     lambda db: starcat.Camera(1280, 960, 100.0, principal_point_px=Other()),
+    lambda db: starcat.Matcher(db),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, selection=3),
     lambda db: starcat.Matcher.open(Other()),
     lambda db: starcat.Matcher.open(db, Other()),
     lambda db: starcat.Matcher.open(db).identify(Other()),
@@ -140,11 +165,15 @@ WRONG = [
     lambda db: starcat.Matcher.open(db).identify_many(Other()),
     lambda db: starcat.Matcher.open(db).identify_many(iter([Other()])),
     lambda db: starcat.Matcher.open(db).identify_many([], threads=0),
-    lambda db: starcat.Matcher.open(db).identify_many([], magnitudes=3.0),
+    lambda db: starcat.Matcher.open(db).identify_many([], mag=3.0),
     lambda db: starcat.Observer.at(Other()),
     lambda db: starcat.Observer.at(TIME, position_km=Other()),
     lambda db: starcat.build(Other()),
     lambda db: starcat.build({}),
+    lambda db: starcat.build(starcat.preset("gaia-12deg"), inputs=5),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), size_px="x"),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), size_px=3),
+    lambda db: starcat.calibrate(db, starcat.simulate(db, 3), camera=Other()),
     lambda db: starcat.calibrate(db, Other()),
     lambda db: starcat.calibrate(db, [Other()]),
     lambda db: starcat.connect(Other()),
@@ -152,11 +181,19 @@ WRONG = [
     lambda db: starcat.export(db, "csv", Other()),
     lambda db: starcat.export(db, "csv", "x", colour="red"),
     lambda db: starcat.export(db, Other()),
+    lambda db: starcat.export(db, "csv", products=5),
+    lambda db: starcat.export(db, "hats", max_partition_rows="x"),
+    lambda db: starcat.export(db, "onboard", max_bytes="x"),
+    lambda db: starcat.export(db, "onboard", sign=5),
     lambda db: starcat.identify_in_time(Other(), Other(), [[1, 2]], None, None),
+    lambda db: starcat.identify_in_time(print, db, [[1, 2]], Other(), starcat.Observer.at(TIME)),
+    lambda db: starcat.identify_in_time(print, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
+    lambda db: starcat.sky_in_time(None, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
     lambda db: starcat.ingest(Other()),
     lambda db: starcat.ingest("sao", Other()),
     lambda db: starcat.ingest("sao", epoch_jyear="soon"),
     lambda db: starcat.init(Other()),
+    lambda db: starcat.init(starcat.Camera(9, 9, 9.0), 5),
     lambda db: starcat.learn(db, Other()),
     lambda db: starcat.open(Other()),
     lambda db: starcat.preset(Other()),
@@ -174,6 +211,10 @@ WRONG = [
     lambda db: starcat.simulate(db, seed=-1),
     lambda db: starcat.simulate(Other()),
     lambda db: starcat.Tracker(Other()),
+    lambda db: starcat.Tracker(starcat.Matcher.open(db)).follow(5),
+    lambda db: starcat.Matcher.open(db).identify([[1, 2]]).to_dict(5),
+    lambda db: starcat.Matcher.open(db).identify(starcat.simulate(db)[0]).with_noise("x"),
+    lambda db: starcat.Matcher.open(db).identify([[1, 2]]).plot(5),
     lambda db: starcat.verify(Other()),
 ]
 

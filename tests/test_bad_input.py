@@ -650,7 +650,7 @@ def answers(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], Cal
         sky, eye = matcher.database, matcher.database.camera
         [frame] = simulate_frames(sky.directions, eye, 1, Noise(0.1), 1, mag=sky.mag)
         measured = MeasuredFrame("frame", frame.centroids_px, frame.mag)
-        result = matcher.identify(frame.centroids_px, eye, magnitudes=frame.mag)
+        result = matcher.identify(frame.centroids_px, eye, mag=frame.mag)
         content = FrameAnswer(measured, result).content()
         change(content)
         place.write("a.ndjson", json.dumps(content) + "\n")
@@ -691,6 +691,8 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "database that points to another file": run("selftest {copy}", hdf5(point_elsewhere)),
     "database whose index leads out of its table": run("selftest {copy}", hdf5(set_index)),
     "no database": run("simulate {folder}/small-1.0.0 -o {out}/frame.csv"),
+    "database and frame swapped": run("identify {frame} {artifact}"),
+    "output that exists": run("simulate {artifact} -o {folder}/f.csv", {"f.csv": ""}),
     "frame of a kind that is not written": run("simulate {artifact} -o {folder}/frame.gif"),
     "frame missing": run(IDENTIFY),
     "frame lacks columns": frames("x,y\n1,2\n"),
@@ -1145,6 +1147,12 @@ EXPORTS: Cases = {
     "product unknown": run(f"{EXPORT} --product star"),
     "HATS of what are no stars": run(f"{EXPORT} --format hats --product pairs"),
     "another file of that name": run(EXPORT, {"out/stars.csv": "mine"}),
+    "one file for several products": run("export {artifact} -o {folder}/all.fits"),
+    "name of another format": run("export {artifact} --to fits -o {folder}/stars.csv"),
+    "camera of another size for C": run(
+        "export {artifact} --to onboard -o {folder}/a.img --camera {folder}/cam.toml",
+        {"cam.toml": "width_px = 64\nheight_px = 64\nfov_x_deg = 40.0\n"},
+    ),
     "file in place of the folder": run(EXPORT, {"out": "mine"}),
     "text that a format cannot hold": run(
         EXPORT_TABLE + "fits", table({"designation": ["α Centauri"]})
@@ -1194,6 +1202,8 @@ def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
 ONBOARD_IMAGES: Cases = {
     "onboard image that cannot be so small": run(f"{ONBOARD} --max-bytes 9000"),
     "onboard image for a method that has none": run(f"{ONBOARD} --method grid"),
+    "profile of an onboard image unknown": run(f"{ONBOARD} --profile tiny"),
+    "profile without a method": run(f"{ONBOARD} --profile small --method triangle"),
     "byte order unknown": run(f"{ONBOARD} --endian middle"),
     "option of an onboard image for tables": run(f"{EXPORT} --to fits --max-bytes 9000"),
     "option of tables for an onboard image": run(f"{ONBOARD} --product stars"),

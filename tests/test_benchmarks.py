@@ -12,10 +12,11 @@ LACKING = 77
 
 BENCHMARKS = [
     "acquisition", "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines",
-    "false_matches", "fields", "hostile", "ingest", "instructions", "interrupts",
-    "matcher --of ruststartracker", "matcher --of starcat", "matcher --of tetra3rs",
-    "matcher --of cedar-solve", "photographs", "pictures", "planning", "products", "scale",
-    "service", "service_load", "shapes", "sql", "tracking", "votable",
+    "false_matches", "fields", "first_camera", "hostile", "ingest", "instructions", "interrupts",
+    "matcher --of tetra3rs", "matcher --of starcat", "matcher --of cedar-solve",
+    "matcher --of ruststartracker", "other_fields", "photographs", "pictures", "planning",
+    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "tracking",
+    "votable",
 ]  # fmt: skip
 
 

@@ -443,7 +443,7 @@ def judged_wide(stars: pa.Table) -> Selected:
             },
             "a box has an odd number of pixels on a side",
         ),
-        ({"neighbours.psf_sigma_px": "0.0"}, "psf_sigma_px: found 0.0; Input should be greater"),
+        ({"neighbours.psf_sigma_px": "0.0"}, "psf_sigma_px: found 0.0; expected at least"),
         ({"neighbours.psf_sigma_px": "1.0", "neighbours.action": "mend"}, "action: found 'mend'"),
         (
             {"neighbours.psf_sigma_px": "1.0", "doubles.action": "merge"},

@@ -70,7 +70,7 @@ def test_pictures_of_any_field_are_identified(matcher, sky):
         spots, camera, matrix = picture(sky, float(fov_deg), generator)
         result = matcher.identify(
             spots.centroids_px, Camera(*SIZE_PX, fov_x_deg=10.0),
-            magnitudes=spots.mag, fov_deg=RANGE_DEG,
+            mag=spots.mag, fov_deg=RANGE_DEG,
         )  # fmt: skip
         if result.ok:
             good = is_right(result, spots, camera, matrix, matcher.database.directions)
@@ -87,5 +87,5 @@ def test_pictures_of_other_fields_and_random_points_get_no_answer(matcher, sky):
         count = int(generator.integers(8, 120))
         given.append((generator.uniform((0, 0), SIZE_PX, (count, 2)), generator.normal(size=count)))
     camera = Camera(*SIZE_PX, fov_x_deg=10.0)
-    answers = [matcher.identify(px, camera, magnitudes=mag, fov_deg=RANGE_DEG) for px, mag in given]
+    answers = [matcher.identify(px, camera, mag=mag, fov_deg=RANGE_DEG) for px, mag in given]
     assert [answer.status for answer in answers] == ["no_match"] * len(answers)

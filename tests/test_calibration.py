@@ -229,9 +229,7 @@ def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     answers = []
     for real, told in ((camera, found.camera), (plain, plain)):
         unseen = photographs(database, real, 100, 77)
-        results = [
-            matcher.identify(frame.centroids_px, told, magnitudes=frame.mag) for frame in unseen
-        ]
+        results = [matcher.identify(frame.centroids_px, told, mag=frame.mag) for frame in unseen]
         answers.append(sum(result.status == "identified" for result in results))
     assert answers[0] == answers[1] >= 99
     grid = np.stack(np.meshgrid(*(np.linspace(1, s - 1, 9) for s in SIZE)), axis=-1).reshape(-1, 2)

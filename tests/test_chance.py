@@ -441,7 +441,7 @@ def accepted(matcher: Matcher, frames: list[SimulatedFrame]) -> int:
     """Return how many frames are identified, all of them rightly."""
     count = 0
     for frame in frames:
-        found = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        found = matcher.identify(frame.centroids_px, mag=frame.mag)
         if found.status == "identified":
             count += 1
             turned = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
@@ -470,7 +470,7 @@ def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     frames = withheld(narrow_sky, 6, 1.0, 0.0, 1e-6)
     stated = Matcher(narrow_sky, "pairs", noise_px=1.0, noise_mag=NOISE_MAG)
     assert accepted(stated, frames) >= 4
-    assert stated.identify(frames[0].centroids_px, magnitudes=frames[0].mag).n_matched == 6
+    assert stated.identify(frames[0].centroids_px, mag=frames[0].mag).n_matched == 6
 
 
 # --- Assignments: their numbers are those of an enumeration, and never above the bound

@@ -21,6 +21,7 @@ from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli.console import OPTIONS, PANELS
 from starcat.cli.main import app
+from starcat.cli.reference import every_command
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
@@ -191,7 +192,9 @@ def test_ingest_writes_the_rejected_rows_beside_it(starcat, sao_file, tmp_path):
     assert fits(run.out)
     # A second run without malformed records takes the old file of them away.
     sao_file.write_bytes(sao_file.read_bytes().removesuffix(b"short\n"))
-    assert starcat(["ingest", "sao", "--input", sao_file, "-o", out]).code == 0
+    again = ["ingest", "sao", "--input", sao_file, "-o", out]
+    assert starcat(again).code == 1
+    assert starcat([*again, "--replace"]).code == 0
     assert not (tmp_path / "out.rejected.parquet").exists()
 
 
@@ -241,7 +244,13 @@ def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
     artifact = tmp_path / "dist" / "small-1.0.0"
     estimate, _, rest = run.err.partition("\n")
     assert estimate.startswith("estimate: ")
-    assert rest == f"written: {artifact}\nreport: {artifact / 'report' / 'index.html'}\n"
+    written, report, go_on, *commands = rest.splitlines()
+    assert written == f"written: {artifact}"
+    assert report == f"report: {artifact / 'report' / 'index.html'}"
+    assert go_on == "go on with:"
+    assert [line.split()[:3] for line in commands] == [
+        ["starcat", name, str(artifact)] for name in ("simulate", "identify", "export")
+    ]
     assert (artifact / "report" / "index.html").is_file()
     assert fits(run.out)
     for words in ("read", "kept", "rejected: too_faint", "fields below 4", "pairs-1.0.0", "clean"):
@@ -347,8 +356,8 @@ def test_a_build_of_nothing_lists_the_presets(starcat, tmp_path, monkeypatch):
 
 
 def test_ingest_takes_its_input_as_the_other_commands_do(starcat, sao_file, tmp_path):
-    for text in (sao_file, f"sao={sao_file}"):
-        out = tmp_path / "out.parquet"
+    for name, text in (("a", sao_file), ("b", f"sao={sao_file}")):
+        out = tmp_path / f"{name}.parquet"
         assert starcat(["ingest", "sao", "--input", text, "-o", out]).code == 0
 
 
@@ -557,10 +566,8 @@ def test_what_is_not_there_has_one_wording_and_one_exit_code(starcat, small_arti
     assert re.search(r"nope\S*: no such [a-z, ]+; ", " ".join(run.err.split())), run.err
 
 
-@pytest.mark.parametrize("command", ["ingest sao --input {here}/s -o {here}/x.csv",
-                                     "crossmatch {here}/a {here}/b -o {here}/z.fits"])  # fmt: skip
-def test_a_file_that_is_written_as_parquet_ends_so(starcat, tmp_path, command):
-    run = starcat(command.format(here=tmp_path).split())
+def test_a_file_that_is_written_as_parquet_ends_so(starcat, tmp_path):
+    run = starcat(["ingest", "sao", "--input", tmp_path / "s", "-o", tmp_path / "x.csv"])
     assert run.code == 2
     assert "end its name with .parquet" in " ".join(run.err.split())
     assert not list(tmp_path.iterdir())

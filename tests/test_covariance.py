@@ -40,7 +40,7 @@ def errors_of(sky: Database, count: int, **stated: object) -> tuple[np.ndarray, 
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
     errors, free = [], []
     for frame in simulate_frames(sky.directions, CAMERA, count, Noise(NOISE_PX), 8, sky.mag):
-        found = matcher.identify(frame.centroids_px, CAMERA, magnitudes=frame.mag)
+        found = matcher.identify(frame.centroids_px, CAMERA, mag=frame.mag)
         if found.ok:
             turn = found.matrix @ frame.matrix.T
             skew = 0.5 * ARCSEC * (turn - turn.T)
@@ -105,7 +105,7 @@ def test_what_the_library_writes_is_what_numpy_makes_of_the_answer(sky, camera, 
         rng = np.random.default_rng(3)
         sigma_px = rng.uniform(0.1, 0.6, len(frame.mag))
         for sigma in (None, sigma_px, np.where(sigma_px > 0.5, np.nan, sigma_px)):
-            given = {"magnitudes": frame.mag, "sigma_px": sigma, "fov_error": fov_error}
+            given = {"mag": frame.mag, "sigma_px": sigma, "fov_error": fov_error}
             found = matcher.identify(frame.centroids_px, camera, **given)
             if not found.ok:
                 continue

@@ -43,17 +43,17 @@ def crowded(sky, count, seed=3):
 def test_fifty_thousand_centroids_take_little_memory_however_they_are_asked(sky, engine):
     px, mag, stars = crowded(sky, 50_000)
     one = Matcher(sky, engine=engine)
-    alone = one.identify(px[stars >= 0], magnitudes=mag[stars >= 0])
+    alone = one.identify(px[stars >= 0], mag=mag[stars >= 0])
     tracker = Tracker(one)
-    tracker.identify(px, magnitudes=mag)
+    tracker.identify(px, mag=mag)
     asked = {
-        "identify": lambda: one.identify(px, magnitudes=mag),
+        "identify": lambda: one.identify(px, mag=mag),
         "prior": lambda: one.identify(
-            px, magnitudes=mag, prior=alone.q_body_from_icrs, prior_error_deg=0.5
+            px, mag=mag, prior=alone.q_body_from_icrs, prior_error_deg=0.5
         ),
-        "scale": lambda: one.identify(px, magnitudes=mag, fov_error=0.02),
-        "many": lambda: one.identify_many([px, px], magnitudes=[mag, mag])[1],
-        "tracking": lambda: tracker.identify(px, magnitudes=mag),
+        "scale": lambda: one.identify(px, mag=mag, fov_error=0.02),
+        "many": lambda: one.identify_many([px, px], mag=[mag, mag])[1],
+        "tracking": lambda: tracker.identify(px, mag=mag),
     }
     for name, ask in asked.items():
         tracemalloc.start()
@@ -103,11 +103,11 @@ def test_one_odd_frame_leaves_the_others_to_the_c_library(sky, monkeypatch):
         matcher, "solve", lambda *args, **more: asked.append(1) or run(*args, **more)
     )
     one = Matcher(sky, engine="c")
-    found = one.identify_many(px, magnitudes=mags, sigma_px=sigma)
+    found = one.identify_many(px, mag=mags, sigma_px=sigma)
     assert len(asked) == 1
     assert found.status == ["identified"] * 6
     for n, answer in enumerate(found):
-        alone = one.identify(px[n], magnitudes=mags[n], sigma_px=sigma[n])
+        alone = one.identify(px[n], mag=mags[n], sigma_px=sigma[n])
         assert answer.star_index.tolist() == alone.star_index.tolist()
         assert answer.n_not_searched == alone.n_not_searched == (188 if n == 2 else 0)
         assert np.array_equal(answer.q_body_from_icrs, found.q_body_from_icrs[n])
@@ -137,8 +137,8 @@ def test_a_magnitude_of_no_star_is_as_unknown_as_nan(sky, engine, value):
     for frame in frames_of(sky, 5, Noise(0.5, 0.1, 3, noise_mag=0.3), seed=4):
         strange, unknown = frame.mag.copy(), frame.mag.copy()
         strange[::5], unknown[::5] = value, np.nan
-        found = one.identify(frame.centroids_px, magnitudes=strange)
-        expected = one.identify(frame.centroids_px, magnitudes=unknown)
+        found = one.identify(frame.centroids_px, mag=strange)
+        expected = one.identify(frame.centroids_px, mag=unknown)
         assert found.star_index.tolist() == expected.star_index.tolist()
 
 
@@ -150,7 +150,7 @@ def test_both_engines_take_a_magnitude_of_no_star_alike(sky, value):
         mag = frame.mag.copy()
         mag[::3] = value
         one, other = (
-            Matcher(sky, engine=engine, noise_mag=0.3).identify(frame.centroids_px, magnitudes=mag)
+            Matcher(sky, engine=engine, noise_mag=0.3).identify(frame.centroids_px, mag=mag)
             for engine in ENGINES
         )
         assert (one.status, one.dropped) == (other.status, other.dropped)

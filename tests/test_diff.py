@@ -91,7 +91,8 @@ def test_every_star_is_accounted_for(small_artifact, make, sao_lines):
     lines[brighter] = with_text(lines[brighter], 80, b" 3.1")
     dec = float(lines[shifted][193:204])
     lines[shifted] = with_text(lines[shifted], 193, f"{dec + 1e-6:+11.8f}".encode())
-    lines.append(with_text(lines[gone], 0, b"   601"))
+    new = with_text(lines[gone], 0, b"   601")
+    lines.append(with_text(new, 193, f"{float(new[193:204]) + 0.001:+11.8f}".encode()))
     del lines[gone]
     found = diff_artifacts(open_artifact(small_artifact), make("b", lines))
     assert [(s.star_id, s.designation, s.reason) for s in found.came] == [
@@ -146,14 +147,23 @@ def test_products_of_one_side(small_artifact, make):
     assert found.spec == (Change("products.triangles.enabled", True, False),)
 
 
-def test_numbers_of_two_catalogs_are_not_the_same_star(small_artifact):
+def test_a_star_with_a_new_number_is_paired_by_its_position(small_artifact, make, sao_lines):
+    lines = list(sao_lines)
+    lines.append(with_text(lines.pop(99), 0, b"   601"))
+    found = diff_artifacts(open_artifact(small_artifact), make("b", lines))
+    count = len(open_artifact(small_artifact).table("stars"))
+    assert (found.paired_by_number, found.paired_by_position) == (count - 1, 1)
+    assert not found.came + found.went
+
+
+def test_stars_of_two_catalogs_are_paired_by_position(small_artifact):
     a, b = open_artifact(small_artifact), open_artifact(small_artifact)
     b.manifest["spec"]["catalog"]["source"] = "tycho2"
     b.manifest["software"]["numpy"] = "1.0"
     found = diff_artifacts(a, b)
     count = len(a.table("stars"))
-    assert (len(found.came), len(found.went), len(found.moved)) == (count, count, 0)
-    assert {star.reason for star in found.came + found.went} == {NOT_READ}
+    assert (len(found.came), len(found.went), len(found.moved)) == (0, 0, 0)
+    assert found.paired_by_number == count  # the numbers are those of the same positions
     assert [(change.name, change.b) for change in found.software] == [("numpy", "1.0")]
 
 

@@ -39,6 +39,7 @@ WALKED = [
     "docs/howto-query.md",
     "docs/howto-release.md",
     "docs/howto-own-catalog.md",
+    "docs/howto-new-release.md",
 ]
 
 
@@ -61,6 +62,7 @@ def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
     found = commands(ROOT / name)
     assert found
     monkeypatch.setenv("STARCAT_CATALOGS", str(catalogs))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     for spec in re.findall(r"```toml\n# (\S+)\n(.*?)```", (ROOT / name).read_text(), re.DOTALL):
         Path(spec[0]).write_text(spec[1])

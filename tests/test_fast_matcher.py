@@ -57,8 +57,8 @@ def test_hard_frames_get_the_same_stars(sky, method, stated, magnitudes):
     identified = 0
     for frame in frames(sky, 25, HARD, seed=11):
         mag = frame.mag if magnitudes else None
-        expected = in_numpy.identify(frame.centroids_px, magnitudes=mag)
-        assert_same(in_c.identify(frame.centroids_px, magnitudes=mag), expected)
+        expected = in_numpy.identify(frame.centroids_px, mag=mag)
+        assert_same(in_c.identify(frame.centroids_px, mag=mag), expected)
         identified += expected.status == "identified"
     assert identified > 15
 
@@ -73,8 +73,8 @@ def test_a_frame_as_noisy_as_stated_gets_the_same_stars(sky, seed, noise_px, mis
     in_c, in_numpy = both(sky)
     (frame,) = frames(sky, 1, Noise(noise_px, missing, false_stars, noise_mag=0.5), seed)
     for mag in (None, frame.mag):
-        expected = in_numpy.identify(frame.centroids_px, magnitudes=mag)
-        assert_same(in_c.identify(frame.centroids_px, magnitudes=mag), expected)
+        expected = in_numpy.identify(frame.centroids_px, mag=mag)
+        assert_same(in_c.identify(frame.centroids_px, mag=mag), expected)
 
 
 @pytest.mark.parametrize("stated", [{}, {"noise_px": 0.7, "noise_mag": 0.3}])
@@ -86,8 +86,8 @@ def test_false_spots_beside_stars_get_the_same_stars(sky, stated):
         beside = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
         px = np.concatenate([frame.centroids_px, frame.centroids_px + beside])
         mag = np.concatenate([frame.mag, frame.mag + 0.1])
-        expected = in_numpy.identify(px, magnitudes=mag)
-        assert_same(in_c.identify(px, magnitudes=mag), expected)
+        expected = in_numpy.identify(px, mag=mag)
+        assert_same(in_c.identify(px, mag=mag), expected)
 
 
 LENSES = [Distortion(k1=-0.2), Distortion(k1=0.1, k2=-0.3, k3=0.2, p1=2e-3, p2=-1e-3)]
@@ -117,9 +117,9 @@ def test_what_cannot_be_used_is_reported_alike(sky):
     mag = np.concatenate([[nan, 1, 2, 3, 4, nan, 1.0, 9.0, nan], frame.mag])
     infinite = np.where(np.isnan(mag), -np.inf, mag)
     for magnitudes in (None, mag, infinite, np.full(len(mag), nan)):
-        expected = in_numpy.identify(given_px, magnitudes=magnitudes)
+        expected = in_numpy.identify(given_px, mag=magnitudes)
         assert len(expected.dropped) == 8
-        assert_same(in_c.identify(given_px, magnitudes=magnitudes), expected)
+        assert_same(in_c.identify(given_px, mag=magnitudes), expected)
     for count in (0, 3, 4):
         few = frame.centroids_px[:count]
         assert_same(in_c.identify(few), in_numpy.identify(few))
@@ -129,7 +129,7 @@ def test_a_frame_that_is_too_large_for_the_library_is_answered(sky):
     (frame,) = frames(sky, 1)
     false = np.random.default_rng(8).random((600, 2)) * 1024.0
     mag = np.concatenate([frame.mag, np.full(600, 9.0)])
-    found = Matcher(sky).identify(np.concatenate([frame.centroids_px, false]), magnitudes=mag)
+    found = Matcher(sky).identify(np.concatenate([frame.centroids_px, false]), mag=mag)
     assert len(found.star_index) > 600
 
 
@@ -151,15 +151,15 @@ def test_answers_do_not_depend_on_threads_or_on_company(sky):
     matcher = Matcher(sky, engine="c")
     some = frames(sky, 600, HARD, seed=21)
     px, mags = [frame.centroids_px for frame in some], [frame.mag for frame in some]
-    one = matcher.identify_many(px, magnitudes=mags, threads=1)
-    four = matcher.identify_many(px, magnitudes=mags, threads=4)
+    one = matcher.identify_many(px, mag=mags, threads=1)
+    four = matcher.identify_many(px, mag=mags, threads=4)
     assert isinstance(one, BatchResult)
     assert isinstance(four, BatchResult)
     assert one.status == four.status
     np.testing.assert_array_equal(one.q_body_from_icrs, four.q_body_from_icrs)
     assert (one.seconds > 0.0).all()
     for number in (0, 255, 256, 599, -1):
-        alone = matcher.identify(px[number], magnitudes=mags[number])
+        alone = matcher.identify(px[number], mag=mags[number])
         for many in (one, four):
             assert many[number].star_ids.tolist() == alone.star_ids.tolist()
             assert np.array_equal(
@@ -183,17 +183,17 @@ def test_frames_may_be_given_as_one_frame_may(sky):
     ]
     mags = [frame.mag.tolist(), [], None, frame.mag[::-1][::-1], frame.mag, frame.mag]
     for known in (None, mags):
-        found = matcher.identify_many(px, magnitudes=known)
+        found = matcher.identify_many(px, mag=known)
         for number, given_px in enumerate(px):
-            alone = matcher.identify(given_px, magnitudes=known and known[number])
+            alone = matcher.identify(given_px, mag=known and known[number])
             assert_same(found[number], alone)
     assert [answer.ok for answer in found] == [True, False, True, True, True, True]
     assert len(matcher.identify_many([])) == 0
     for wrong in ([[1.0, 2.0, 3.0]], [1.0, 2.0], 5.0):
         with pytest.raises(ValueError, match="expected"):
             matcher.identify_many([frame.centroids_px, wrong])
-    with pytest.raises(ValueError, match=r"magnitudes has shape \(1,\); expected"):
-        matcher.identify_many([frame.centroids_px], magnitudes=[[1.0]])
+    with pytest.raises(ValueError, match=r"mag has shape \(1,\); expected"):
+        matcher.identify_many([frame.centroids_px], mag=[[1.0]])
 
 
 def told(answer: MatchResult) -> list[str]:
@@ -205,13 +205,13 @@ def told(answer: MatchResult) -> list[str]:
 def test_an_answer_keeps_its_values_when_the_next_frame_comes(sky):
     matcher = Matcher(sky, engine="c")
     some = frames(sky, 12, HARD, seed=5)
-    expected = [told(matcher.identify(one.centroids_px, magnitudes=one.mag)) for one in some]
+    expected = [told(matcher.identify(one.centroids_px, mag=one.mag)) for one in some]
     px, mag = np.empty((100, 2)), np.empty(100)
     found = []
     for one in some:  # the caller's memory is used again too
         count = len(one.mag)
         px[:count], mag[:count] = one.centroids_px, one.mag
-        found.append(matcher.identify(px[:count], magnitudes=mag[:count]))
+        found.append(matcher.identify(px[:count], mag=mag[:count]))
     px[:], mag[:] = -1.0, 99.0
     assert [told(answer) for answer in found] == expected
 
@@ -221,7 +221,7 @@ def test_threads_that_share_a_matcher_get_the_answers_of_one(sky):
     some = frames(sky, 200, HARD, seed=7)
 
     def ask(frame: SimulatedFrame) -> MatchResult:
-        return matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        return matcher.identify(frame.centroids_px, mag=frame.mag)
 
     expected = [told(ask(frame)) for frame in some]
     with ThreadPoolExecutor(2) as pool:
@@ -322,5 +322,5 @@ def test_50_000_frames_of_random_points_get_no_answer(sky, stated):
         counts = generator.integers(4, 21, 1000)
         px = [generator.random((count, 2)) * 1024.0 for count in counts]
         mags = [generator.choice(sky.mag, count) for count in counts]
-        found = matcher.identify_many(px, magnitudes=mags)
+        found = matcher.identify_many(px, mag=mags)
         assert set(found.status) == {"no_match"}

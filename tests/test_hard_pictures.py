@@ -223,7 +223,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     write_image(path, render_image(places, mag, size, optics, 5))
     measured = measure_picture(path)
     [frame] = measured.frames
-    first = matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag, fov_error=FOV_ERROR)
+    first = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
     [answer] = identify_file(path, matcher)
     assert answer.result.ok

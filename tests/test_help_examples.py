@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from starcat.cli.options import chosen_spec
+from starcat.cli.reference import every_command
 from starcat.images.solve_files import identify_file
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build_database

@@ -636,7 +636,6 @@ UNREAD = [
     ("a.tif", b"II*\0\x10\0\0\0CR\x02\0", r"a raw image of Canon \(CR2\)"),
     ("a.fits", b"XISF0100\xff\0", "an XISF image"),
     ("a.gif", b"GIF89a\xff", "a GIF image"),
-    ("a.NEF", b"MM\0*\0\0\0\x08\xff", r"a raw image of Nikon \(NEF\)"),
     ("a.ser", b"LUCAM-RECORDER\xff", "an SER video"),
     ("a.mov", b"\0\0\0\x14ftypqt  \xff", "an MP4 or QuickTime video"),
 ]
@@ -647,6 +646,58 @@ def test_a_format_that_is_not_read_is_named(name, data, words, tmp_path):
     (tmp_path / name).write_bytes(data + bytes(40))
     with pytest.raises(ConfigError, match=f"is {words}, which is not supported; convert it to"):
         starcat.read_frames(tmp_path / name)
+
+
+def dng(mosaic: np.ndarray, black: int) -> bytes:
+    """A raw picture of 16 bits in Adobe's format, as small as LibRaw reads it."""
+    height, width = mosaic.shape
+    pixels = mosaic.astype("<u2").tobytes()
+    ratios = struct.pack(
+        "<18i", *np.stack([np.eye(3).ravel() * 1000, np.full(9, 1000)], 1).astype(int).ravel()
+    )
+    shorts = lambda *values: (3, len(values), struct.pack(f"<{len(values)}H", *values))  # noqa: E731
+    text = b"starcat test\0"
+    tags = {
+        254: (4, 1, struct.pack("<I", 0)), 256: (4, 1, struct.pack("<I", width)),
+        257: (4, 1, struct.pack("<I", height)), 258: shorts(16), 259: shorts(1), 262: shorts(32803),
+        271: (2, len(text), text), 272: (2, len(text), text), 273: (4, 1, b""), 277: shorts(1),
+        278: (4, 1, struct.pack("<I", height)), 279: (4, 1, struct.pack("<I", len(pixels))),
+        33421: shorts(2, 2), 33422: (1, 4, bytes([0, 1, 1, 2])), 50706: (1, 4, bytes([1, 4, 0, 0])),
+        50708: (2, len(text), text), 50714: shorts(black), 50717: shorts(65535),
+        50721: (10, 9, ratios),
+    }  # fmt: skip
+    beyond = 8 + 2 + 12 * len(tags) + 4
+    extra = b"".join(value for _, _, value in tags.values() if len(value) > 4)
+    tags[273] = (4, 1, struct.pack("<I", beyond + len(extra)))
+    entries, at = b"", beyond
+    for tag, (kind, count, value) in tags.items():
+        entries += struct.pack("<HHI", tag, kind, count)
+        entries += struct.pack("<I", at) if len(value) > 4 else value.ljust(4, b"\0")
+        at += len(value) if len(value) > 4 else 0
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags))
+    return head + entries + bytes(4) + extra + pixels
+
+
+def test_a_raw_picture_is_read_above_its_black_level(tmp_path):
+    pytest.importorskip("rawpy", reason="rawpy, of the extra raw, is not installed")
+    image = np.full((96, 128), 1000.0)
+    y, x = np.mgrid[:96, :128] + 0.5
+    for x_px, y_px in ((40.25, 30.5), (90.75, 60.0)):
+        image += 20_000 * np.exp(-((x - x_px) ** 2 + (y - y_px) ** 2) / 4.0)
+    (tmp_path / "a.dng").write_bytes(dng(image, 900))
+    grey = read_image(tmp_path / "a.dng")
+    assert grey.shape == (96, 128)
+    assert np.median(grey) == pytest.approx(100.0, abs=1.0)
+    [frame] = starcat.read_frames(tmp_path / "a.dng")
+    found = frame.centroids_px[np.argsort(frame.centroids_px[:, 0])]
+    np.testing.assert_allclose(found, [(40.25, 30.5), (90.75, 60.0)], atol=0.05)
+
+
+def test_a_raw_picture_says_which_package_reads_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    (tmp_path / "a.NEF").write_bytes(b"MM\0*\0\0\0\x08\xff")
+    with pytest.raises(ConfigError, match=r"need the package rawpy .*\[raw\]"):
+        starcat.read_frames(tmp_path / "a.NEF")
 
 
 HEIC = base64.b64decode(

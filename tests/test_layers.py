@@ -70,6 +70,7 @@ LIGHT = {
     "starcat.arrays",
     "starcat.errors",
     "starcat.rooms",
+    "starcat.version",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
     "starcat.storage.file_formats",
@@ -207,7 +208,11 @@ def test_products_know_neither_catalogs_nor_artifacts(module):
     assert rooms <= {"ground", "geometry", "storage", "stars", "products"}
 
 
-OPTIONAL = {"starcat.matcher.result": {"astropy"}, "starcat.matcher.sky_objects": {"astropy"}}
+OPTIONAL = {
+    "starcat.matcher.batch": {"astropy"},
+    "starcat.matcher.result": {"astropy", "matplotlib", "scipy"},
+    "starcat.matcher.sky_objects": {"astropy", "matplotlib", "scipy"},
+}
 """What gives objects of a library to those who have it; it is imported when they are asked for."""
 
 

@@ -46,7 +46,7 @@ def identified(database, frames, path):
     matcher = Matcher(database)
     with path.open("w") as file:
         for frame in frames:
-            result = matcher.identify(frame.centroids_px, database.camera, magnitudes=frame.mag)
+            result = matcher.identify(frame.centroids_px, database.camera, mag=frame.mag)
             file.write(json.dumps(FrameAnswer(frame, result).content()) + "\n")
     return path
 
@@ -219,7 +219,7 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     observed = tomllib.loads(section.read_text())["selection"]["observed"]
     assert observed["zero_point_mag"] == pytest.approx(0.2, abs=0.02)
     assert observed["database"] == "small-1.0.0"
-    told_json = json.loads(starcat([*command, "--json"]).out)
+    told_json = json.loads(starcat([*command, "--json", "--replace"]).out)
     assert sorted(one["star_id"] for one in told_json["distrusted"]) == sorted(
         map(str, observed["reject"])
     )

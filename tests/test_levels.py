@@ -133,7 +133,7 @@ def test_frames_of_all_fields_of_a_range_are_identified(sky, fov_deg):
     true_px = Camera(1024, 768, fov_x_deg=fov_deg).focal_length_px
     for seed in range(4):
         px, mag, rows = frame_of(sky, fov_deg, seed)
-        result = matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+        result = matcher.identify(px, mag=mag, fov_deg=RANGE_DEG)
         assert result.ok, (fov_deg, seed, result.refusal)
         has_star = result.star_index >= 0
         assert has_star.sum() >= 8
@@ -153,24 +153,24 @@ def test_nothing_is_taken_for_a_frame_of_the_range(sky):
     mirrored = frame_of(sky, 20.0, 1)
     frames.append((np.array([1024.0, 0.0]) + mirrored[0] * [-1.0, 1.0], mirrored[1]))
     for px, mag in frames:
-        result = matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+        result = matcher.identify(px, mag=mag, fov_deg=RANGE_DEG)
         assert result.status == "no_match"
         assert result.refusal.reason in ("chance", "share_of_frame", "scale", "no_candidate")
-    few = matcher.identify(px[:3], magnitudes=mag[:3], fov_deg=RANGE_DEG)
+    few = matcher.identify(px[:3], mag=mag[:3], fov_deg=RANGE_DEG)
     assert few.status == "too_few_stars"
 
 
 def test_a_frame_outside_of_a_narrower_range_gets_no_answer(sky):
     matcher = Matcher(sky, engine="numpy")
     px, mag, _ = frame_of(sky, 20.0, 2)
-    assert matcher.identify(px, magnitudes=mag, fov_deg=(15.0, 25.0)).ok
+    assert matcher.identify(px, mag=mag, fov_deg=(15.0, 25.0)).ok
     for other in ((11.0, 18.0), (22.5, 38.0)):
-        assert matcher.identify(px, magnitudes=mag, fov_deg=other).status == "no_match"
+        assert matcher.identify(px, mag=mag, fov_deg=other).status == "no_match"
 
 
 def test_an_answer_counts_the_chance_of_all_levels(sky):
     px, mag, _ = frame_of(sky, 20.0, 2, faintest=9)
-    found = Matcher(sky, engine="numpy").identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+    found = Matcher(sky, engine="numpy").identify(px, mag=mag, fov_deg=RANGE_DEG)
     chance = found.false_match_probability
     assert found.ok
     focal_px = found.camera.focal_length_px
@@ -179,10 +179,10 @@ def test_an_answer_counts_the_chance_of_all_levels(sky):
     ends = [
         2.0 * math.degrees(math.atan(512.0 / focal_px)) for focal_px in (part.high_px, part.low_px)
     ]
-    alone = Matcher(sky, engine="numpy").identify(px, magnitudes=mag, fov_deg=tuple(ends))
+    alone = Matcher(sky, engine="numpy").identify(px, mag=mag, fov_deg=tuple(ends))
     assert chance == pytest.approx(4.0 * alone.false_match_probability, rel=1e-6)
     strict = Matcher(sky, engine="numpy", max_false_match_probability=0.9 * chance)
-    assert strict.identify(px, magnitudes=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
+    assert strict.identify(px, mag=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
 
 
 def test_parts_cover_the_range_once(sky):
@@ -254,7 +254,7 @@ def test_a_database_with_no_level_in_the_product_is_damaged(sky):
 def test_the_same_steps_give_the_same_end(sky):
     px, mag = np.random.default_rng(2).uniform(0, 768, (40, 2)), np.linspace(1.0, 5.0, 40)
     matcher = Matcher(sky, engine="numpy", max_steps=2000)
-    first, second = (matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG) for _ in range(2))
+    first, second = (matcher.identify(px, mag=mag, fov_deg=RANGE_DEG) for _ in range(2))
     assert first.refusal == second.refusal
     assert first.refusal.reason == "steps"
 

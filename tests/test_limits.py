@@ -143,12 +143,12 @@ def test_frames_that_no_answer_belongs_to_get_none(sky):
     matcher = Matcher(sky, max_steps=3_000)
     for number in range(120):
         kind, px, mag, fov_error = hostile_frame(number, sky)
-        result = matcher.identify(px, magnitudes=mag, fov_error=fov_error)
+        result = matcher.identify(px, mag=mag, fov_error=fov_error)
         assert not result.ok, (number, kind)
 
 
 def test_a_wide_tolerance_finds_what_a_narrow_one_does(sky):
     for frame in hard_frames(sky, 6, 60, 0.2):
         narrow, wide = Matcher(sky, tolerance_px=1.0), Matcher(sky, tolerance_px=6.0)
-        if narrow.identify(frame.centroids_px, magnitudes=frame.mag).ok:
-            assert wide.identify(frame.centroids_px, magnitudes=frame.mag).ok
+        if narrow.identify(frame.centroids_px, mag=frame.mag).ok:
+            assert wide.identify(frame.centroids_px, mag=frame.mag).ok

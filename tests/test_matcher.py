@@ -174,13 +174,13 @@ def test_what_numpy_cannot_convert_is_refused(triangles, values):
         triangles.identify(values)
     with pytest.raises(ConfigError, match="centroids_px is no array of real numbers"):
         triangles.identify_many([np.ones((5, 2)), values])
-    with pytest.raises(ConfigError, match=r"magnitudes is no array of real .* shape \(4,\)"):
-        triangles.identify(np.ones((4, 2)), magnitudes=values)
+    with pytest.raises(ConfigError, match=r"mag is no array of real .* shape \(4,\)"):
+        triangles.identify(np.ones((4, 2)), mag=values)
 
 
 @pytest.mark.parametrize("shape", [(3,), (5,), (4, 1), ()])
 def test_magnitudes_of_another_number_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"magnitudes has shape .*expected \(4,\)"):
+    with pytest.raises(ConfigError, match=r"mag has shape .*expected \(4,\)"):
         observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
 
 
@@ -580,8 +580,8 @@ def test_many_frames_are_answered_without_c(sky, monkeypatch):
 
 def test_many_frames_need_as_many_magnitudes(sky):
     (frame,) = frames(sky, 1)
-    with pytest.raises(ConfigError, match="magnitudes of 1 frames; expected 2"):
-        Matcher(sky).identify_many([frame.centroids_px] * 2, magnitudes=[frame.mag])
+    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
+        Matcher(sky).identify_many([frame.centroids_px] * 2, mag=[frame.mag])
 
 
 def test_engines_that_cannot_serve_say_why(sky, monkeypatch):

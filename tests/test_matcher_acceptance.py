@@ -251,7 +251,7 @@ def test_order_and_magnitudes_change_no_answer(answers, matcher, noise):
         shuffled = matcher.identify(frame.centroids_px[order])
         assert np.array_equal(shuffled.star_ids, without.star_ids[order])
         assert np.array_equal(shuffled.q_body_from_icrs, without.q_body_from_icrs, equal_nan=True)
-        found = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        found = matcher.identify(frame.centroids_px, mag=frame.mag)
         if without.status == found.status == "identified":
             # Other triangles lead there, and the same stars round differently.
             assert np.array_equal(found.star_ids, without.star_ids)
@@ -327,7 +327,7 @@ def answers_to_random_points(artifact: Path, seed: int, count: int) -> int:
     for _ in range(count):
         points = generator.random((generator.integers(4, 31), 2)) * size
         mag = generator.choice(matcher.database.mag, len(points))
-        answers += matcher.identify(points, magnitudes=mag).status == "identified"
+        answers += matcher.identify(points, mag=mag).status == "identified"
     return answers
 
 

@@ -121,9 +121,9 @@ class TestMethod:
             rough = frame.mag + generator.normal(scale=0.3, size=len(order))
             some = np.where(np.arange(len(rough)) % 2, rough, np.nan)
             for mag in (None, rough.round(), some, np.full(len(rough), np.nan)):
-                one = matcher.identify(frame.centroids_px, magnitudes=mag)
+                one = matcher.identify(frame.centroids_px, mag=mag)
                 shuffled = None if mag is None else mag[order]
-                other = matcher.identify(frame.centroids_px[order], magnitudes=shuffled)
+                other = matcher.identify(frame.centroids_px[order], mag=shuffled)
                 assert other.star_ids.tolist() == one.star_ids[order].tolist()
                 assert np.array_equal(other.q_body_from_icrs, one.q_body_from_icrs, equal_nan=True)
                 if one.ok and without.ok:

@@ -14,13 +14,15 @@ import pytest
 from starcat.api.functions import simulate
 from starcat.artifact.reader import open_artifact
 from starcat.cli import exchange
-from starcat.exchange.onboard import contents_of
-from starcat.matcher.database import open_database
+from starcat.exchange.onboard import contents_of, export_image
+from starcat.matcher.c_engine import CEngine
+from starcat.matcher.database import open_database, open_image
 from starcat.onboard import flight_limits
-from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import DIRECTION_SCALE
 from starcat.onboard.reading import read_onboard_image
+from starcat.simulation import in_flight
 
 
 @pytest.fixture
@@ -107,6 +109,46 @@ def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_pat
     assert starcat(["verify", path, "--against", small_artifact]).code == 0
 
 
+def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
+    small_artifact, tmp_path, starcat
+):
+    path = tmp_path / "db.img"
+    command = ["export", small_artifact, "--to", "onboard", "-o", path]
+    ran = starcat([*command, "--profile", "small"])
+    assert "by the profile small: those that are not among the 10 brightest of a field" in ran.err
+    said = json.loads(starcat([*command, "--profile", "small", "--json"]).out)
+    assert (said["profile"], said["method"]) == ("small", "pyramid")
+    assert said["image_bytes"] == path.stat().st_size
+    assert starcat(["verify", path, "--against", small_artifact]).code == 0
+    table = CEngine(open_image(path), path.read_bytes()).image.neighbours
+    assert said["voting_bytes"] == 4 * (table.capacity + table.n_stars + 1)
+    assert f"{said['voting_bytes']:,} bytes besides the image" in ran.out
+    ways = [(one["kind"], one["votes"]) for one in said["rates"]]
+    assert ways == [("clean", False), ("hard", False), ("clean", True), ("hard", True)]
+    for one in said["rates"]:
+        assert (one["frames"], one["wrong"]) == (200, 0)
+        assert one["identified"] >= (0.9 if one["kind"] == "hard" else 0.97) * one["frames"]
+        assert 0 < one["mean_steps"] <= one["most_steps"] <= FLIGHT_STEPS
+        assert f"at most {one['most_steps']:,}" in ran.out
+
+
+def test_without_a_profile_nothing_is_measured_and_the_full_one_has_the_same_bytes(
+    small_artifact, path, tmp_path, starcat
+):
+    full = tmp_path / "full.img"
+    command = ["export", small_artifact, "--to", "onboard", "--json", "-o"]
+    said = json.loads(starcat([*command, full, "--profile", "full"]).out)
+    assert full.read_bytes() == path.read_bytes()
+    assert {one["identified"] for one in said["rates"] if one["kind"] == "clean"} == {200}
+    assert "rates" not in json.loads(starcat([*command, path]).out)
+
+
+def test_an_image_that_flight_refuses_has_no_rates(small_artifact, tmp_path, monkeypatch):
+    monkeypatch.setattr(in_flight, "FLIGHT_STARS", 3)
+    made = export_image(small_artifact, "onboard", tmp_path / "db.img", profile="small")
+    assert made.rates == ()
+
+
 def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
     image, ran = read_onboard_image(path), starcat(["inspect", path])
     assert ran.code == 0
@@ -181,6 +223,8 @@ def test_the_limits_in_flight_are_those_of_the_header():
     header = (Path(__file__).parents[1] / "onboard" / "include" / "starcat.h").read_text()
     for name, limit in (("STARS", FLIGHT_STARS), ("CENTROIDS", FLIGHT_CENTROIDS)):
         assert re.findall(rf"#define STARCAT_MAX_{name} (\d+)", header) == [str(limit)]
+    source = (Path(__file__).parents[1] / "onboard" / "src" / "frame.c").read_text()
+    assert re.findall(r"max_steps = (\d+)u;", source) == [str(FLIGHT_STEPS)]
 
 
 def test_a_field_that_the_library_has_no_room_for_is_told_of(

@@ -17,13 +17,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.onboard import layout
 from starcat.onboard.c_source import c_header, c_source, c_symbol
-from starcat.onboard.checking import (
-    MIN_SHARE,
-    artifact_problems,
-    capacity_problems,
-    shrink,
-    value_problems,
-)
+from starcat.onboard.checking import artifact_problems, capacity_problems, shrink, value_problems
 from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
 from starcat.onboard.layout import (
@@ -36,6 +30,7 @@ from starcat.onboard.layout import (
     in_order,
     scrub,
 )
+from starcat.onboard.profiles import FULL, PROFILES
 from starcat.onboard.reading import read_onboard_image
 from starcat.products.pairs import find_pairs
 from starcat.products.tiling import tile_sphere
@@ -419,13 +414,52 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
         kept = {tuple(row) for row in fitted.contents.features.tolist()}
         left = np.array([tuple(row) in kept for row in contents.features.tolist()])
         assert seen[~left].max(initial=0) <= seen[left].min()
-        assert seen[left].sum() >= MIN_SHARE[method] * seen.sum()
+        assert seen[left].sum() >= FULL.least[method] * seen.sum()
     if share <= 0.25:
         assert fitted.stars < 1500
     if fitted.stars < 1500:
         assert fitted.stars_per_field is not None
         _, wanted = fields_of(contents)().brightest(fitted.stars_per_field)
         assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
+
+
+def test_a_profile_keeps_the_shortest_pairs_of_the_brightest_stars(real):
+    contents, _ = real
+    found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
+    pairs = np.stack([found.i, found.j], axis=-1)
+    contents, small = replace(contents, method="pyramid", features=pairs), PROFILES["small"]
+    fitted = shrink(contents, None, fields_of(contents), None, small)
+    _, wanted = fields_of(contents)().brightest(small.stars_per_field)
+    assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
+    assert fitted.stars_per_field == small.stars_per_field
+    u = fitted.contents.directions
+    i, j = fitted.contents.features.T
+    longest = separation(u[i], u[j]).max()
+    assert longest == pytest.approx(small.most * longest_pair_rad(CAMERA), rel=0.1)
+    every = find_pairs(u, 0.0, longest * (1.0 + 1e-12))
+    assert set(zip(every.i, every.j, strict=True)) == {tuple(np.sort(row)) for row in np.c_[i, j]}
+    image = read_onboard_image(make_image(fitted.contents).data)
+    cells = image.header["grid_bands"] * image.header["grid_sectors"]
+    assert fitted.stars / cells == pytest.approx(small.stars_per_cell, rel=0.2)
+    assert not [*artifact_problems(image, contents), *value_problems(image)]
+    # With less memory there are shorter pairs first, then fewer stars.
+    whole = len(image.data)
+    less = shrink(contents, None, fields_of(contents), whole - 1, small)
+    assert (less.stars, less.features < fitted.features) == (fitted.stars, True)
+    least = shrink(contents, None, fields_of(contents), 2 * whole // 3, small)
+    assert least.stars_per_field < small.stars_per_field
+
+
+def test_a_profile_keeps_all_stars_of_fields_that_have_few(real):
+    contents, _ = real
+    found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
+    pairs = np.stack([found.i, found.j], axis=-1)
+    contents = replace(contents, method="pyramid", features=pairs)
+    fields = fields_of(contents)
+    fullest = int(fields().count.max())
+    every = replace(PROFILES["small"], stars_per_field=fullest)
+    fitted = shrink(contents, None, fields, None, every)
+    assert (fitted.stars, fitted.stars_per_field) == (len(contents.star_id), None)
 
 
 def test_an_image_that_cannot_be_so_small_is_refused_with_what_it_takes(real):

@@ -158,11 +158,7 @@ EDITS_OF_MAP = (
     ('"mine"', '"sao"', "name: sao is a source of starcat; choose another name"),
     ("epoch =", "epoc =", "mine.toml: epoc: unknown key; did you mean 'epoch'?"),
     ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is no date; write it like 2016-01-01"),
-    (
-        "epoch",
-        'frame = "B1950"\nepoch',
-        "frame: found 'B1950'; Input should be 'ICRS', 'FK5', 'FK4'",
-    ),
+    ("epoch", 'frame = "B1950"\nepoch', "frame: found 'B1950'; expected 'ICRS', 'FK5', 'FK4'"),
     (
         "epoch",
         'frame = "FK5"\nequinox = "1975"\nepoch',

@@ -160,7 +160,7 @@ def test_tables_fit(registry, starcat, artifact_version):
         (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
         (
             ["pull", "small@1.0.0", "--registry", "registry"],
-            "pulled: dist/small-1.0.0; nothing is signed in this registry",
+            "pulled: dist/small-1.0.0; this registry has no signatures",
         ),
         (["pull", "--locked"], "unchanged: dist/small-1.0.0"),
         (["releases", "registry"], ""),
@@ -400,7 +400,7 @@ def test_without_a_registry_the_pinned_one_is_asked(registry, artifact_version):
     [
         ("{", "not what starcat writes.*restore the lock file"),
         ("[]", "not what starcat writes"),
-        ('{"format": "starcat-lock", "lock_version": "1.0.0"}', "artifacts: Field required"),
+        ('{"format": "starcat-lock", "lock_version": "1.0.0"}', "artifacts: missing"),
     ],
 )
 def test_damaged_lock_files(registry, text, message):
@@ -496,7 +496,7 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     ),
     "manifest with a strange digest": (
         of_manifest(lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")),
-        "files.pairs.parquet.sha256: String should match pattern",
+        "files.pairs.parquet.sha256: expected 64 hexadecimal digits in lower case",
     ),
     "manifest with a size that is none": (
         of_manifest(lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
@@ -509,12 +509,15 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "index not JSON": (index_of("<html>"), "not what starcat writes"),
     "index empty": (index_of(""), "not what starcat writes"),
     "index of deep lists": (index_of("[" * 100_000), "not what starcat writes"),
-    "index of something else": (index_of("{}"), "format: Field required"),
+    "index of something else": (index_of("{}"), "format: missing"),
     "index with a release twice": (
         of_index(lambda index: index["releases"].append(index["releases"][0])),
         "lists small-1.0.0 twice",
     ),
-    "index with a name that leads out": (first(name="../../x"), "releases.0.name: String should"),
+    "index with a name that leads out": (
+        first(name="../../x"),
+        "releases.0.name: expected 1 to 64",
+    ),
     "index with a version that leads out": (first(version="../../../x"), "releases.0.version"),
     "index with a digest that leads out": (
         first(manifest={"sha256": "../../x", "bytes": 1}),

@@ -290,7 +290,7 @@ def identified(
 ) -> MatchResult:
     """The answer to a frame in which planets may be."""
     identify = Matcher(sky).identify
-    return identify_in_time(identify, sky, frame, sky.camera, observer, magnitudes=magnitudes)
+    return identify_in_time(identify, sky, frame, sky.camera, observer, mag=magnitudes)
 
 
 @pytest.fixture(scope="module")
@@ -400,13 +400,13 @@ def test_a_star_beside_jupiter_does_not_take_its_spot(random_sky, jupiter_frame)
         np.append(random_sky.mag, 5.9), np.full(len(directions), b""), random_sky.products,
     )  # fmt: skip
     matcher = Matcher(database, engine="numpy")
-    assert matcher.identify(frame, camera, magnitudes=mag).star_ids[-1] == len(directions) - 1
-    found = identify_in_time(matcher.identify, database, frame, camera, observer, magnitudes=mag)
+    assert matcher.identify(frame, camera, mag=mag).star_ids[-1] == len(directions) - 1
+    found = identify_in_time(matcher.identify, database, frame, camera, observer, mag=mag)
     assert found.star_ids[-1] == -1
     assert found.dropped == ((len(frame) - 1, "jupiter"),)
     # A star that outshines the planet keeps its spot.
     database.mag[-1] = -3.0
-    found = identify_in_time(matcher.identify, database, frame, camera, observer, magnitudes=mag)
+    found = identify_in_time(matcher.identify, database, frame, camera, observer, mag=mag)
     assert found.star_ids[-1] == len(directions) - 1
 
 
@@ -415,24 +415,24 @@ def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupit
     camera, last = random_sky.camera, len(frame) - 1
     matcher, asked = Matcher(random_sky), []
 
-    def stubborn(centroids: Array, magnitudes: Array | None = None) -> Any:
+    def stubborn(centroids: Array, mag: Array | None = None) -> Any:
         """Refuse frames whose brightest spot is no star, as a stricter matcher does."""
         asked.append(centroids)
         keep = len(frame) if np.isnan(centroids[last]).all() else 2
-        mags = None if magnitudes is None else magnitudes[:keep]
-        return matcher.identify(centroids[:keep], camera, magnitudes=mags)
+        mags = None if mag is None else mag[:keep]
+        return matcher.identify(centroids[:keep], camera, mag=mags)
 
     at = Observer.at(JUPITER)
-    found = identify_in_time(stubborn, random_sky, frame, camera, at, magnitudes=mag)
+    found = identify_in_time(stubborn, random_sky, frame, camera, at, mag=mag)
     assert found.status == "identified"
     assert (last, "jupiter") in found.dropped
     assert (found.star_index[:last] == rows[:last]).mean() > 0.9
-    plain = matcher.identify(frame[:-1], camera, magnitudes=mag[:-1])
+    plain = matcher.identify(frame[:-1], camera, mag=mag[:-1])
     assert found.false_match_probability > plain.false_match_probability
     # At another time no planet is there, and leaving spots out is no way to an answer.
     other = Observer.at("2031-01-10T09:00:00")
     assert identify_in_time(
-        stubborn, random_sky, frame, camera, other, magnitudes=mag
+        stubborn, random_sky, frame, camera, other, mag=mag
     ).status != "identified"  # fmt: skip
     # Without a brightness nobody knows which spots to leave out.
     before = len(asked)
@@ -459,7 +459,7 @@ def test_the_earth_and_the_moon_do_not_take_the_spot_of_a_planet(random_sky, jup
     moon = replace(seen, directions=seen.directions.copy())
     moon.directions[seen.row("Moon")] = jupiter
     both = np.vstack([spot, spot + np.array([9.0, 0.0])])
-    names = planets_among(both, matrix, camera, moon, magnitudes=np.array([-2.7, -3.0]))
+    names = planets_among(both, matrix, camera, moon, mag=np.array([-2.7, -3.0]))
     assert names == {0: "jupiter", 1: "moon"}
 
 

@@ -116,7 +116,7 @@ def test_a_good_file_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "key", "message"),
     [
-        ('citation = "none"', 'cite = "none"', "citation", "Field required"),
+        ('citation = "none"', 'cite = "none"', "citation", "missing"),
         ('title = "Tiny"', 'title = "Tiny"\ncolour = 1', "colour", "Extra inputs"),
         ("record_bytes", "record_length", "record_length", "Extra inputs"),
         ('"I4"', '"I4", nulls = []', "nulls", "Extra inputs"),
@@ -128,7 +128,7 @@ def test_a_good_file_is_read(tmp_path):
         ('"mag", bytes', '"number", bytes', "files.0", "named twice: ['number']"),
         ('"F5.2"', '"R5.2"', "files.0.columns.1", "format 'R5.2' is not like I6"),
         ('"F5.2"', '"F5"', "files.0.columns.1", "format 'F5' is not like I6"),
-        ('"mag", bytes', '"Vmag", bytes', "files.0.columns.1.name", "match pattern"),
+        ('"mag", bytes', '"Vmag", bytes', "files.0.columns.1.name", "expected small letters"),
         ("record_bytes = 10\n", "", "files.0", "need record_bytes"),
         ('"fixed_width"', '"fits"', "files.0.layout", "'delimited'"),
         ('"ICRS"', '"B1950"', "frame", "'FK5'"),

@@ -392,7 +392,7 @@ def right_answers(
         found[rule] = 0
         for matrix in random_attitudes(frames, generator):
             frame = simulate_frame(sky, matcher.database.camera, matrix, noise, generator)
-            result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            result = matcher.identify(frame.centroids_px, mag=frame.mag)
             found[rule] += result.ok and answers_rightly(result, frame, matcher)
     return found
 

@@ -70,10 +70,10 @@ def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
     noise, same = Noise(0.5, 0.1, 3, noise_mag=0.3), 0
     for error_deg in (0.1, 3.0):
         for number, frame in enumerate(frames(sky, 20, noise)):
-            lost = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            lost = matcher.identify(frame.centroids_px, mag=frame.mag)
             prior = wrong(frame, error_deg, number)
             found = matcher.identify(
-                frame.centroids_px, magnitudes=frame.mag, prior=prior, prior_error_deg=error_deg
+                frame.centroids_px, mag=frame.mag, prior=prior, prior_error_deg=error_deg
             )
             assert found.ok == lost.ok
             # A centroid at the end of the reach may move the attitude so that it is within.

@@ -77,7 +77,7 @@ def test_votes_solve_frames_that_triangles_do_not(sky, frames):
     right = [0, 0]
     for frame in frames[:12]:
         for row, matcher in enumerate((found, alone)):
-            answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            answer = matcher.identify(frame.centroids_px, mag=frame.mag)
             if answer.ok:
                 assert np.degrees(np.arccos(answer.matrix[2] @ frame.matrix[2])) < 0.2
                 right[row] += 1
@@ -93,7 +93,7 @@ def test_both_engines_say_the_same(sky, frames, stated, has_magnitudes):
     slow = Matcher(sky, engine="numpy", **stated)
     for frame in frames[:10]:
         mag = frame.mag if has_magnitudes else None
-        answers = [one.identify(frame.centroids_px, magnitudes=mag) for one in (fast, slow)]
+        answers = [one.identify(frame.centroids_px, mag=mag) for one in (fast, slow)]
         if all(answer.ok for answer in answers):
             # A magnitude that an image rounds may be compatible with one centroid more.
             assert_same(*answers, log_error=0.1)
@@ -105,7 +105,7 @@ def test_c_solves_as_many_and_none_wrongly(sky, frames):
     matcher, right = Matcher(sky, **STATED), 0
     assert matcher._c_engine is not None
     for frame in frames:
-        answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        answer = matcher.identify(frame.centroids_px, mag=frame.mag)
         if answer.ok:
             assert np.degrees(np.arccos(answer.matrix[2] @ frame.matrix[2])) < 0.2
             right += 1
@@ -134,7 +134,7 @@ def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):
     monkeypatch.setattr(numpy_engine, "STEPS_BEFORE_VOTES", 0)
     monkeypatch.setattr(votes, "candidates", lambda *given: tried.append(given[0]) or own(*given))
     strict = Matcher(sky, engine="numpy", max_false_match_probability=1e-300, **STATED)
-    answer = strict.identify(frames[0].centroids_px, magnitudes=frames[0].mag)
+    answer = strict.identify(frames[0].centroids_px, mag=frames[0].mag)
     assert not answer.ok
     assert answer.refusal.reason == "chance"
     assert 0 < len(tried) < votes.MAX_REFERENCES

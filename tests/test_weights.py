@@ -167,7 +167,7 @@ def test_spots_of_a_picture_weigh_by_their_light(sky):
         mag = 4.0 + 6.0 * np.random.default_rng(number).random(len(frame.mag))
         picture = render_image(frame.centroids_px, mag, (1024, 1024), Optics(), number)
         spots = find_spots(picture, gain_e_per_adu=1.0)
-        found = matcher.identify(spots.centroids_px, magnitudes=spots.mag)
+        found = matcher.identify(spots.centroids_px, mag=spots.mag)
         if not found.ok:
             continue
         told = weighed(found, spots.sigma_px)

@@ -18,7 +18,7 @@ import starcat_service
 from starcat.cli import REFERENCE
 from starcat.errors import ConfigError, QueryError, worded
 from starcat.failures import failure_of, option_of
-from starcat.matcher.result import HINTS, bracketed
+from starcat.matcher.refusal import HINTS, bracketed
 
 PACKAGE = Path(starcat.__file__).parent
 SERVICE = Path(starcat_service.__file__).parent

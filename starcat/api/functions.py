@@ -13,7 +13,7 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import database_path, path_of, paths_of, whole_number
+from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database
+    from starcat.matcher.observation import FrameLike
+    from starcat.matcher.result import MatchResult
     from starcat.pipeline.build import Built
     from starcat.pipeline.starter import Starter
     from starcat.planning.plan import Plan
@@ -43,8 +45,8 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 
 
 OPTIONS_OF_EXPORT = (
-    "products", "max_partition_rows", "method", "endian", "max_bytes", "patch_from", "sign",
-    "replace",
+    "products", "max_partition_rows", "profile", "method", "endian", "max_bytes", "patch_from",
+    "sign", "camera", "replace",
 )  # fmt: skip
 """Options of `export`; each format has some of them."""
 
@@ -93,6 +95,7 @@ def build(
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
+    check_type("inputs", inputs or {}, Mapping, "a mapping of the names of sources to paths")
     given = {source: _inputs("inputs", files) for source, files in (inputs or {}).items()}
     return run(
         chosen,
@@ -147,9 +150,10 @@ def ingest(
     from starcat.store.reading import read_catalog as read
 
     name = source_given(_text_of("source", source)).name
-    for parameter, value in (("epoch_jyear", epoch_jyear), ("read_limit_mag", read_limit_mag)):
-        if value is not None:
-            checked_number(parameter, value)
+    if epoch_jyear is not None:
+        epoch_jyear = checked_number("epoch_jyear", epoch_jyear)
+    if read_limit_mag is not None:
+        read_limit_mag = checked_number("read_limit_mag", read_limit_mag)
     return read(
         name,
         locate(name, {name: _inputs("inputs", inputs)} if inputs is not None else {}),
@@ -162,7 +166,7 @@ def ingest(
 
 def calibrate(
     artifact: Artifact | PathLike,
-    frames: PathLike | Sequence[PathLike],
+    frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
@@ -178,8 +182,10 @@ def calibrate(
     artifact : Artifact, str or path-like
         A database for about this field: what `open_artifact` (``starcat.open``) returns, or its
         folder ``<name>-<version>``.
-    frames : path or sequence of paths
-        Images or files of centroids, of one camera.
+    frames : paths, frames or results, one or a sequence of them
+        Images or files of centroids of one camera, folders of them and patterns, as ``starcat
+        identify`` takes them; or frames as `Matcher.identify` takes them, such as those of
+        `simulate` and `read_frames`; or results, which hold their frames.
     camera : Camera, optional
         To start from; the database's own by default.
     size_px : tuple of int, optional
@@ -207,14 +213,21 @@ def calibrate(
     CalibrationError
         If too few frames can be identified; says which and why.
     """
-    from starcat.calibration.files import calibrate_files
-    from starcat.images.batch import frame_files
+    from starcat.calibration.files import calibrate_files, frames_given
+    from starcat.geometry.camera import Camera
+    from starcat.geometry.distortion import checked_pair
     from starcat.matcher.matcher import Matcher
     from starcat.progress import no_progress
 
+    if camera is not None:
+        check_type("camera", camera, Camera, "a starcat.Camera")
+    if size_px is not None:
+        checked_pair("size_px", size_px)
+        width_px, height_px = (whole_number("size_px", side, 1) for side in size_px)
+        size_px = width_px, height_px
     return calibrate_files(
         Matcher.open(artifact, method),
-        frame_files([str(path) for path in paths_of("frames", frames)]),
+        frames_given(frames),
         camera=camera,
         size_px=size_px,
         fov_deg=fov_deg,
@@ -327,11 +340,10 @@ def init(
     from starcat.pipeline.starter import starter_spec, write_starter
     from starcat.specs.build_spec import CameraSpec
 
-    if not isinstance(camera, Camera):
-        text = f"camera is of type {type(camera).__name__}; expected a starcat.Camera"
-        raise ArgumentTypeError(text, key="camera", value=camera, fields=("camera",))
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("name", name, str, "text")
     if faint_limit_mag is not None:
-        checked_number("faint_limit_mag", faint_limit_mag)
+        faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
     wanted = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
@@ -366,13 +378,14 @@ def simulate(
     false_stars : int, default 0
         Centroids that are no stars, in each frame.
     seed : int, default 0
-        The same seed gives the same frames.
+        The same seed gives the same frames: the first ones are the same for any ``count``, and
+        ``starcat simulate --seed`` writes the first one.
 
     Returns
     -------
-    list of Frame
-        ``centroids_px`` of shape (N, 2) and ``mag`` of shape (N,) to identify; ``matrix`` (body
-        from ICRS) and ``star_index`` are the truth.
+    list of SimulatedFrame
+        Each is a frame for `Matcher.identify`, with ``centroids_px`` of shape (N, 2) and ``mag`` of
+        shape (N,); ``matrix`` (body from ICRS) and ``star_index`` are the truth.
 
     Raises
     ------
@@ -382,18 +395,22 @@ def simulate(
     from starcat.geometry.distortion import checked_number
     from starcat.matcher.database import as_database
     from starcat.matcher.settings import in_range
-    from starcat.simulation.simulate import Noise, simulate_frames
+    from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
-    sky = as_database("database", database)
-    for name, value in (("noise_px", noise_px), ("noise_mag", noise_mag)):
-        if checked_number(name, value) < 0.0:
+    known = as_database("database", database)
+    noises = {"noise_px": noise_px, "noise_mag": noise_mag}
+    for name, value in noises.items():
+        noises[name] = checked_number(name, value)
+        if noises[name] < 0.0:
             text = f"{name} is {value!r}; expected a finite number, 0 or larger"
             raise ConfigError(text, key=name, value=value, fields=(name,))
-    in_range("drop_probability", drop_probability, 1.0, with_zero=True)
+    drop_probability = in_range("drop_probability", drop_probability, 1.0, with_zero=True)
     false = whole_number("false_stars", false_stars, 0)
-    noise = Noise(noise_px, drop_probability, false, noise_mag=noise_mag)
-    frames = whole_number("count", count, 0), noise, whole_number("seed", seed, 0)
-    return list(simulate_frames(sky.directions, sky.camera, *frames, mag=sky.mag))
+    px, mag = noises["noise_px"], noises["noise_mag"]
+    noise = Noise(px, drop_probability, false, noise_mag=mag)
+    sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
+    seed = whole_number("seed", seed, 0)
+    return list(simulate_sequence(sky, known.camera, frames, noise, seed))
 
 
 def plan(
@@ -504,9 +521,9 @@ def export(
     output : str or path-like, optional
         A folder for tables, by default ``export``, or for a solver's files; the file of an image.
     **options
-        ``products``, ``replace``, ``max_partition_rows`` for tables; ``method``, ``endian``,
-        ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of keys) for an image;
-        ``replace`` for a solver.
+        ``products``, ``replace``, ``max_partition_rows`` for tables; ``profile`` (full or small),
+        ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of
+        keys), ``camera`` (a file) for an image; ``replace`` for a solver.
 
     Returns
     -------
@@ -537,6 +554,15 @@ def export(
         known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
         text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
         raise ArgumentTypeError(text, key=unknown[0], value=options[unknown[0]])
+    for name in ("max_partition_rows", "max_bytes"):
+        if options.get(name) is not None:
+            options[name] = whole_number(name, options[name], 1)
+    if "sign" in options:
+        options["sign"] = paths_of("sign", options["sign"])
+    if options.get("products") is not None:
+        products = options["products"]
+        check_type("products", products, Iterable, "a sequence of names")
+        options["products"] = [products] if isinstance(products, str) else list(products)
     return run(**options)
 
 

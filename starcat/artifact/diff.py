@@ -1,7 +1,8 @@
 """What differs between two databases: spec, sources, software, stars and products.
 
-Stars are matched by their permanent number, so that the answer says which star of the sky came,
-went or moved, and why, and not which row.
+Stars are paired by their permanent number, so that the answer says which star of the sky came,
+went or moved, and why, and not which row. Where a catalog has given other numbers, as a new release
+may, stars are paired by position, motion and magnitude.
 """
 
 from __future__ import annotations
@@ -17,11 +18,20 @@ from numpy.typing import NDArray
 
 from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.sphere import separation
+from starcat.products.crossmatch import NEEDED, moving_stars
+from starcat.products.match_figures import MatchModel
+from starcat.products.match_stars import VERDICTS, crossmatch
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Reason
 
 MOVED_ARCSEC = 1e-3
 """Stars that are further from where they were have moved."""
+
+PAIR_ARCSEC = 10.0
+"""Largest separation of stars that are paired by position, at one epoch of the two."""
+
+FAR_ARCSEC = 60.0
+"""If half of the stars of the same number are farther apart, the numbers are others."""
 
 NOT_READ = "not in that catalog"
 
@@ -79,6 +89,8 @@ class Difference:
     came: tuple[OneSided, ...]  # guide stars of B alone, and of A alone
     went: tuple[OneSided, ...]
     moved: tuple[Moved, ...]  # guide stars of both, elsewhere or of another magnitude
+    paired_by_number: int  # guide stars of both that have one number
+    paired_by_position: int  # the other ones: paired by position, motion and magnitude
     products: tuple[ProductChange, ...]  # every product of either
 
     @property
@@ -95,11 +107,14 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
     """Compare two databases."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
-    # A number means the same star only within one catalog.
-    is_one_catalog = _catalog(a) == _catalog(b)
-    rows_a, rows_b = _common_rows(stars_a, stars_b) if is_one_catalog else (_NO_ROWS, _NO_ROWS)
-    known_a = rejected_a if is_one_catalog else rejected_a.slice(0, 0)
-    known_b = rejected_b if is_one_catalog else rejected_b.slice(0, 0)
+    # A number means the same star only within one catalog, and only if it kept its numbers.
+    is_numbered_alike = _catalog(a) == _catalog(b) and _agree(stars_a, stars_b)
+    rows_a, rows_b = _paired_rows(stars_a, stars_b, is_numbered_alike=is_numbered_alike)
+    n_numbered = int((_numbers(stars_a)[rows_a] == _numbers(stars_b)[rows_b]).sum())
+    known_a, known_b = rejected_a, rejected_b
+    if not is_numbered_alike:
+        known_a = _numbered_as(stars_b.take(_others(stars_b, rows_b)), rejected_a)
+        known_b = _numbered_as(stars_a.take(_others(stars_a, rows_a)), rejected_b)
     return Difference(
         spec=changes_between(_dotted(a.manifest["spec"]), _dotted(b.manifest["spec"])),
         sources=changes_between(_source_facts(a), _source_facts(b)),
@@ -107,6 +122,8 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
         came=_one_sided(stars_b, rows_b, known_a, _read_limit_mag(a, b)),
         went=_one_sided(stars_a, rows_a, known_b, _read_limit_mag(b, a)),
         moved=_moved(stars_a.take(rows_a), stars_b.take(rows_b)),
+        paired_by_number=n_numbered,
+        paired_by_position=len(rows_a) - n_numbered,
         products=_products(a, b),
     )
 
@@ -123,10 +140,60 @@ def _catalog(artifact: DatabaseFolder) -> str:
     return str(artifact.manifest["spec"]["catalog"]["source"])
 
 
+def _numbers(stars: pa.Table) -> NDArray[np.int64]:
+    numbers: NDArray[np.int64] = stars["star_id"].to_numpy()
+    return numbers
+
+
 def _common_rows(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    number_a, number_b = a["star_id"].to_numpy(), b["star_id"].to_numpy()
-    _, rows_a, rows_b = np.intersect1d(number_a, number_b, assume_unique=True, return_indices=True)
+    _, rows_a, rows_b = np.intersect1d(
+        _numbers(a), _numbers(b), assume_unique=True, return_indices=True
+    )
     return rows_a, rows_b
+
+
+def _others(stars: pa.Table, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.setdiff1d(np.arange(len(stars)), rows)
+
+
+def _agree(a: pa.Table, b: pa.Table) -> bool:
+    """Return whether stars of one number are near each other in two databases."""
+    rows_a, rows_b = _common_rows(a, b)
+    off = separation(directions_of(a)[rows_a], directions_of(b)[rows_b])
+    return bool(np.median(np.append(off, 0.0)) * 206264.8 < FAR_ARCSEC)
+
+
+def _paired_rows(
+    a: pa.Table, b: pa.Table, *, is_numbered_alike: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows of the stars of both: by number if that holds, the others by position."""
+    numbered = _common_rows(a, b) if is_numbered_alike else (_NO_ROWS, _NO_ROWS)
+    left_a, left_b = _others(a, numbered[0]), _others(b, numbered[1])
+    placed = _rows_by_position(a.take(left_a), b.take(left_b))
+    return np.append(numbered[0], left_a[placed[0]]), np.append(numbered[1], left_b[placed[1]])
+
+
+def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows of stars that are each other's likeliest counterpart beyond doubt."""
+    if not (len(a) and len(b) and {*NEEDED} <= {*a.column_names} & {*b.column_names}):
+        return _NO_ROWS, _NO_ROWS
+    radius_rad = np.radians(PAIR_ARCSEC / 3600.0)
+    found = crossmatch(moving_stars(a), moving_stars(b), radius_rad, MatchModel())
+    is_same_number = _numbers(a)[found.star] == _numbers(b)[found.counterpart]
+    is_certain = np.isin(found.verdict, [VERDICTS.index("unique"), VERDICTS.index("best")])
+    taken = (found.rank == 1) & (found.star_rank == 1) & (is_certain | is_same_number)
+    return found.star[taken], found.counterpart[taken]
+
+
+def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
+    """Return the rejected rows that are stars of another catalog, with the numbers of those."""
+    is_placed = np.isfinite([floats_of(rejected, name) for name in ("ra_deg", "epoch_jyear")])
+    placed = rejected.filter(pa.array(is_placed.all(axis=0)))
+    for name in sorted({*NEEDED} - {*placed.column_names}):  # rejected stars have no motions
+        placed = placed.append_column(name, pa.nulls(len(placed), pa.float64()))
+    rows, known = _rows_by_position(stars, placed)
+    number = placed.column_names.index("star_id")
+    return placed.take(known).set_column(number, "star_id", stars["star_id"].take(rows))
 
 
 def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -6,25 +6,30 @@ residuals over the detector and with the radius.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcat.arguments import columns_of, path_of, wrong_type
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration, calibrate_frames
 from starcat.calibration.fit import PARAMETERS
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
+from starcat.images.batch import frame_files
 from starcat.images.identify_options import IdentifyOptions
 from starcat.images.overlay import check_kind, own_style, write_figure
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import as_arrays, is_frame
+from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 from starcat.report.plots import STYLE, headline
 from starcat.specs.camera_file import camera_toml
@@ -40,9 +45,52 @@ if TYPE_CHECKING:
 USUAL_ERROR = 0.1
 
 
+def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
+    """Return the files and frames that a caller gives to calibrate a camera from.
+
+    Files are given as paths, folders and patterns, frames as what `Matcher.identify` takes or as
+    results of it; both alone or in a sequence.
+    """
+    if _is_file(frames) or _is_one_frame(frames):
+        frames = [frames]
+    if not isinstance(frames, Iterable):
+        raise wrong_type("frames", frames, _FRAMES)
+    given: list[Path | MeasuredFrame] = []
+    for number, one in enumerate(frames, start=1):
+        if _is_file(one):
+            given += frame_files([str(path_of("frames", one))])
+        elif _is_one_frame(one) or isinstance(one, list | tuple):
+            frame = one.frame if isinstance(one, MatchResult) else one
+            if frame is None:
+                raise ConfigError(
+                    f"result {number} of frames does not hold its frame, as after pickling; give "
+                    "the frame",
+                    key="frames",
+                    fields=("frames",),
+                )
+            name = str(getattr(frame, "name", "") or f"frame {number}")
+            given.append(MeasuredFrame(name, *as_arrays(frame)))
+        else:
+            raise wrong_type(f"frame {number} of frames", one, _FRAMES)
+    return list(dict.fromkeys(given))
+
+
+def _is_file(value: object) -> bool:
+    return isinstance(value, str | os.PathLike)
+
+
+def _is_one_frame(value: Any) -> bool:
+    if isinstance(value, np.ndarray) and value.dtype.names is None:
+        return value.ndim == 2
+    return isinstance(value, MatchResult) or is_frame(value) or columns_of(value) is not None
+
+
+_FRAMES = "files, folders, patterns, or frames of starcat.simulate or starcat.read_frames"
+
+
 def calibrate_files(
     matcher: Matcher,
-    paths: Sequence[Path],
+    inputs: Sequence[Path | MeasuredFrame],
     *,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
@@ -50,8 +98,8 @@ def calibrate_files(
     flip: bool | None = None,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Find the camera that took the frames of files."""
-    frames, image_size_px = measured_frames(paths, flip=flip, progress=progress)
+    """Find the camera that took the frames of files, or frames that are measured already."""
+    frames, image_size_px = measured_frames(inputs, flip=flip, progress=progress)
     known, focal_px = starting_camera(
         matcher.database.camera,
         camera=camera,
@@ -63,12 +111,21 @@ def calibrate_files(
 
 
 def measured_frames(
-    paths: Sequence[Path], *, flip: bool | None = None, progress: Progress = no_progress
+    inputs: Sequence[Path | MeasuredFrame],
+    *,
+    flip: bool | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[list[MeasuredFrame], tuple[int, int] | None]:
-    """Read the frames of files."""
+    """Read the frames of files; frames that are measured already stay as they are."""
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
-    for number, (path, name) in enumerate(zip(paths, names_of_files(paths), strict=True), start=1):
+    paths = [one for one in inputs if isinstance(one, Path)]
+    names = iter(names_of_files(paths))
+    for number, path in enumerate(inputs, start=1):
+        if isinstance(path, MeasuredFrame):
+            frames.append(path)
+            continue
+        name = next(names)
         measured = measure_picture(path, IdentifyOptions(flip=flip))
         for frame in measured.frames:
             frames.append(replace(frame, name=name) if frame.name == path.stem else frame)
@@ -80,7 +137,7 @@ def measured_frames(
                     f"{size_px[1]}; give the frames of one camera"
                 )
             size_px = width, height
-        progress("measure", number, len(paths))
+        progress("measure", number, len(inputs))
     return frames, size_px
 
 

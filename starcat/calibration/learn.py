@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,13 @@ from starcat.artifact.manifest import manifest_digest
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.calibration.answers import Sightings, SkyStars, read_answers
 from starcat.calibration.response import MIN_COLOURS, Depth, Terms, fit_depth, fit_terms
-from starcat.errors import CalibrationError
+from starcat.errors import CalibrationError, ConfigError
+from starcat.sections import version_numbers
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
-from starcat.specs.reading import what_is_wrong
+from starcat.specs.reading import content_of_toml, read_spec, what_is_wrong
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.storage.atomic import file_sha256, write_file
+from starcat.storage.atomic import file_sha256
 
 CLIP = 4.0  # deviations farther away, in their noise, are not counted in the noise
 FAR = 4.0  # those in the scatter of a star count as so many noises at most: one proves nothing
@@ -569,9 +571,32 @@ def observed_toml(learnt: Learnt) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_observed(learnt: Learnt, path: Path) -> None:
-    """Write the section of a spec."""
-    write_file(path, observed_toml(learnt).encode())
+_OBSERVED = re.compile(
+    r"^\[selection\.observed\].*?(?=\n(?:#[^\n]*\n|\n)*\[|\Z)", re.MULTILINE | re.DOTALL
+)
+
+
+def patch_toml(learnt: Learnt, path: Path) -> str:
+    """Return the spec of a patch release: a spec with the next version, and with what was learnt.
+
+    Comments of the spec stay. A section that an earlier patch release has is replaced.
+    """
+    spec = read_spec(path)
+    if f"{spec.name}-{spec.version}" != learnt.stars.name:
+        raise ConfigError(
+            f"{path}: the spec of {spec.name}-{spec.version}, and the frames were identified with "
+            f"{learnt.stars.name}; give the spec of that database"
+        )
+    major, minor, patch = version_numbers(spec.version)
+    raised = f"{major}.{minor}.{patch + 1}"
+    text = path.read_text(encoding="utf-8")
+    stated = rf"^(version\s*=\s*[\"']){re.escape(spec.version)}(?=[\"'])"
+    text = re.sub(stated, rf"\g<1>{raised}", text, count=1, flags=re.MULTILINE)
+    text = f"{_OBSERVED.sub('', text).rstrip()}\n\n{observed_toml(learnt)}"
+    made = content_of_toml(text, str(path))
+    if (made.get("version"), made.get("name")) != (raised, spec.name):
+        raise ConfigError(f'{path}: expected a line version = "{spec.version}" of its own')
+    return text
 
 
 def star_table(learnt: Learnt) -> pa.Table:
@@ -603,6 +628,12 @@ def star_table(learnt: Learnt) -> pa.Table:
     return pa.table(columns)
 
 
+def _colour_stars(learnt: Learnt) -> int:
+    """Return how many stars have a measured magnitude and a colour."""
+    measured = np.isfinite(learnt.lesson.records.observed_mag)
+    return int(np.count_nonzero(measured & np.isfinite(learnt.stars.colour)))
+
+
 def content_of(learnt: Learnt) -> dict[str, Any]:
     """Return all of it as JSON has it."""
     lesson, terms = learnt.lesson, learnt.lesson.terms
@@ -617,6 +648,7 @@ def content_of(learnt: Learnt) -> dict[str, Any]:
         "colour_bands": learnt.colour_bands,
         "colour_term": terms.colour_term,
         "colour_term_error": terms.colour_term_error,
+        "colour_stars": _colour_stars(learnt),
         "limit_mag": limit if math.isfinite(limit) else None,
         "noise_mag": float(np.median(lesson.mag_noise.sigma)),
         "star_scatter_mag": lesson.mag_noise.of_stars,

@@ -160,7 +160,7 @@ def identify_part(
             away = np.hypot(*(px[rows] - 0.5 * np.array([middle.width_px, middle.height_px])).T)
             rows = np.sort(rows[np.argsort(away if frame.mag is None else frame.mag[rows])[:few]])
         mag = None if frame.mag is None else frame.mag[rows]
-        result = matcher.identify(px[rows], middle, magnitudes=mag, fov_error=fov_error)
+        result = matcher.identify(px[rows], middle, mag=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))
     return IdentifiedFrame(tuple(results), camera, matcher.tolerance_px)
 
@@ -182,7 +182,9 @@ def settled(
         progress("round", number + 1, None)
         if not identified.found or (share == 1.0 and identified.stars == before):
             return identified, fit if identified.found else None
-        fit = _supported(identified.seen(frames, matcher), values_of(camera), size_px, tolerance_px)
+        fit = supported_fit(
+            identified.seen(frames, matcher), values_of(camera), size_px, tolerance_px
+        )
         camera = camera_of(fit.values, size_px)
         if share == 1.0:
             before = identified.stars
@@ -192,7 +194,7 @@ def settled(
     return identified, fit
 
 
-def _supported(seen: Seen, values: Array, size_px: tuple[int, int], tolerance_px: float) -> Fit:
+def supported_fit(seen: Seen, values: Array, size_px: tuple[int, int], tolerance_px: float) -> Fit:
     """Return the fit of the model that the stars support, of those of a round."""
     free: tuple[str, ...] = FOCAL
     noise_px = tolerance_px / NOISE_DEVIATIONS

@@ -243,7 +243,7 @@ def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) 
     years = " to ".join(sorted(ends))
     return (
         f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
-        f"at J{years}, not J{epoch_jyear:.2f}",
+        f'at J{years}, not J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
     )
 
 

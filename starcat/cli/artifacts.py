@@ -18,7 +18,8 @@ from starcat.cli.console import (
     show,
     warn,
 )
-from starcat.cli.options import Input, Json, inputs_by_source, to_folder
+from starcat.cli.options import Input, Json, database, inputs_by_source
+from starcat.cli.outputs import Replace, expect_free, to_folder
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def inspect(
     ],
     json: Json = False,
 ) -> None:
-    """Say what a database or an onboard image holds and what it was made from.
+    """Show what a database or an onboard image holds and what it was made from.
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
@@ -60,54 +61,63 @@ def inspect(
 
 @app.command("coverage")
 def coverage_command(
-    artifact: Annotated[
-        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
-    ],
+    artifact: Annotated[Path, database()],
     output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Say how many stars, pairs and triangles the fields of a database hold.
+    """Show how many stars, pairs and triangles the fields of a database hold.
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
     from starcat.artifact.reader import open_artifact
 
+    expect_free(output, replace=replace)
     print_coverage(open_artifact(artifact), output, as_json=json)
 
 
 @app.command("verify")
 def verify_command(
     artifact: Annotated[
-        Path,
+        str,
         typer.Argument(
-            metavar="DATABASE", help="The folder <name>-<version>, or an onboard image."
+            metavar="DATABASE",
+            help="The folder <name>-<version>, an onboard image, or a registry: folder or address.",
         ),
     ],
     against: Annotated[
         Path | None, typer.Option(help="The database that an onboard image should be of.")
     ] = None,
     trust: Annotated[
-        Path | None, typer.Option(help="Public key that has to have signed an onboard image.")
+        Path | None,
+        typer.Option(help="Public key that has to have signed the onboard image or the registry."),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Check a database or an onboard image: digests, contents, orders, indices, references.
+    """Check a database, an onboard image or a registry: digests, contents, orders, references.
 
-    Exits with 5 if anything is wrong.
+    Of a registry all releases are read. Exits with 5 if anything is wrong.
 
     Example: starcat verify dist/gaia-12deg-1.0.0
     """
-    if artifact.is_file():
+    from starcat.releases.registry import is_registry
+
+    if Path(artifact).is_file():
         from starcat.exchange.onboard import verify_image
 
-        found = verify_image(artifact, against, trust)
+        found = verify_image(Path(artifact), against, trust)
+    elif against is None and is_registry(artifact):
+        from starcat.releases.verifying import verify_registry
+
+        with progress_bars() as progress:
+            found = verify_registry(artifact, trust, progress)
     elif against is not None or trust is not None:
         name = "against" if against is not None else "trust"
         raise ConfigError(f"--{name} is for an onboard image; {artifact} is none", key=name)
     else:
         from starcat.artifact.verify import verify_artifact
 
-        found = verify_artifact(artifact)
+        found = verify_artifact(Path(artifact))
     show(json, found.as_dict(), print_verification, found)
     if found.findings:
         raise typer.Exit(ProductError.exit_code)
@@ -115,11 +125,11 @@ def verify_command(
 
 @app.command("diff")
 def diff_command(
-    a: Annotated[Path, typer.Argument(metavar="A", help="The earlier database's folder.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="The later one's.")],
+    a: Annotated[Path, database("The earlier database's folder.", name="A")],
+    b: Annotated[Path, database("The later one's.", name="B")],
     json: Json = False,
 ) -> None:
-    """Say what differs between two databases: spec, sources, stars and why, products.
+    """Show what differs between two databases: spec, sources, stars and why, products.
 
     Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
     """
@@ -133,9 +143,7 @@ def diff_command(
 
 @app.command("rebuild")
 def rebuild_command(
-    artifact: Annotated[
-        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
-    ],
+    artifact: Annotated[Path, database()],
     inputs: Input = None,
     output: Annotated[
         Path | None, to_folder("Where the new database goes; default: it is not kept.")
@@ -183,6 +191,15 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     _print_changes("Spec", found.spec)
     _print_changes("Sources", found.sources)
     _print_changes("Software", found.software)
+    print_table(
+        "Stars of both",
+        ("paired by", "stars"),
+        [
+            ("number", f"{found.paired_by_number:,}"),
+            ("position, motion and magnitude", f"{found.paired_by_position:,}"),
+        ],
+        numbers=(1,),
+    )
     one_sided = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
     _print_stars("came", found.came, one_sided)
     _print_stars("went", found.went, one_sided)

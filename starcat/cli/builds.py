@@ -28,8 +28,8 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
-    to_folder,
 )
+from starcat.cli.outputs import Replace, to_folder
 from starcat.cli.remote import client_of
 from starcat.errors import BuildError
 from starcat.failures import failure_of
@@ -57,9 +57,7 @@ def build_command(
     inputs: Input = None,
     sources: OwnSources = None,
     output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a different database of that name.")
-    ] = False,
+    replace: Replace = False,
     workers: Annotated[
         int, typer.Option(min=1, max=64, help="Threads; the database is the same for any number.")
     ] = 2,
@@ -72,7 +70,7 @@ def build_command(
     explain: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Only say what each stage would do, and which files it would read."
+            "--explain", help="Only print what each stage would do, and which files it would read."
         ),
     ] = False,
     json: Json = False,
@@ -156,6 +154,7 @@ def _build_remotely(
     print_rates(list(map(rates_of, report["self_test"])))
     say(f"{outcome}: {folder}")
     say(f"database {database} of {client.url}")
+    _say_next(folder)
 
 
 def _print_facts(
@@ -186,6 +185,15 @@ def print_built(built: Built, *, as_json: bool) -> None:
     print_problems(built.problems)
     say(f"{built.outcome}: {built.folder}")
     say(f"report: {built.folder / 'report' / 'index.html'}")
+    _say_next(built.folder)
+
+
+def _say_next(folder: Path) -> None:
+    say(
+        f"go on with:\n  starcat simulate {folder} -o frame.csv\n"
+        f"  starcat identify {folder} frame.csv\n"
+        f"  starcat export {folder} --to onboard -o {folder.name}.img"
+    )
 
 
 def _print_contents(built: Built) -> None:
@@ -281,7 +289,7 @@ def print_coverage_table(report: CoverageReport) -> None:
     columns = {
         "in a field": "{0[0]}",
         "fewest": "{0[1].minimum:,}",
-        "1 %": "{0[1].one_percent:,}",
+        "1 % have at most": "{0[1].one_percent:,}",
         "median": "{0[1].median:,}",
         "mean": "{0[1].mean:,.1f}",
         "most": "{0[1].maximum:,}",

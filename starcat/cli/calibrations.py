@@ -35,12 +35,12 @@ def print_calibration(
     print_table(
         f"{calibration.n_identified} of {len(calibration.frames)} frames, "
         f"{len(calibration.fit.seen)} stars, residual {calibration.fit.noise_px:.3f} px an axis",
-        ("", "value", "error", "with all terms", "error"),
+        ("", "value", "error", "if all are fitted", "error"),
         [_row(calibration, name) for name in PARAMETERS if name in _errors(calibration)],
         numbers=(1, 2, 3, 4),
     )
     print_table(
-        "Models on frames that they have not seen",
+        "Cross-validation: models on frames that they were not fitted to",
         ("terms", "residual px", "worse than the best", ""),
         [_model(trial) for trial in calibration.trials],
         numbers=(1, 2),
@@ -134,7 +134,11 @@ def _model(trial: Trial) -> tuple[str, ...]:
 
 def _in_errors(trial: Trial) -> str:
     ratio = trial.worse_px2 / trial.worse_error_px2
-    return f"{ratio:.1f} standard errors" if math.isfinite(ratio) else "folds"
+    return (
+        f"{ratio:.1f} standard errors"
+        if math.isfinite(ratio)
+        else "not usable: two directions fall on one pixel"
+    )
 
 
 def _frame(frame: CalibratedFrame) -> tuple[str, ...]:

@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_json, print_table, progress_bars, say, show
-from starcat.cli.options import (
-    Json,
-    OwnSources,
-    Scheduler,
-    Workers,
-    inputs_by_source,
-    to_either,
-    to_file,
-)
+from starcat.cli.options import Json, OwnSources, Scheduler, Workers, inputs_by_source
+from starcat.cli.outputs import Replace, expect_free, to_either, to_file
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
@@ -36,7 +29,7 @@ def sources(
     ] = None,
     check: Annotated[
         Path | None,
-        typer.Option(metavar="MAP.toml", help="Say what this map makes of the table FILE."),
+        typer.Option(metavar="MAP.toml", help="Show what this map makes of the table FILE."),
     ] = None,
     draft: Annotated[
         bool, typer.Option("--draft", help="Propose a map for the table FILE.")
@@ -52,7 +45,7 @@ def sources(
     if check is not None or draft or file is not None:
         _about_table(file, check, draft=draft, as_json=json)
         return
-    found = _source_facts()
+    found = source_facts()
     show(json, found, _print_sources, found)
 
 
@@ -71,7 +64,6 @@ MemoryGib = Annotated[
 ]
 PartitionRows = Annotated[int, typer.Option(min=1, help="Stars of a partition at most (hats).")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that differs (hats).")]
 
 
 @app.command("ingest")
@@ -123,6 +115,7 @@ def ingest_command(
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         expect_parquet(output)
+        expect_free(output, replace=replace)
         read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
         print_ingested(read, output, as_json=json)
         return
@@ -177,10 +170,11 @@ def crossmatch_command(
     b: Annotated[
         Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
-    output: Annotated[Path, to_file("Where the Parquet file goes.")],
+    output: Annotated[Path, to_file("Where the counterparts go; the suffix selects the format.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
     """Find the counterparts of stars in another catalog by position, epoch and magnitude.
@@ -190,18 +184,22 @@ def crossmatch_command(
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
-    from starcat.exchange.formats import expect_parquet
+    from starcat.exchange.formats import format_of
+    from starcat.exchange.writers import write_batches
     from starcat.pipeline.counterparts import match_files
     from starcat.products.crossmatch import Crossmatch
 
-    expect_parquet(output)
-    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
+    form = format_of(output)
+    expect_free(output, replace=replace)
+    table, found = match_files(a, b, Crossmatch(radius_arcsec=radius_arcsec))
+    write_batches(table.to_reader(), output, form)
     names = {"a": a.stem, "b": b.stem}
     facts = {**names, **found.as_dict(), "output": str(output)}
     show(json, facts, print_crossmatch, found, *names.values(), output)
 
 
-def _source_facts() -> list[dict[str, Any]]:
+def source_facts() -> list[dict[str, Any]]:
+    """Return what is known of each catalog, and where it would be read from."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import locate
 

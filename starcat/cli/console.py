@@ -85,7 +85,7 @@ class RateColumn(ProgressColumn):
 PANELS = {
     "Design a database": ("sources", "bands", "presets", "init", "estimate", "blend"),
     "Build it": ("fetch", "ingest", "crossmatch", "build", "rebuild"),
-    "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate"),
+    "Check it": ("inspect", "verify", "coverage", "diff", "selftest", "evaluate", "doctor"),
     "Use it": ("simulate", "identify", "plan", "calibrate", "learn", "methods", "sql"),
     "Ship it": ("export", "publish", "pull", "releases", "keys"),
     "Serve it": ("serve", "token"),

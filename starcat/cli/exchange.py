@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_facts, print_table, print_things, say, show
-from starcat.cli.options import Json, to_either
+from starcat.cli.options import Json
+from starcat.cli.outputs import Replace, to_either
 from starcat.errors import ConfigError
-from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
+from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS, suffix_format
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
+from starcat.onboard.profiles import PROFILES
 
 if TYPE_CHECKING:
     from starcat.exchange.export import Exported
@@ -27,12 +29,13 @@ SourcePath = Annotated[
     Path | None, typer.Argument(metavar="SOURCE", help="A database's folder, or a Parquet file.")
 ]
 FormatName = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--to",
         "--format",
         metavar="FORMAT",
-        help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
+        help="Default: as the suffix of --output says, or csv. "
+        f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
         f"{' or '.join(ONBOARD_FORMATS)} for flight software; for other solvers "
         f"{', '.join(SOLVER_FORMATS[:-1])} or {SOLVER_FORMATS[-1]}.",
     ),
@@ -40,16 +43,24 @@ FormatName = Annotated[
 OutputPath = Annotated[
     Path | None,
     to_either(
-        "Where the result goes: the folder of one file a product, default: export; for onboard and "
-        "c the file, default: <name>-<version>.img or .c; for other solvers the folder, default: "
-        "<name>-<version>-<format>."
+        "Where the result goes: with a suffix the file of one product, else the folder of all, "
+        "default: export; for onboard and c the file, default: <name>-<version>.img or .c; for "
+        "other solvers the folder, default: <name>-<version>-<format>."
     ),
 ]
 MaxPartitionRows = Annotated[
     int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
 ]
 Method = Annotated[
-    str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+    str | None,
+    typer.Option(help="onboard, c: triangle or pyramid; default: triangle, or the profile's."),
+]
+ProfileName = Annotated[
+    str | None,
+    typer.Option(
+        help=f"onboard, c: {' or '.join(PROFILES)}; small: short pairs of bright stars, for little "
+        "memory. What the image identifies is measured."
+    ),
 ]
 Endian = Annotated[
     str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
@@ -64,23 +75,33 @@ PatchFrom = Annotated[
     Path | None,
     typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
 ]
+CameraToC = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        metavar="camera.toml",
+        help="onboard, c: calibrated camera; written for C beside the image, as *_camera.h.",
+    ),
+]
 
 
 @app.command("export")
 def export_command(
     source: SourcePath = None,
-    form: FormatName = "csv",
+    form: FormatName = None,
     output: OutputPath = None,
     product: Annotated[
         list[str] | None, typer.Option(help="Product of a database; default: all. Repeatable.")
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
+    replace: Replace = False,
     max_partition_rows: MaxPartitionRows = None,
+    profile: ProfileName = None,
     method: Method = None,
     endian: Endian = None,
     max_bytes: MaxBytes = None,
     patch_from: PatchFrom = None,
     sign: Sign = None,
+    camera: CameraToC = None,
     json: Json = False,
 ) -> None:
     """Write tables for other tools, an image for flight software, or other solvers' databases.
@@ -88,12 +109,15 @@ def export_command(
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
     of_images: dict[str, Any] = {
+        "profile": profile,
         "method": method,
         "endian": endian,
         "max_bytes": max_bytes,
         "patch_from": patch_from,
         "sign": sign,
+        "camera": camera,
     }
+    form = form or _form_of(output)
     of_tables: dict[str, object] = {"product": product}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
@@ -119,6 +143,14 @@ def export_command(
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")
     show(json, exported.as_dict(), print_exported, exported)
+
+
+def _form_of(output: Path | None) -> str:
+    """Return the format that an output's suffix selects; csv without one."""
+    if output is None:
+        return "csv"
+    own = {".img": "onboard", ".c": "c"}
+    return own.get(output.suffix.lower()) or suffix_format(output) or "csv"
 
 
 def _for_flight(
@@ -186,11 +218,12 @@ def print_exported_solver(exported: ExportedSolver) -> None:
 def _say_left_out(exported: ExportedImage) -> None:
     fitted, made = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
+    why = "to fit" if exported.profile is None else f"by the profile {exported.profile}"
     if fitted.features < fitted.features_before:
-        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, to fit")
+        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, {why}")
     if fitted.stars_per_field is not None:
         say(
-            f"{fitted.stars_before - fitted.stars:,} stars are left out, to fit: those that are "
+            f"{fitted.stars_before - fitted.stars:,} stars are left out, {why}: those that are "
             f"not among the {fitted.stars_per_field} brightest of a field"
         )
     for sentence in stars_in_flight(made.most_near):
@@ -212,11 +245,35 @@ def print_exported_image(exported: ExportedImage) -> None:
         (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
         ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
         ("a frame in flight", f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"),
+        *_profile_rows(exported),
         *_patch_rows(exported),
         *(("signed by", key) for key in exported.signed_by),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def _profile_rows(exported: ExportedImage) -> list[tuple[str, str]]:
+    """Return what an image by a profile takes and identifies."""
+    if exported.profile is None:
+        return []
+    rows = [
+        ("profile", exported.profile),
+        (
+            "memory for votes",
+            f"{exported.voting_bytes:,} bytes besides the image, if they are used",
+        ),
+    ]
+    for one in exported.rates:
+        share = 100.0 * one.identified / one.frames
+        rows.append(
+            (
+                f"{one.kind} frames, {'with' if one.votes else 'no'} votes",
+                f"{share:g} % of {one.frames} identified, {one.wrong} wrong; "
+                f"{one.mean_steps:,} steps, at most {one.most_steps:,}",
+            )
+        )
+    return rows
 
 
 def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.cli.console import print_things, progress_bars, say, show
-from starcat.cli.options import Json, to_folder
+from starcat.cli.options import Json
+from starcat.cli.outputs import to_folder
 
 if TYPE_CHECKING:
     from starcat.catalog.tap import Asked

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 keys = typer.Typer(
     name="keys",
-    help="Make keys that sign databases and images, and say which of them count.\n\n"
+    help="Make keys that sign databases and images, and choose which of them are accepted.\n\n"
     "Example: starcat keys new flight",
     no_args_is_help=True,
 )
@@ -70,7 +70,7 @@ def renew_command(
 ) -> None:
     """Sign the newest state of a registry again, so that it holds longer.
 
-    Who pulls with --trust refuses a registry whose signatures have ended: news may be kept back.
+    Signatures expire, so that nobody can hide a newer release: pull --trust refuses expired ones.
 
     Example: starcat keys renew registry --sign flight.key
     """
@@ -101,7 +101,7 @@ def roles(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Say which keys count in a registry from now on; a role that is not named keeps its keys.
+    """Choose which keys a registry accepts from now on; a role that is not named keeps its keys.
 
     --sign takes keys that may change roles now, and those that may afterwards. Who has trusted the
     registry before goes on with the new keys without doing anything.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,8 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, say
+from starcat.cli.outputs import Replace, expect_free, to_file
+from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.calibration.learn import Learnt
@@ -19,14 +22,22 @@ app = typer.Typer()
 @app.command("learn")
 def learn_command(
     database: Annotated[
-        Path, typer.Argument(help="The folder <name>-<version> they were identified with.")
+        Path, opt.database("The folder <name>-<version> they were identified with.")
     ],
     results: Annotated[
-        list[Path],
-        typer.Argument(metavar="RESULTS...", help="What 'starcat identify --ndjson' printed."),
+        list[str],
+        typer.Argument(
+            metavar="RESULTS...",
+            help="What 'starcat identify --ndjson' printed: files, folders of *.ndjson, patterns.",
+        ),
     ],
     output: Annotated[
-        Path | None, opt.to_file("Where the section of a spec for a patch release goes (TOML).")
+        Path | None,
+        to_file("Where the section of a spec goes, or with --patch the spec of the patch (TOML)."),
+    ] = None,
+    patch: Annotated[
+        Path | None,
+        typer.Option(metavar="SPEC", help="Spec of the database: write its whole patch release."),
     ] = None,
     stars: Annotated[
         Path | None,
@@ -41,20 +52,32 @@ def learn_command(
     min_frames: Annotated[
         int, typer.Option(min=2, max=1000, help="Fewest frames that a star is judged from.")
     ] = 3,
+    replace: Replace = False,
     json: opt.Json = False,
 ) -> None:
     """Learn zero point, colour term and the stars to distrust from identified frames.
 
     Example: starcat learn dist/gaia-12deg-1.0.0 answers.ndjson -o observed.toml
     """
-    from starcat.calibration.learn import content_of, learn_files, star_table, write_observed
+    from starcat.calibration.learn import (
+        content_of,
+        learn_files,
+        observed_toml,
+        patch_toml,
+        star_table,
+    )
     from starcat.exchange.formats import format_of
     from starcat.exchange.writers import write_batches
+    from starcat.storage.atomic import write_file
 
+    if patch is not None and output is None:
+        raise ConfigError("--patch needs a name for the new spec; give it with -o", key="output")
     form = None if stars is None else format_of(stars)
-    found = learn_files(database, results, by_frame=by_frame, min_frames=min_frames)
+    expect_free(output, stars, replace=replace)
+    found = learn_files(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
     if output is not None:
-        write_observed(found, output)
+        text = observed_toml(found) if patch is None else patch_toml(found, patch)
+        write_file(output, text.encode())
     if stars is not None and form is not None:
         write_batches(star_table(found).to_reader(), stars, form)
     if json:
@@ -63,6 +86,20 @@ def learn_command(
         _print_learnt(found)
     for path in filter(None, (output, stars)):
         say(f"written: {path}")
+    if patch is not None:
+        say(f"go on with: starcat build {output}")
+
+
+def _files_of(given: list[str]) -> list[Path]:
+    """Return the files that names, folders and patterns stand for."""
+    files: list[Path] = []
+    for text in given:
+        pattern = f"{glob.escape(text)}/*.ndjson" if Path(text).is_dir() else text
+        found = [Path(name) for name in sorted(glob.glob(pattern))]
+        if not found and Path(text).is_dir():
+            raise ConfigError(f"{text}: no file *.ndjson is in this folder")
+        files += found or [Path(text)]
+    return files
 
 
 def _print_learnt(found: Learnt) -> None:
@@ -71,7 +108,7 @@ def _print_learnt(found: Learnt) -> None:
     told, lesson = content_of(found), found.lesson
     rows = [_term("zero point, mag", told["zero_point_mag"], told["zero_point_error_mag"])]
     if told["colour_term"] is not None:
-        name = f"colour term, {told['colour_bands']}"
+        name = f"colour term, {told['colour_bands']}, of {told['colour_stars']:,} stars"
         rows.append(_term(name, told["colour_term"], told["colour_term_error"]))
     rows += [
         ("noise of a magnitude, mag", f"{told['noise_mag']:.3f}", ""),

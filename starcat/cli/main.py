@@ -25,6 +25,7 @@ from starcat.cli import (
     blending,
     builds,
     catalogs,
+    doctor,
     exchange,
     fetching,
     interrupts,
@@ -36,7 +37,7 @@ from starcat.cli import (
     specs,
     sql,
 )
-from starcat.cli.console import WholeSummaries
+from starcat.cli.console import PANELS, WholeSummaries
 from starcat.cli.packages import add_commands
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
@@ -57,7 +58,7 @@ app = typer.Typer(
 )
 for part in (
     *(catalogs, fetching, bands, blending, specs, builds, artifacts, sql, exchange),
-    *(releases, keys, matching, planning, learning),
+    *(releases, keys, matching, planning, learning, doctor),
 ):
     app.add_typer(part.app)
 add_commands(app)
@@ -105,6 +106,7 @@ def main() -> None:
     interrupts.catch_signals()
     logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
     arguments, behind = _parted(sys.argv[1:])
+    arguments = _as_typed_often(arguments)
     is_debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
@@ -122,6 +124,26 @@ def main() -> None:
             sys.stderr.write(interrupts.left_by(_command_of(arguments)))
         raise
     sys.exit(code)
+
+
+def _as_typed_often(arguments: list[str]) -> list[str]:
+    """Return arguments with what people type first where the parser expects it.
+
+    Examples
+    --------
+    >>> _as_typed_often(["help", "build"]), _as_typed_often(["version"])
+    (['build', '--help'], ['--version'])
+    >>> _as_typed_often(["--json", "sources"])
+    ['sources', '--json']
+    """
+    if arguments[:1] == ["help"]:
+        return [*arguments[1:], "--help"]
+    if arguments == ["version"]:
+        return ["--version"]
+    known = {name for names in PANELS.values() for name in names}
+    start = next((n for n, word in enumerate(arguments) if word in known), 0)
+    moved = [word for word in arguments[:start] if word == "--json"]
+    return [word for word in arguments[:start] if word != "--json"] + arguments[start:] + moved
 
 
 def _command_of(arguments: Sequence[str]) -> str:

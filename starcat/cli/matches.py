@@ -18,7 +18,7 @@ from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.centroids import MAX_CENTROIDS
 from starcat.matcher.database import Database
-from starcat.matcher.result import bracketed
+from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import SimulatedFrame
 

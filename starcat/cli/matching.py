@@ -10,6 +10,7 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
+from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -20,12 +21,15 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Folder = Annotated[Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")]
+Folder = Annotated[Path, opt.database()]
+FolderOrImage = Annotated[
+    Path, opt.database("The folder <name>-<version>, or an onboard image.", or_image=True)
+]
 FrameFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="INPUT...",
-        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP), "
+        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP, raw), "
         "folders of them, or patterns in quotes ('night/*.jpg').",
     ),
 ]
@@ -80,26 +84,29 @@ def methods(json: opt.Json = False) -> None:
 @app.command("simulate")
 def simulate_command(
     artifact: Folder,
-    output: Annotated[Path, opt.to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
+    output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
+    noise_mag: Annotated[float, typer.Option(min=0, max=10, help="Noise of a magnitude.")] = 0.2,
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are no stars.")] = 0,
+    replace: Replace = False,
     json: opt.Json = False,
 ) -> None:
     """Write one simulated frame, centroids or image, to try 'starcat identify' with.
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
+    from starcat.api.functions import simulate
     from starcat.cli.matches import simulated_facts
     from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
-    from starcat.simulation.simulate import Noise, simulate_frames
 
+    expect_free(output, replace=replace)
     database = open_database(artifact)
-    noise = Noise(noise_px, false_stars=false_stars)
-    eye = database.camera
-    frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
-    write_simulated(output, frame, eye, seed)
+    [frame] = simulate(
+        database, noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, seed=seed
+    )
+    write_simulated(output, frame, database.camera, seed)
     told = simulated_facts(frame, output)
     if json:
         print_json(told)
@@ -114,7 +121,7 @@ def simulate_command(
 @app.command("identify", cls=OptionsInPanels)
 def identify_command(
     context: typer.Context,
-    artifact: Folder,
+    artifact: FolderOrImage,
     files: FrameFiles,
     method: opt.MethodName = None,
     camera: CameraFile = None,
@@ -123,7 +130,7 @@ def identify_command(
     noise_mag: MagnitudeNoise = None,
     max_false_match_probability: Certainty = 1e-9,
     fov_error: opt.FovError = None,
-    fov: opt.FieldRange = None,
+    fov: opt.Field = None,
     size: opt.FrameSize = None,
     min_share: opt.MinShare = None,
     max_steps: opt.MaxSteps = None,
@@ -237,8 +244,7 @@ def _print_file_answers(
         expect_room_for_wcs(wcs, answers.path, is_picture=answers.is_image)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
-    is_any = tally.identified > 0
-    for note in answers.notes(tally.first, is_any_identified=is_any, flip="--flip or --no-flip"):
+    for note in answers.notes(tally.first):
         say(note)
     if tally.first is not None and picture is not None:
         answers.draw(picture, tally.first)
@@ -249,11 +255,11 @@ def _print_file_answers(
 
 @app.command("calibrate")
 def calibrate_command(
-    artifact: Folder,
+    artifact: FolderOrImage,
     files: Annotated[
         list[str], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
     ],
-    output: Annotated[Path, opt.to_file("Where the camera (TOML) goes.")],
+    output: Annotated[Path, to_file("Where the camera (TOML) goes.")],
     camera: Annotated[
         Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
     ] = None,
@@ -280,6 +286,7 @@ def calibrate_command(
             help="Columns frame and time (UTC), where pictures do not say when they were taken.",
         ),
     ] = None,
+    replace: Replace = False,
     json: opt.Json = False,
 ) -> None:
     """Find focal length, principal point and distortion of a camera from frames of stars.
@@ -296,6 +303,7 @@ def calibrate_command(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    expect_free(output, plot, replace=replace)
     paths = frame_files(files)
     when = times_of_frames(paths, times) if earth_rotation or times else None
     known = read_camera(camera) if camera else None
@@ -313,7 +321,7 @@ def calibrate_command(
 
 @app.command("selftest")
 def selftest(
-    artifact: Folder,
+    artifact: FolderOrImage,
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     noise_px: opt.NoisePx = 0.5,

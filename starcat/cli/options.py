@@ -9,39 +9,44 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError, OutputError
+from starcat.errors import ConfigError, words_of
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 
-def _no_file(path: Path | None) -> Path | None:
-    if path is not None and path.is_file():
-        raise OutputError(f"{path}: is a file; choose a folder with --output", path=path)
-    return path
+def database(
+    what: str = "The folder <name>-<version>.", *, or_image: bool = False, name: str = "DATABASE"
+) -> Any:
+    """Return the argument of a command that opens a database, or an onboard image too."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and path.is_file() and not (or_image and path.suffix == ".img"):
+            _refuse_other_files(path)
+        return path
+
+    return typer.Argument(metavar=name, callback=check, help=what)
 
 
-def _no_folder(path: Path | None) -> Path | None:
-    if path is not None and path.is_dir():
-        raise OutputError(f"{path}: is a folder; choose a file with --output", path=path)
-    return path
+def _refuse_other_files(path: Path) -> None:
+    from starcat.images.batch import CENTROID_SUFFIXES
+    from starcat.images.solve_files import IMAGE_SUFFIXES
+    from starcat.storage.file_formats import RAW_MAKERS
 
-
-# ``-o`` is everywhere where the result goes: a file where a command makes one, else a folder.
-def to_folder(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes into a folder."""
-    return typer.Option("--output", "-o", metavar="FOLDER", callback=_no_file, help=what)
-
-
-def to_file(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes a file."""
-    return typer.Option("--output", "-o", metavar="FILE", callback=_no_folder, help=what)
-
-
-def to_either(what: str) -> Any:
-    """Return the option ``-o`` of a command that writes a file or a folder, by the format."""
-    return typer.Option("--output", "-o", metavar="FILE|FOLDER", help=what)
+    kinds = {
+        "a picture": (*IMAGE_SUFFIXES, *RAW_MAKERS),
+        "a file of centroids": CENTROID_SUFFIXES,
+        "a file of answers": (".ndjson",),
+        "a spec or a camera": (".toml",),
+        "an onboard image": (".img",),
+    }
+    for kind, suffixes in kinds.items():
+        if path.suffix.lower() in suffixes:
+            raise ConfigError(
+                f"{path} is {kind}; the database comes first: the folder <name>-<version> that "
+                "'starcat build' made"
+            )
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -82,7 +87,14 @@ Scheduler = Annotated[
 ]
 FieldRange = Annotated[
     str | None,
-    typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
+    typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
+]
+Field = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DEG|LOW:HIGH",
+        help="Field across the width in place of the camera's, degrees, or the range of it.",
+    ),
 ]
 Time = Annotated[
     str | None,
@@ -101,11 +113,14 @@ FrameSize = Annotated[
     typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
 ]
 FovError = Annotated[
-    str | None, typer.Option(metavar="2%", help="Error of the field that is allowed; default: 5%.")
+    str | None,
+    typer.Option(metavar="2%", help="How far the field of view may be off; default: 5%."),
 ]
 MinShare = Annotated[
     float | None,
-    typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
+    typer.Option(
+        min=0, max=1, help="Smallest fraction of the centroids to be identified; default: a third."
+    ),
 ]
 MaxSteps = Annotated[
     int | None,
@@ -198,7 +213,18 @@ def camera_of_options(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        raise what_is_wrong(error, "camera") from error
+        text = str(what_is_wrong(error, "camera")).removeprefix("camera: ").removeprefix("spec: ")
+        raise ConfigError(words_of(text, CAMERA_OPTIONS, CAMERA_OPTIONS.__getitem__)) from error
+
+
+CAMERA_OPTIONS = {
+    "width_px": "--size WIDTH",
+    "height_px": "--size HEIGHT",
+    "focal_length_mm": "--focal-mm",
+    "pixel_um": "--pixel-um",
+    "fov_x_deg": "--fov-x-deg",
+}
+"""Options by the key of the spec."""
 
 
 def size_in_px(text: str) -> tuple[int, int]:
@@ -209,8 +235,8 @@ def size_in_px(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def field_range(text: str | None) -> tuple[float, float] | None:
-    """Return the smallest and the largest field of a ``--fov``."""
+def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
+    """Return the smallest and the largest field of a ``--fov``; of one field twice the same."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
@@ -220,6 +246,10 @@ def field_range(text: str | None) -> tuple[float, float] | None:
         about = float(low)
     except ValueError:
         raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+    if may_be_one:
+        if 0.0 < about < 180.0:
+            return about, about
+        raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
         f"--fov {text!r} is one field of view; write the range that is possible, such as "
         f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
@@ -257,11 +287,12 @@ def unknown_field(
     size: str | None, fov: str | None, fov_error: str | None
 ) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
     """Return what is stated of frames whose field of view is not known."""
-    if fov is not None and fov_error is not None:
+    fields = field_range(fov, may_be_one=True)
+    if fields is not None and fields[0] != fields[1] and fov_error is not None:
         raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
     if size is not None and fov is None:
         raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
-    return None if size is None else size_in_px(size), field_range(fov)
+    return None if size is None else size_in_px(size), fields
 
 
 def share_of_percent(text: str | None) -> float | None:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.console import print_things, progress_bars, say, show
-from starcat.cli.options import Json, to_folder
+from starcat.cli.options import Json, database
+from starcat.cli.outputs import to_folder
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an ad
 SIGNED = {
     "checked": "; signed by keys that you trust",
     "unchecked": "; signed, but not checked: name a key that you trust with --trust",
-    "unsigned": "; nothing is signed in this registry",
+    "unsigned": "; this registry has no signatures",
     "pinned": "",
 }
 """What is said of the signatures of what was pulled."""
@@ -32,9 +33,7 @@ SIGNED = {
 
 @app.command("publish")
 def publish_command(
-    artifact: Annotated[
-        Path, typer.Argument(metavar="DATABASE", help="The folder <name>-<version>.")
-    ],
+    artifact: Annotated[Path, database()],
     registry: Annotated[str, typer.Argument(help="Folder of the registry; made if need be.")],
     sign: Annotated[
         list[Path] | None, typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")
@@ -116,16 +115,21 @@ def releases(
     retries: Retries = 3,
     json: Json = False,
 ) -> None:
-    """List the versions that a registry has.
+    """List the versions that a registry has, and which of them are signed.
 
     Example: starcat releases registry
     """
     from starcat.releases.registry import open_registry
+    from starcat.releases.signing import signatures_of
     from starcat.storage.download import DownloadOptions
 
     listed = open_registry(registry, DownloadOptions(retries)).releases()
     highest = {release.name: release for release in listed}
-    facts = [r.model_dump() | {"is_latest": highest[r.name] is r} for r in listed]
+    signed = signatures_of(registry, listed)
+    facts = [
+        release.model_dump() | {"is_latest": highest[release.name] is release, "signed": state}
+        for release, state in zip(listed, signed, strict=True)
+    ]
     show(json, facts, print_releases, facts)
 
 
@@ -167,6 +171,12 @@ def print_releases(listed: Sequence[dict[str, Any]]) -> None:
         "files": "{0[files]}",
         "bytes": "{0[bytes]:,}",
         "manifest": "{0[manifest][sha256]:.16}",
+        "signed": "{0[signed]}",
     }
     marked = [facts | {"mark": "latest" if facts["is_latest"] else ""} for facts in listed]
     print_things("", marked, columns, numbers=(3, 4))
+    if any(facts["signed"] == "yes" for facts in listed):
+        say(
+            "signed: by the keys that 'starcat keys show' lists. Whether they are the publisher's, "
+            "'starcat pull --trust KEY' checks"
+        )

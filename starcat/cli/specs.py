@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,12 +31,15 @@ from starcat.cli.options import (
     chosen_spec,
     field_range,
     inputs_by_source,
+    size_in_px,
 )
+from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
     from starcat.pipeline.starter import Starter
+    from starcat.progress import Progress
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 app = typer.Typer()
@@ -83,7 +88,7 @@ def estimate_command(
     sources: OwnSources = None,
     json: Json = False,
 ) -> None:
-    """Say what a spec will give without building it: guide stars, fields, files, time, memory.
+    """Print what a spec will give without building it: guide stars, fields, files, time, memory.
 
     Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
     """
@@ -99,9 +104,20 @@ def estimate_command(
 @app.command("init")
 def init_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
+    more: Annotated[
+        list[str] | None, typer.Argument(metavar="[PHOTO...]", help="Further ones of --from.")
+    ] = None,
     size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
-    ],
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
+    ] = None,
+    photos: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            metavar="PHOTO...",
+            help="Pictures or centroids that tell the camera: files, folders, patterns.",
+        ),
+    ] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
     pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
     fov_x_deg: Annotated[
@@ -118,7 +134,11 @@ def init_command(
         ),
     ] = None,
     response: Annotated[
-        str | None, typer.Option(help="Response of the sensor, as 'starcat bands' lists them.")
+        str | None,
+        typer.Option(help="Response of the sensor, as 'starcat bands' lists them, or a CSV file."),
+    ] = None,
+    per: Annotated[
+        str | None, typer.Option(help="What a CSV file is relative to: photon or energy.")
     ] = None,
     sensor: Annotated[
         Path | None,
@@ -126,40 +146,91 @@ def init_command(
             metavar="FILE", help="Star sensor (TOML) as for 'evaluate --ecss': its limit."
         ),
     ] = None,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a file of that name.")
-    ] = False,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Write a build spec for a camera, every key explained, and say how many stars a field has.
+    """Write a build spec for a camera, every key explained, and print how many stars a field has.
 
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
     from starcat.pipeline.starter import starter_spec, write_starter
 
     fields = field_range(fov_range)
+    if photos:
+        if fov_x_deg is not None or focal_mm is not None or pixel_um is not None:
+            raise ConfigError(
+                "--from finds the field of view; leave out --fov-x-deg, --focal-mm and --pixel-um"
+            )
+        with progress_bars() as progress:
+            starter, remarks = starter_of_photos(
+                [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress
+            )
+        write_starter(starter, file, replace=replace, remarks=remarks)
+        print_starter(starter, file, as_json=json, remarks=remarks)
+        return
+    if more:
+        raise ConfigError(f"{more[0]!r} is not an option; pictures of the camera go with --from")
+    if size is None:
+        raise ConfigError("give the size of the detector, --size 1280x960, or pictures, --from")
     if fields is not None:
         if fov_x_deg is not None:
             raise ConfigError("give either --fov-range or --fov-x-deg, not both")
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
-        camera = with_sensor(camera, response, sensor)
+        camera = with_sensor(camera, response, sensor, per)
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
 
 
-def with_sensor(camera: CameraSpec, response: str | None, sensor: Path | None) -> CameraSpec:
+def starter_of_photos(
+    photos: Sequence[str],
+    name: str,
+    size: str | None,
+    fields: tuple[float, float] | None,
+    faint_limit: float | None,
+    progress: Progress,
+) -> tuple[Starter, list[str]]:
+    """Return the spec of the camera that took pictures, and where its values come from."""
+    from starcat.calibration.first_camera import first_camera
+    from starcat.images.batch import files_of
+    from starcat.matcher.matcher import Matcher
+    from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+    from starcat.pipeline.starter import starter_spec
+    from starcat.specs.build_spec import CameraSpec
+
+    paths = files_of(photos)
+    matcher = Matcher.open(blind_database(progress))
+    size_px = None if size is None else size_in_px(size)
+    found = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
+    width, height = found.camera.width_px, found.camera.height_px
+    camera = CameraSpec(
+        width_px=width, height_px=height, fov_x_deg=round(found.camera.fov_x_deg, 4)
+    )
+    starter = starter_spec(name, camera, faint_limit, progress, reach_mag=found.reach_mag)
+    spec = starter.spec
+    test = spec.self_test.model_copy(update={"noise_px": found.noise_px})
+    starter = dataclasses.replace(starter, spec=spec.model_copy(update={"self_test": test}))
+    return starter, found.remarks(
+        spec.selection.faint_limit_mag, starter.band, is_stated=faint_limit is not None
+    )
+
+
+def with_sensor(
+    camera: CameraSpec, response: str | None, sensor: Path | None, per: str | None = None
+) -> CameraSpec:
     """Return a camera with the band of its sensor, and with the light and noise of a frame."""
     if response is None and sensor is None:
         return camera
     from starcat.bands.response import shipped
-    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse
+    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse, response_of_file
     from starcat.specs.star_sensor import read_sensor
 
     content = camera.model_dump()
-    if response is not None:
+    if response is not None and Path(response).is_file():
+        content["response"] = response_of_file(Path(response), {"per": per})
+    elif response is not None:
         shipped(response)
         content["response"] = CameraResponse(name=response).model_dump()
     if sensor is not None:
@@ -191,20 +262,25 @@ def print_preset(spec: BuildSpec) -> None:
     print_facts(f"{spec.name} {spec.version}", facts)
 
 
-def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
+def print_starter(
+    starter: Starter, path: Path, *, as_json: bool, remarks: Sequence[str] = ()
+) -> None:
     """Print what a first spec gives, and what to think of before it is kept."""
     from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
 
     figures = starter.figures
     if as_json:
-        print_json({"file": str(path), **asdict(figures)})
+        told = {"remarks": list(remarks)} if remarks else {}
+        print_json({"file": str(path), **told, **asdict(figures)})
         return
+    for line in remarks:
+        say(line)
     camera = starter.spec.camera.camera()
     columns = {
         f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",
         "guide stars": "{0[2].guide_stars:,}",
         "fewest": "{0[2].stars.minimum:,}",
-        "1 %": "{0[2].stars.one_percent:,}",
+        "1 % have at most": "{0[2].stars.one_percent:,}",
         "median": "{0[2].stars.median:,}",
         "most": "{0[2].stars.maximum:,}",
     }
@@ -217,8 +293,8 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
         f"{thinned.stars.median:,} in the middle one."
-        "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
-        f"{ENOUGH_STARS}:\nsome are left where centroids are missing, and the database stays small."
+        f"\nA frame needs 4 stars. Choose the limit where 99 of 100 fields have {ENOUGH_STARS} or "
+        "more: enough\nremain when a few are missed, and the database stays small."
     )
     warn(figures.advice)
     say(figures.in_words)

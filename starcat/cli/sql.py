@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from starcat.cli.options import Json, to_file
+from starcat.cli.options import Json
+from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS
 
@@ -46,6 +47,7 @@ def sql(
     values: Values = None,
     output: OutputFile = None,
     form: FormatName = None,
+    replace: Replace = False,
     rows: Annotated[int, typer.Option(min=1, help="Rows of a table to show.")] = 40,
     show_list: Annotated[bool, typer.Option("--list", help="List the named queries.")] = False,
     show_macros: Annotated[bool, typer.Option("--macros", help="List the macros.")] = False,
@@ -87,6 +89,7 @@ def sql(
         with opened(targets, limits) as session:
             print_views(session, as_json=json)
         return
+    expect_free(output, replace=replace)
     form = form or ("json" if json else None)
     question = Question(query, named, dict(_set(values)), form, output)
     if context.obj is not None:

@@ -14,6 +14,7 @@ import filecmp
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from dataclasses import replace as changed
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,13 @@ import pyarrow as pa
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
 from starcat.exchange.columns import Label, field_facts
-from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS
+from starcat.exchange.formats import (
+    EXPORT_FORMATS,
+    FORMATS,
+    ONBOARD_FORMATS,
+    SOLVER_FORMATS,
+    suffix_format,
+)
 from starcat.exchange.writers import write_batches
 from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import whole_folder
@@ -132,9 +139,11 @@ def export_tables(
 ) -> Exported:
     """Write tables in one of `EXPORT_FORMATS`, one file a product; other files in the folder stay.
 
-    Without products all are written, and for HATS all star tables.
+    Without products all are written, and for HATS all star tables. A ``folder`` whose name has the
+    suffix of a format is the file of the only product.
     """
-    _check_asked(file_format, folder)
+    is_file = suffix_format(folder) is not None
+    _check_asked(file_format, folder, tables.chosen(products), is_file=is_file)
     columns: list[tuple[str, ...]] = []
     with whole_folder(folder) as part:
         files = []
@@ -149,14 +158,17 @@ def export_tables(
                 files.append(_write_hats(table, part / product, name, max_partition_rows))
         if not files:
             raise ConfigError(f"{tables.name} has no star table, which HATS is for")
-        has_columns = file_format in FORMATS and not FORMATS[file_format].has_units
+        if is_file:
+            (part / files[0].name).rename(part / folder.name)
+            files, folder = [changed(files[0], name=folder.name)], folder.parent
+        has_columns = not (is_file or file_format == "hats" or FORMATS[file_format].has_units)
         if has_columns:
             _write_columns(part / COLUMNS_NAME, folder / COLUMNS_NAME, columns)
         _publish(part, folder, replace=replace)
     return Exported(tables.name, file_format, folder, tuple(files), has_columns)
 
 
-def _check_asked(file_format: str, folder: Path) -> None:
+def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_file: bool) -> None:
     """Refuse what cannot be done before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
@@ -165,9 +177,25 @@ def _check_asked(file_format: str, folder: Path) -> None:
             key="to",
             value=file_format,
         )
-    if folder.exists() and not folder.is_dir():
+    if is_file and file_format != suffix_format(folder):
+        raise ConfigError(
+            f"{folder}: the name is that of a {suffix_format(folder)} file, and the format is "
+            f"{file_format}; give one of them only",
+            key="output",
+        )
+    if is_file and len(products) != 1:
+        raise ConfigError(
+            f"{folder}: the name is that of one file, and there are {len(products)} products: "
+            f"{', '.join(products)}; choose one of them with products, or a folder",
+            key="output",
+            fields=("products",),
+        )
+    if folder.exists() and folder.is_dir() == is_file:
+        found, wanted = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"{folder}: is a file; choose a folder with output", path=folder, fields=("output",)
+            f"{folder}: is a {found}; choose a {wanted} with output",
+            path=folder,
+            fields=("output",),
         )
 
 

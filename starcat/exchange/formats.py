@@ -107,15 +107,26 @@ TAP_FORMATS = tuple(
 
 def format_of(path: str | Path) -> FileFormat:
     """Return the format that the suffix of a file's name asks for, in any case."""
-    suffix = Path(path).suffix.lower()
-    for name in FILE_FORMATS:
-        if suffix in FORMATS[name].suffixes:
-            return name
+    found = suffix_format(path)
+    if found is not None:
+        return found
     choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
         f"{path}: the name says no format that starcat writes; end it with one of {choices}",
         value=str(path),
     )
+
+
+def suffix_format(path: str | Path) -> FileFormat | None:
+    """Return the format that the suffix of a file's name stands for, in any case, or None.
+
+    Examples
+    --------
+    >>> suffix_format("stars.FITS"), suffix_format("dist/cube-1.0.0")
+    ('fits', None)
+    """
+    suffix = Path(path).suffix.lower()
+    return next((name for name in FILE_FORMATS if suffix in FORMATS[name].suffixes), None)
 
 
 def expect_parquet(path: Path) -> None:

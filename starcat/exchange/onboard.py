@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as changed
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
-from starcat.onboard.c_source import c_header, c_source
+from starcat.geometry.camera import Camera
+from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
     Shrunk,
     artifact_problems,
@@ -35,9 +36,12 @@ from starcat.onboard.patching import (
     sign_image,
     signature_problems,
 )
+from starcat.onboard.profiles import method_of, profile_named
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
+from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
+from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
@@ -53,6 +57,8 @@ class ExportedImage:
     file_format: str
     byte_order: ByteOrder
     files: tuple[Path, ...]  # the image, or source and header; then the patch
+    sky: Contents  # the whole database
+    profile: str | None = None  # None: no profile was asked for, so all is kept that fits
     signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
     patch_bytes: int | None = None  # of the patch, if one was asked for
 
@@ -61,9 +67,26 @@ class ExportedImage:
         """CRC-32 of all data, which flight software is told of a new image."""
         return crc_of(self.made.data, self.byte_order)
 
+    @property
+    def voting_bytes(self) -> int:
+        """Memory, besides the image, of the table of neighbours for votes, bytes."""
+        contents = self.fitted.contents
+        return voting_bytes(contents.directions, contents.camera.radius_rad)
+
+    @cached_property
+    def rates(self) -> tuple[FlightRates, ...]:
+        """What the image identifies of simulated frames; empty without the C library."""
+        return flight_rates(self.fitted.contents, self.sky)
+
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        fitted = self.fitted
+        """Return plain values for JSON; of an image by a profile with `rates`."""
+        fitted, of_profile = self.fitted, {}
+        if self.profile is not None:
+            of_profile = {
+                "profile": self.profile,
+                "voting_bytes": self.voting_bytes,
+                "rates": [rates.as_dict() for rates in self.rates],
+            }
         return {
             "source": fitted.contents.name,
             "format": self.file_format,
@@ -80,6 +103,7 @@ class ExportedImage:
             "features_without_limit": fitted.features_before,
             "most_near": self.made.most_near,
             "signed_by": list(self.signed_by),
+            **of_profile,
         }
 
 
@@ -88,17 +112,23 @@ def export_image(
     file_format: str,
     output: Path | None = None,
     *,
-    method: str = "triangle",
+    profile: str | None = None,
+    method: str | None = None,
     endian: str = "little",
     max_bytes: int | None = None,
     patch_from: Path | None = None,
     replace: bool = False,
     sign: Sequence[Path] = (),
+    camera: Path | None = None,
 ) -> ExportedImage:
     """Write the onboard image of a database, signed with the keys of some files.
 
-    With `patch_from`, an older image, the patch that makes the new one of it is beside it.
+    A profile is a name of `PROFILES`; the method is the profile's default unless one is given.
+    With `patch_from`, an older image, the patch that makes the new one of it is beside it. With
+    `camera`, a camera file, a header with this camera for the library is beside it.
     """
+    kept = profile_named("full" if profile is None else profile)
+    method = method_of("full" if profile is None else profile, method)
     check_method(method)
     keys = [read_private(Path(path)) for path in sign]
     order = next((known for known in BYTE_ORDERS if known == endian), None)
@@ -124,6 +154,7 @@ def export_image(
             key="patch_from",
             fields=("patch_from", "form"),
         )
+    own_camera = None if camera is None else read_camera(Path(camera))
     old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
         raise OutputError(
@@ -131,8 +162,11 @@ def export_image(
         )
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
+    if own_camera is not None:
+        _check_camera(own_camera, contents.camera, Path(str(camera)))
     room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
-    fitted = shrink(contents, _times_seen(opened, method), partial(_fields, opened), room)
+    fields = partial(_fields, opened)
+    fitted = shrink(contents, _times_seen(opened, method), fields, room, kept)
     made = make_image(fitted.contents, order)
     made = changed(made, data=sign_image(made.data, order, keys))
     files = {target: made.data}
@@ -141,10 +175,26 @@ def export_image(
     patch = None if old is None else _checked_patch(old, read_onboard_image(made.data))
     if patch is not None:
         files[target.with_suffix(".patch")] = patch
+    if own_camera is not None:
+        text = c_camera(fitted.contents.name, own_camera)
+        files[target.with_name(f"{target.stem}_camera.h")] = text.encode()
     _write(files, replace=replace)
     signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
     size = None if patch is None else len(patch)
-    return ExportedImage(made, fitted, file_format, order, tuple(files), signed_by, size)
+    paths = tuple(files)
+    return ExportedImage(
+        made, fitted, file_format, order, paths, contents, profile, signed_by, size
+    )
+
+
+def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
+    size_px, expected_px = ((one.width_px, one.height_px) for one in (camera, built_for))
+    if size_px != expected_px:
+        raise ConfigError(
+            f"{path}: a camera of {size_px[0]} x {size_px[1]} px; the database is for "
+            f"{expected_px[0]} x {expected_px[1]} px. Give the camera that was calibrated with it",
+            key="camera",
+        )
 
 
 def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:

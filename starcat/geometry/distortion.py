@@ -15,6 +15,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arguments import without_unit
 from starcat.arrays import Array
 from starcat.errors import ConfigError
 
@@ -33,6 +34,7 @@ NEWTON_STEPS = 50
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
     """Return a value that has to be a finite number in an open interval; a bool is none."""
+    value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number may be too large for a float
             number = float(value)
@@ -46,7 +48,8 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 
 def checked_pair(name: str, value: object) -> tuple[float, float]:
     """Return a value that has to be two numbers."""
-    numbers = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    given = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    numbers = [without_unit(name, one) for one in given]
     if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
         text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
         raise ConfigError(text, key=name, value=value)

@@ -17,5 +17,5 @@ from starcat.images.solve_files import FrameAnswer as FrameAnswer
 from starcat.images.solve_files import identify_either_way as identify_either_way
 from starcat.images.solve_files import identify_file as identify_file
 from starcat.images.solve_files import open_matcher as open_matcher
-from starcat.images.spots import FOV_ERROR as FOV_ERROR
-from starcat.images.spots import WIDE_FOV_ERROR as WIDE_FOV_ERROR
+from starcat.matcher.other_fields import FOV_ERROR as FOV_ERROR
+from starcat.matcher.other_fields import WIDE_FOV_ERROR as WIDE_FOV_ERROR

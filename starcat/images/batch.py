@@ -34,6 +34,7 @@ from starcat.images.solve_files import (
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
+from starcat.storage.file_formats import RAW_MAKERS
 
 CENTROID_SUFFIXES = (".csv", ".json")
 TILE_PX = 256  # longest side of the small picture that is kept of each
@@ -105,7 +106,7 @@ def _is_pattern(given: str) -> bool:
 
 def _of_folder(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
-    for suffixes in (IMAGE_SUFFIXES, CENTROID_SUFFIXES):
+    for suffixes in ((*IMAGE_SUFFIXES, *RAW_MAKERS), CENTROID_SUFFIXES):
         chosen = [path for path in files if path.suffix.lower() in suffixes]
         if chosen:
             return chosen
@@ -152,7 +153,7 @@ def identify_files(
             yield BatchItem(path, error=error, small=measured.small)
             continue
         first = next(iter(found), None)
-        notes = answers.notes(first, is_any_identified=True)
+        notes = answers.notes(first)
         yield BatchItem(path, found, notes=tuple(notes), small=measured.small)
 
 

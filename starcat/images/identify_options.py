@@ -31,7 +31,9 @@ class IdentifyOptions(BaseModel):
         None, ge=0, le=0.5, description="Error of the field that is allowed; by default 0.05."
     )
     fov_deg: tuple[float, float] | None = Field(
-        None, description="Smallest and largest field across the width, of an unknown camera."
+        None,
+        description="Smallest and largest field across the width, of an unknown camera; twice the "
+        "same for one field in place of the camera's.",
     )
     size_px: tuple[int, int] | None = Field(
         None, description="Width and height of a frame of centroids; with fov_deg."
@@ -68,11 +70,17 @@ class IdentifyOptions(BaseModel):
         None, gt=0, le=20, description="Largest error of prior_q."
     )
 
+    @property
+    def is_one_field(self) -> bool:
+        """Whether one field of view is stated in place of the camera's, and not a range."""
+        return self.fov_deg is not None and self.fov_deg[0] == self.fov_deg[1]
+
     @model_validator(mode="after")
     def _go_together(self) -> IdentifyOptions:
         if (self.prior_q is None) != (self.prior_error_deg is None):
             raise ValueError("prior_q and prior_error_deg go together; give both, or neither")
-        if self.fov_deg is not None and self.fov_error is not None:
+        is_range = self.fov_deg is not None and not self.is_one_field
+        if is_range and self.fov_error is not None:
             raise ValueError("give either fov_deg, a range of fields, or fov_error, not both")
         if self.size_px is not None and self.fov_deg is None:
             raise ValueError("size_px is the size of frames with fov_deg")

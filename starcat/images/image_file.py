@@ -8,7 +8,8 @@ files are written that say where in the sky each pixel is.
 What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
 FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
 by imagecodecs, and HEIC by pi-heif, which the extra ``images`` brings. Stacks of other numbers of
-planes are refused, unless one of them is chosen.
+planes are refused, unless one of them is chosen. Raw pictures of cameras, known by their suffix,
+are read by rawpy, which the extra ``raw`` brings.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from starcat.arrays import Array
 from starcat.errors import ConfigError, FileMissing, SourceError
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
-from starcat.storage.file_formats import unread_format
+from starcat.storage.file_formats import RAW_MAKERS, unread_format
 from starcat.storage.regular_files import read_regular_file
 from starcat.version import install_command
 
@@ -85,6 +86,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
         kind = "HEIC"
+    if path.suffix.lower() in RAW_MAKERS:
+        kind = "a raw picture"
     unread = unread_format(path, data)
     if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
         if unread is not None:
@@ -98,6 +101,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     try:
         if kind == "FITS":
             values, upside_down = _read_fits(data, path, plane)
+        elif kind == "a raw picture":
+            values, upside_down = _grey_of_raw(data), False
         elif kind == "HEIC":
             values, upside_down = _grey_of_heic(data), False
         else:
@@ -220,6 +225,23 @@ def _grey_of_heic(data: bytes) -> NDArray[Any]:
     if values.ndim == 2:
         return values.copy()
     return np.rint(_luminance(np.moveaxis(values, 2, 0)))
+
+
+def _grey_of_raw(data: bytes) -> NDArray[Any]:
+    """Return the light of a raw picture: its mosaic of colours above the black level, smoothed."""
+    try:
+        import rawpy
+    except ImportError as error:
+        raise ConfigError(
+            f"raw pictures of cameras need the package rawpy ({error}); {install_command('raw')}, "
+            "or convert the picture to TIFF"
+        ) from error
+    with rawpy.imread(io.BytesIO(data)) as raw:
+        values = raw.raw_image_visible.astype(np.float32)
+        if values.ndim == 3:  # of a sensor without a mosaic
+            return _luminance(np.moveaxis(values, 2, 0))
+        values -= np.array(raw.black_level_per_channel, dtype=np.float32)[raw.raw_colors_visible]
+    return grey_of_mosaic(values).astype(np.float32)
 
 
 def _luminance(planes: NDArray[Any]) -> NDArray[np.float32]:

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from starcat.arguments import path_of
 from starcat.arrays import Array, Matrix, Pixels
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.images.overlay import (
@@ -33,6 +35,7 @@ from starcat.images.overlay import (
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
+from starcat.resources import PathLike
 from starcat.sky.names import common_names
 
 if TYPE_CHECKING:
@@ -45,21 +48,42 @@ _LONG_SIDE_IN = 9.0
 _LEFT_IN, _BOTTOM_IN, _RIGHT_IN, _TOP_IN = 0.6, 0.85, 0.3, 0.8
 
 
+def draw_result(
+    result: MatchResult, output: PathLike | None, image: ArrayLike | None, name: str
+) -> Figure:
+    """Draw the frame of a result, as `MatchResult.plot` describes it."""
+    frame, database = result.frame, result.database
+    if frame is None or database is None:
+        raise ConfigError("this MatchResult does not hold the frame that was asked about")
+    camera = result.camera or frame.camera
+    pixels = None if image is None else np.asarray(image)
+    if pixels is not None and pixels.shape != (camera.height_px, camera.width_px):
+        raise ConfigError(
+            f"image has the shape {pixels.shape}; expected {camera.height_px} rows of "
+            f"{camera.width_px} pixels, as the camera has",
+            key="image",
+        )
+    path = None if output is None else path_of("output", output)
+    named = MeasuredFrame(name, frame.centroids_px, frame.mag)
+    return draw(path, named, pixels, result, database, camera)
+
+
 def draw(
-    path: Path,
+    path: Path | None,
     frame: MeasuredFrame,
     image: NDArray[Any] | None,
     result: MatchResult,
     database: Database,
     camera: Camera,
     sky: SkyInTime | None = None,
-) -> None:
-    """Draw a frame with its stars circled and named."""
-    title, below = f"{frame.name}: {result.status.replace('_', ' ')}", database.name
+) -> Figure:
+    """Draw a frame with its stars circled and named, and write the picture if there is a path."""
+    name = f"{frame.name}: " if frame.name else ""
+    title, below = f"{name}{result.status.replace('_', ' ')}", database.name
     compass = overlay = None
     if result.status == "identified":
         title = (
-            f"{frame.name}: RA {result.boresight_ra_deg:.4f}, "
+            f"{name}RA {result.boresight_ra_deg:.4f}, "
             f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
         )
         below = (
@@ -70,7 +94,7 @@ def draw(
         compass = compass_from_matrix(matrix)
         bodies = () if sky is None else sky.bodies
         overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
-    draw_identified(
+    return draw_identified(
         path,
         image,
         (camera.width_px, camera.height_px),
@@ -117,7 +141,7 @@ def picture_name(designation: str) -> str:
 
 
 def draw_identified(
-    path: Path,
+    path: Path | None,
     image: NDArray[Any] | None,
     camera_size: tuple[int, int],
     centroids_px: Pixels,
@@ -128,8 +152,8 @@ def draw_identified(
     below: str = "",
     compass: tuple[Array, Array] | None = None,
     overlay: Overlay | None = None,
-) -> None:
-    """Draw which centroids of a frame are which stars."""
+) -> Figure:
+    """Draw which centroids of a frame are which stars; write the picture if there is a path."""
     check_kind(path, "picture")
     with own_style():
         figure, axes, scale = _canvas(camera_size, title, below)
@@ -142,7 +166,9 @@ def draw_identified(
         taken = draw_compass(frame, compass)
         left_out = draw_names(frame, np.vstack([taken, written]))
         _draw_legend(figure, names, left_out)
-        write_figure(figure, path)
+        if path is not None:
+            write_figure(figure, path)
+    return figure
 
 
 def compass_from_matrix(matrix: Matrix) -> tuple[Array, Array]:

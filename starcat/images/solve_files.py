@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -27,7 +27,7 @@ from starcat.images.attempts import (
     is_new,
 )
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
-from starcat.images.spots import FOV_ERROR, Search, look_again, weighed
+from starcat.images.spots import weighed
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_centroid_files,
@@ -36,10 +36,12 @@ from starcat.matcher.centroids import (
     upside_down,
 )
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
+from starcat.storage.file_formats import RAW_MAKERS
 
 if TYPE_CHECKING:
     from starcat.images.centroiding import Spots
@@ -115,7 +117,7 @@ class FrameAnswer:
 
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
-        found = {"frame": self.frame.name, **facts(self.result), "stars": self._stars()}
+        found = {"frame": self.frame.name, **self.result.to_dict(self.frame)}
         if self.spots is not None and self.spots.streak is not None:
             found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
         if self.attempt is not None:
@@ -124,67 +126,6 @@ class FrameAnswer:
         if self.observer is not None:
             found["in_time"] = None if self.sky is None else self.sky.content()
         return found
-
-    def _stars(self) -> list[Content]:
-        reasons, stars = dict(self.result.dropped), self.result.stars
-        row_of = {spot: row for row, spot in enumerate(stars.spot.tolist())}
-        numbers = (
-            *("mag", "ra_deg", "dec_deg"),
-            *("dx_px", "dy_px", "separation_arcsec", "difference_mag"),
-        )
-        columns = {name: getattr(stars, name).tolist() for name in numbers}
-        content, given = [], self.frame.mag
-        for number, (x, y) in enumerate(self.frame.centroids_px.tolist()):
-            seen = None if given is None else _or_none(float(given[number]))
-            one: Content = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
-            one |= {"star": None, "mag": None}
-            row = row_of.get(number)
-            if row is not None:
-                one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
-                one |= {name: _or_none(column[row]) for name, column in columns.items()}
-            if number in reasons:
-                one["dropped"] = reasons[number]
-            content.append(one)
-        return content
-
-
-def facts(result: MatchResult) -> Content:
-    """Return what an answer says of the whole frame, as JSON has it."""
-    found: Content = {"status": result.status, "origin": result.origin}
-    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
-    if result.ok:
-        camera, database = result.camera, result.database
-        found |= {
-            "database": None if database is None else database.name,
-            "camera": None if camera is None else asdict(camera),
-            "boresight_ra_deg": result.boresight_ra_deg,
-            "boresight_dec_deg": result.boresight_dec_deg,
-            "roll_deg": result.roll_deg,
-            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
-            "covariance_arcsec2": [
-                [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
-            ],
-            "residual_arcsec": result.residual_arcsec,
-            "reduced_chi_square": _or_none(result.reduced_chi_square),
-            "false_match_probability": result.false_match_probability,
-            "focal_length_px": None if camera is None else camera.focal_length_px,
-            "focal_length_error_px": result.focal_length_error_px,
-        }
-    elif result.refusal is not None:
-        why = result.refusal
-        found["refusal"] = {
-            "reason": why.reason,
-            "words": why.message,
-            "advice": why.hint,
-            "n_matched": why.n_matched,
-            "false_match_probability": why.false_match_probability,
-            "share": why.share,
-        }
-    return {**found, "time_s": _or_none(result.time_s)}
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -218,30 +159,38 @@ class FileAnswers:
 
     def _answer(self, frame: MeasuredFrame, search: Search, fov_error: float) -> FrameAnswer:
         observer, spots = self.local.observer, self.measured.spots
-        result = search(frame, fov_error)
+        result = search(frame, fov_error, None, math.inf)
         if not result.ok and fov_error and self.options.fov_error is None:
             # Few stars may determine the attitude of the camera as it was described, and no more.
-            exact = search(frame, 0.0)
+            exact = search(frame, 0.0, None, math.inf)
             result = exact if exact.ok else result
         if spots is not None:
             result = weighed(result, spots.sigma_px)
         if not result.ok and (again := self._answer_again(result, frame, search, fov_error)):
             return again
-        is_searched = result.status == "no_match" and not _is_limited(result)
-        if is_searched and self._is_lost_in_space:
-            result = look_again(
-                search, frame, self.camera, result, fov_error,
-                is_scale_free=self._is_scale_free, flip=self.options.flip,
-            )  # fmt: skip
+        if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
+            result = self._explained(result, frame, search, fov_error)
         return FrameAnswer(frame, result, observer, spots)
+
+    def _explained(
+        self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
+    ) -> MatchResult:
+        """Return a refused answer with what a second look has found."""
+        if self.local.track or self.options.prior_q is not None:
+            return refused
+        return explained(
+            refused, frame, self.camera, search, fov_error=fov_error,
+            with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
+            limit=self.matcher.max_false_match_probability,
+            searches=MAX_SEARCHES if self.is_image else SEARCHES,
+        )  # fmt: skip
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
     ) -> FrameAnswer | None:
         """Return the answer to an image that is measured once more; None if there is none."""
         limit, is_limited = self.matcher.max_false_match_probability, _is_limited(refused)
-        own_limit = self.options.time_limit_s is not None or self.options.max_steps is not None
-        if not self.is_image or (is_limited and own_limit):
+        if not self.is_image or (is_limited and self._has_own_limit):
             return None
         searched = [first.centroids_px]
         end_s = time.monotonic() + (self.options.time_limit_s or math.inf)
@@ -255,7 +204,7 @@ class FileAnswers:
             if spots is None or (attempt.number > 2 and not is_new(frame.centroids_px, searched)):
                 continue
             searched.append(frame.centroids_px)
-            result = counted(search(frame, fov_error), limit)
+            result = counted(search(frame, fov_error, None, math.inf), limit)
             if result is not None:
                 result = weighed(result, spots.sigma_px)
                 return FrameAnswer(frame, result, self.local.observer, spots, attempt)
@@ -296,6 +245,10 @@ class FileAnswers:
             )
 
     @property
+    def _has_own_limit(self) -> bool:
+        return self.options.time_limit_s is not None or self.options.max_steps is not None
+
+    @property
     def _is_lost_in_space(self) -> bool:
         """Whether the whole sky is searched with one camera."""
         options = self.options
@@ -314,18 +267,24 @@ class FileAnswers:
 
     def _search(self, tracker: Tracker | None) -> Search:
         """Return how a frame is identified with an error of the focal length."""
-        matcher, camera, observer = self.matcher, self.camera, self.local.observer
-        way = self._way(tracker)
+        matcher, observer = self.matcher, self.local.observer
+        self._check_way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
                 "track=True does not tell planets from stars; leave out time, or track=True",
                 fields=("track=True", "time"),
             )
 
-        def search(frame: MeasuredFrame, fov_error: float) -> MatchResult:
+        def search(
+            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
+        ) -> MatchResult:
+            camera = other or self.camera
+            is_range = self.options.fov_deg is not None
+            hurried = matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
+            way = self._way(tracker, hurried)
             identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
             if observer is None:
-                return identify(frame.centroids_px, magnitudes=frame.mag)
+                return identify(frame.centroids_px, mag=frame.mag)
             from starcat.sky.in_time import identify_in_time
 
             return identify_in_time(
@@ -334,32 +293,33 @@ class FileAnswers:
                 frame.centroids_px,
                 camera,
                 observer,
-                magnitudes=frame.mag,
+                mag=frame.mag,
                 tolerance_px=matcher.tolerance_px,
                 max_false_match_probability=matcher.max_false_match_probability,
             )
 
         return search
 
-    def _way(self, tracker: Tracker | None) -> Callable[..., MatchResult]:
-        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
+    def _check_way(self, tracker: Tracker | None) -> None:
         options = self.options
-        if options.prior_q is None and tracker is None:
-            return partial(self.matcher.identify, fov_deg=options.fov_deg)
-        if options.fov_deg is not None:
+        if options.fov_deg is not None and (options.prior_q is not None or tracker is not None):
             raise ConfigError(
                 "fov_deg is for frames of an unknown camera; leave out track=True and prior_q",
                 fields=("fov_deg", "track=True", "prior_q"),
             )
+
+    def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
+        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
+        options = self.options
         if tracker is not None:
             return tracker.attempt
-        prior, error_deg = list(options.prior_q or ()), options.prior_error_deg
-        return partial(self.matcher.identify, prior=prior, prior_error_deg=error_deg)
+        if options.prior_q is None:
+            return partial(matcher.identify, fov_deg=options.fov_deg)
+        prior, error_deg = list(options.prior_q), options.prior_error_deg
+        return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
 
-    def notes(
-        self, first: FrameAnswer | None, *, is_any_identified: bool, flip: str = "flip"
-    ) -> list[str]:
-        """Return what a user should know beside the answers; ``flip`` is what to try."""
+    def notes(self, first: FrameAnswer | None) -> list[str]:
+        """Return what a user should know beside the answers."""
         unknown = said_of_columns([first.frame]) if first else None
         notes = [unknown] if unknown else []
         if first and first.spots is not None and first.spots.streak is not None:
@@ -373,10 +333,6 @@ class FileAnswers:
                 f"{first.attempt.words}; the chance of a false match counts all "
                 f"{MAX_SEARCHES} searches that an image can have."
             )
-        refusal = None if first is None else first.result.refusal
-        is_said = refusal is not None and refusal.reason == "mirrored" and refusal.flip is not None
-        if self.is_image and not is_any_identified and not is_said:
-            notes.append(f"An image that was read upside down is never identified: try {flip}.")
         return notes
 
     def draw(self, path: Path, answer: FrameAnswer) -> None:
@@ -453,6 +409,10 @@ def answers_of(
         camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
     if options.fov_deg is not None:
         camera = _camera_of_size(measured, options.size_px, camera)
+        if options.is_one_field:
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=options.fov_deg[0])
+            camera = camera.with_focal_length(flat.focal_length_px)
+            options = options.model_copy(update={"fov_deg": None, "size_px": None})
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
@@ -473,7 +433,7 @@ def measure_picture(
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
+    if path.suffix.lower() not in (*IMAGE_SUFFIXES, *RAW_MAKERS):
         return MeasuredFile(read_centroid_files(path))
     from starcat.images.centroiding import find_spots
 
@@ -527,4 +487,6 @@ def _camera_of_size(
                 key="size",
                 fields=("size_px",),
             )
+    if (width, height) == (known.width_px, known.height_px):
+        return known
     return Camera(width, height, fov_x_deg=known.fov_x_deg)

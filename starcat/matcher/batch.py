@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from starcat.arrays import Array
 from starcat.matcher.result import MatchResult, Status
+from starcat.matcher.sky_objects import sky_object_table
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +52,37 @@ class BatchResult(Sequence[MatchResult]):
             return answers[n] if n in answers else self._answer(n)
 
         return BatchResult(status, seconds, attitudes, answer_of)
+
+    def table(self) -> QTable:
+        """Return the answers as an astropy table, one row per frame.
+
+        Returns
+        -------
+        astropy.table.QTable
+            With units: ``status``, ``reason`` (of `Refusal`; empty if identified),
+            ``n_centroids``, ``n_matched``, ``boresight_ra_deg``, ``boresight_dec_deg``,
+            ``roll_deg``, ``q_body_from_icrs`` of shape (N, 4), ``residual_arcsec``,
+            ``false_match_probability`` and ``time_s``. Angles are NaN unless identified.
+
+        Raises
+        ------
+        ConfigError
+            If astropy is not installed.
+        """
+        answers = list(self)
+        reasons = ["" if one.refusal is None else one.refusal.reason for one in answers]
+        columns: dict[str, Any] = {
+            "status": np.array(self.status, dtype=np.str_),
+            "reason": np.array(reasons, dtype=np.str_),
+            "n_centroids": np.array([len(one.star_index) for one in answers], dtype=np.int64),
+            "n_matched": np.array([one.n_matched for one in answers], dtype=np.int64),
+        }
+        for name in ("boresight_ra_deg", "boresight_dec_deg", "roll_deg"):
+            columns[name] = np.array([getattr(one, name) for one in answers], dtype=np.float64)
+        columns["q_body_from_icrs"] = self.q_body_from_icrs
+        for name in ("residual_arcsec", "false_match_probability", "time_s"):
+            columns[name] = np.array([getattr(one, name) for one in answers], dtype=np.float64)
+        return sky_object_table(columns, {})
 
     def __len__(self) -> int:
         return len(self.status)

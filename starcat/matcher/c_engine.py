@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
 from struct import Struct
@@ -28,7 +28,8 @@ from starcat.matcher.methods.votes import has_few_neighbours
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Reason, Refusal, Status, no_match
+from starcat.matcher.refusal import Reason, Refusal, known_of
+from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Status, no_match
 from starcat.matcher.settings import Settings
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
@@ -268,7 +269,7 @@ class Search:
         arrays = (
             ffi.from_buffer("int64_t[]", starts),
             _double_pointer(frames.centroids_px),
-            _double_pointer(frames.magnitudes),
+            _double_pointer(frames.mag),
             _double_pointer(frames.sigma_px),
             ffi.from_buffer("starcat_answer[]", records),
             ffi.from_buffer("int32_t[]", star_index),
@@ -305,6 +306,9 @@ class Search:
         star_index = np.ndarray(count, _INT32, record, IDS_AT + 8 * count)
         if code != _IDENTIFIED:
             why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
+            noises = self._settings.noise_px, self._settings.noise_mag
+            known = known_of(frame.magnitudes is not None, *noises, n_usable < count)
+            why = replace(why, known=known)
             content = {**vars(no_match(count, refusal=why))}
         else:
             content = {"status": "identified", "star_index": star_index}

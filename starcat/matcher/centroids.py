@@ -51,11 +51,11 @@ class Brightest:
     @property
     def frame(self) -> Frame:
         """The centroids that are searched, as a frame."""
-        mag, sigma = self.whole.magnitudes, self.whole.sigma_px
+        mag, sigma = self.whole.mag, self.whole.sigma_px
         return replace(
             self.whole,
             centroids_px=self.whole.centroids_px[self.rows],
-            magnitudes=None if mag is None else mag[self.rows],
+            mag=None if mag is None else mag[self.rows],
             sigma_px=None if sigma is None else sigma[self.rows],
         )
 
@@ -84,8 +84,8 @@ def brightest_of(frame: Frame) -> Brightest:
     dropped = [] if len(rows) == len(px) else unusable(px, inside)
     hashes = _hash(px[rows])
     mag = np.zeros(len(rows))
-    if frame.magnitudes is not None:
-        mag = np.nan_to_num(known_magnitudes(frame.magnitudes)[rows], nan=np.inf)
+    if frame.mag is not None:
+        mag = np.nan_to_num(known_magnitudes(frame.mag)[rows], nan=np.inf)
     # Centroids at exactly the same place count once. Few frames have any, so that in nearly all
     # of them it is enough to sort twice as many as are needed.
     for count in (2 * MAX_CENTROIDS, len(rows)):
@@ -107,12 +107,12 @@ def brightest_of_frames(frames: Frames) -> tuple[Frames, dict[int, Brightest]]:
         is_kept[frames.starts[n] : frames.starts[n + 1]] = False
         is_kept[frames.starts[n] + part.rows] = True
         counts[n] = len(part.rows)
-    mag, sigma = frames.magnitudes, frames.sigma_px
+    mag, sigma = frames.mag, frames.sigma_px
     searched = replace(
         frames,
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         centroids_px=frames.centroids_px[is_kept],
-        magnitudes=None if mag is None else mag[is_kept],
+        mag=None if mag is None else mag[is_kept],
         sigma_px=None if sigma is None else sigma[is_kept],
     )
     return searched, crowded

@@ -19,24 +19,39 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import HasFolder, database_path, whole_number
+from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_number
 from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.centroids import MAX_CENTROIDS, brightest_of, brightest_of_frames
+from starcat.matcher.centroids import (
+    MAX_CENTROIDS,
+    MeasuredFrame,
+    brightest_of,
+    brightest_of_frames,
+)
 from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_arrays, as_frame, as_frames
-from starcat.matcher.prior import Prior, prior_of
+from starcat.matcher.observation import (
+    WIDEST_FOV_ERROR,
+    Frame,
+    FrameLike,
+    as_arrays,
+    as_frame,
+    as_frames,
+)
+from starcat.matcher.other_fields import explained
+from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
     CERTAIN,
     MAX_STEPS,
     MIN_SHARE,
+    SCALE_FREE,
     Engine,
     Settings,
     TriangleOrder,
@@ -69,6 +84,10 @@ class Matcher(Settings, _WithDatabase):
     """
 
     def __post_init__(self) -> None:
+        check_type(
+            "database", self.database, Database,
+            "the database of a matcher; open one with starcat.Matcher.open",
+        )  # fmt: skip
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
             text = "engine 'numpy' needs a database; an onboard image has no products"
@@ -154,15 +173,16 @@ class Matcher(Settings, _WithDatabase):
 
     def identify(
         self,
-        centroids_px: ArrayLike | os.PathLike[str],
+        centroids_px: FrameLike | os.PathLike[str],
         camera: Camera | None = None,
         *,
-        magnitudes: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
-        fov_deg: tuple[float, float] | None = None,
+        fov_deg: float | tuple[float, float] | None = None,
+        explain: bool = False,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -171,13 +191,14 @@ class Matcher(Settings, _WithDatabase):
         centroids_px : array_like of float64, shape (N, 2)
             Pixels, in any order. Those that are not finite (or masked), outside of the frame or
             repeat another get no star and are reported. Of more than 512 the brightest are
-            searched, and `MatchResult.n_not_searched` counts the others. A table (astropy, pandas,
-            polars, Arrow, structured array, mapping) is read by name: ``x_px``, ``y_px``, and
-            ``mag`` and ``sigma_px`` if it has them. `starcat.Matcher` also takes the path of a
-            file.
+            searched, and `MatchResult.n_not_searched` counts the others. A frame of
+            `starcat.simulate`, `starcat.read_frames` or a result is read with its ``mag`` and
+            ``sigma_px``. A table (astropy, pandas, polars, Arrow, structured array, mapping) is
+            read by name: ``x_px``, ``y_px``, and ``mag`` and ``sigma_px`` if it has them.
+            `starcat.Matcher` also takes the path of a file.
         camera : Camera, optional
             The database's own by default.
-        magnitudes : array_like of float64, shape (N,), optional
+        mag : array_like of float64, shape (N,), optional
             They decide what is tried first; with ``noise_mag`` also what is accepted, and their
             zero point has to be that of the database. NaN, a masked entry, and any number outside
             of -100 to 100 are unknown magnitudes.
@@ -188,10 +209,18 @@ class Matcher(Settings, _WithDatabase):
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
         prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
-            Attitude that is expected, as ``q_body_from_icrs``, and its largest error as an angle of
-            rotation, at most 20. Only the stars near it are compared; the verification is the same.
-        fov_deg : pair of float, optional
-            Narrowest and widest field across the width, where no more is known; with ``levels``.
+            Attitude that is expected, as ``q_body_from_icrs`` or as a scipy ``Rotation`` like
+            `MatchResult.rotation` returns, and its largest error as an angle of rotation, at most
+            20. Only the stars near it are compared; the verification is the same. An astropy
+            ``SkyCoord`` is the expected boresight alone: the whole sky is searched, and an
+            attitude whose boresight is farther from it than the error is withheld.
+        fov_deg : float or pair of float, optional
+            Field across the width in place of the camera's, of a lens without distortion; or the
+            narrowest and the widest possible, where no more is known, with the product ``levels``.
+        explain : bool, default False
+            Whether a frame that is not identified is tried mirrored, and in fields of half to
+            twice the stated one, for 2 seconds at most. What explains it is in
+            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``.
 
         Returns
         -------
@@ -207,14 +236,56 @@ class Matcher(Settings, _WithDatabase):
         if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
             return self._identify_file(Path(centroids_px), camera)
         camera = self._camera(camera)
-        px, mags, sigma = as_arrays(centroids_px, magnitudes, sigma_px)
+        if fov_deg is not None and not isinstance(fov_deg, tuple | list):
+            checked_number("fov_deg", fov_deg)
+            camera, fov_deg = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg), None
+        px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
         near = prior_of(prior, prior_error_deg)
+        if near is not None and isinstance(near, BoresightPrior):
+            found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
+                                  fov_deg=fov_deg)  # fmt: skip
+            return near.checked(found)
         if len(px) <= MAX_CENTROIDS:
-            return self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
-        part = brightest_of(as_frame(px, camera, mags, sigma))
-        few = part.frame
-        searched = few.centroids_px, camera, few.magnitudes, few.sigma_px
-        return part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+            found = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
+        else:
+            part = brightest_of(as_frame(px, camera, mags, sigma))
+            few = part.frame
+            searched = few.centroids_px, camera, few.mag, few.sigma_px
+            found = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+        if not explain or found.status != "no_match" or near is not None or fov_deg is not None:
+            return found
+        return self._explained(
+            found, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
+        )
+
+    def _explained(
+        self, refused: MatchResult, frame: MeasuredFrame, camera: Camera, fov_error: float
+    ) -> MatchResult:
+        def search(
+            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
+        ) -> MatchResult:
+            eye = other or camera
+            return self.within(time_limit_s, eye, fov_error).identify(
+                frame.centroids_px, eye,
+                mag=frame.mag, sigma_px=frame.sigma_px, fov_error=fov_error,
+            )  # fmt: skip
+
+        return explained(
+            refused, frame, camera, search, fov_error=fov_error,
+            with_fields=self.method in SCALE_FREE, limit=self.max_false_match_probability,
+        )  # fmt: skip
+
+    def within(
+        self, time_limit_s: float, camera: Camera, fov_error: float, *, is_range: bool = False
+    ) -> Self:
+        """Return a matcher whose searches with numpy end after a time; C has its own limit.
+
+        ``is_range`` is whether it is to search a range of fields, which C does not.
+        """
+        in_c = not is_range and self._in_c(camera, fov_error) is not None
+        if in_c or time_limit_s >= self.time_limit_s:
+            return self
+        return replace(self, time_limit_s=time_limit_s)
 
     def _search(
         self,
@@ -239,10 +310,10 @@ class Matcher(Settings, _WithDatabase):
 
     def identify_many(
         self,
-        frames: Iterable[ArrayLike],
+        frames: Iterable[FrameLike],
         camera: Camera | None = None,
         *,
-        magnitudes: Iterable[ArrayLike] | None = None,
+        mag: Iterable[ArrayLike] | None = None,
         sigma_px: Iterable[ArrayLike] | None = None,
         threads: int | None = None,
     ) -> BatchResult:
@@ -254,7 +325,7 @@ class Matcher(Settings, _WithDatabase):
             Centroids of each frame, as `identify` takes them.
         camera : Camera, optional
             The database's own by default.
-        magnitudes, sigma_px : sequence of array_like of float64, shape (n,), optional
+        mag, sigma_px : sequence of array_like of float64, shape (n,), optional
             Those of each frame.
         threads : int, optional
             Threads that the C library runs in at once; all cores by default. The answers do not
@@ -271,7 +342,7 @@ class Matcher(Settings, _WithDatabase):
             As `identify`, or if there are not as many arrays of each as frames.
         """
         camera = self._camera(camera)
-        given = as_frames(frames, camera, magnitudes, sigma_px)
+        given = as_frames(frames, camera, mag, sigma_px)
         searched, crowded = brightest_of_frames(given)
         workers = (os.cpu_count() or 1) if threads is None else whole_number("threads", threads, 1)
         in_c = self._in_c(camera)
@@ -285,12 +356,8 @@ class Matcher(Settings, _WithDatabase):
     def _camera(self, camera: Camera | None) -> Camera:
         if camera is None:
             return self.database.camera
-        if not isinstance(camera, Camera):
-            text = (
-                f"camera is of type {type(camera).__name__}; expected a starcat.Camera. Give "
-                "magnitudes by name: identify(centroids_px, magnitudes=...)"
-            )
-            raise ConfigError(text, key="camera", value=camera)
+        expected = "a starcat.Camera. Give magnitudes by name: identify(centroids_px, mag=...)"
+        check_type("camera", camera, Camera, expected)
         return camera
 
     def _identify_file(self, path: Path, camera: Camera | None) -> MatchResult:
@@ -364,7 +431,7 @@ class Matcher(Settings, _WithDatabase):
     def _checked_fov_error(self, fov_error: float) -> float:
         if type(fov_error) is float and fov_error == 0.0:  # in nearly all calls, so at once
             return fov_error
-        in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
+        fov_error = in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
         if not fov_error:
             return 0.0
         check_scale_free(self)

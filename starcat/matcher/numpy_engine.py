@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
@@ -12,7 +13,8 @@ from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import fit_by_weights, focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
-from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
+from starcat.matcher.refusal import Refusal, known_of
+from starcat.matcher.result import MatchResult, Origin, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
@@ -122,7 +124,9 @@ def result_of_search(
     origin: Origin = "lost_in_space" if prior is None else "tracking"
     most = observation.settings.max_false_match_probability
     if found is None or found.false_match_probability > most:
-        why = _refusal_of(found, observation, limit, prior)
+        noises = observation.settings.noise_px, observation.settings.noise_mag
+        known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
+        why = replace(_refusal_of(found, observation, limit, prior), known=known)
         return no_match(count, observation.dropped, why, origin=origin)
     error_px = None
     if observation.fov_error:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arguments import columns_of, numbers_of
+from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
@@ -31,12 +31,27 @@ magnitudes, of light in any unit, lie far within. ``onboard/bindings/python/many
 limit."""
 
 
+class HasCentroids(Protocol):
+    """A frame of `starcat.simulate`, of `starcat.read_frames` or of a result.
+
+    ``mag`` and ``sigma_px`` are read too, if it has them.
+    """
+
+    @property
+    def centroids_px(self) -> Pixels:
+        """Return the centroids, shape (N, 2)."""
+
+
+FrameLike = ArrayLike | HasCentroids | Mapping[str, ArrayLike]
+"""What a caller can give for the centroids of a frame: numbers, a frame, or a table by column."""
+
+
 @dataclass(eq=False)  # a frozen one would take three times as long to make
 class Frame:
     """The centroids of a frame as they were given, and the camera that they were given with."""
 
     centroids_px: Pixels
-    magnitudes: Array | None
+    mag: Array | None  # NaN for a centroid without one
     camera: Camera
     # Standard deviation of each centroid on each axis; NaN or infinite where it is not known.
     sigma_px: Array | None = None
@@ -52,7 +67,7 @@ class Frames(Sequence[Frame]):
     # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``.
     starts: NDArray[np.int64]
     centroids_px: Pixels
-    magnitudes: Array | None
+    mag: Array | None  # NaN for a centroid without one
     camera: Camera
     sigma_px: Array | None = None
 
@@ -68,48 +83,72 @@ class Frames(Sequence[Frame]):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
         rows = slice(self.starts[frame], self.starts[frame + 1])
-        magnitudes = None if self.magnitudes is None else self.magnitudes[rows]
+        mag = None if self.mag is None else self.mag[rows]
         sigma_px = None if self.sigma_px is None else self.sigma_px[rows]
-        return Frame(self.centroids_px[rows], magnitudes, self.camera, sigma_px)
+        return Frame(self.centroids_px[rows], mag, self.camera, sigma_px)
 
 
 def as_frame(
-    centroids_px: ArrayLike,
+    centroids_px: FrameLike,
     camera: Camera,
-    magnitudes: ArrayLike | None = None,
+    mag: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
 ) -> Frame:
     """Return a copy of what a caller gives as a frame; errors as those of `as_arrays`."""
-    px, *each = as_arrays(centroids_px, magnitudes, sigma_px)
-    mag, sigma = (None if one is None else one.copy() for one in each)
-    return Frame(px.copy(), mag, camera, sigma)
+    px, *each = as_arrays(centroids_px, mag, sigma_px)
+    known, sigma = (None if one is None else one.copy() for one in each)
+    return Frame(px.copy(), known, camera, sigma)
 
 
 def as_arrays(
-    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None, sigma_px: ArrayLike | None = None
+    centroids_px: FrameLike, mag: ArrayLike | None = None, sigma_px: ArrayLike | None = None
 ) -> tuple[Pixels, Array | None, Array | None]:
     """Return the arrays of a frame; `ConfigError` unless numbers are as expected.
 
-    A table is read by the names of its columns. Its brightness and noise count unless they are
-    given separately.
+    A frame is read by its attributes, a table by the names of its columns. Their magnitudes and
+    noises count unless others are given separately.
     """
     if type(centroids_px) is not np.ndarray or centroids_px.dtype.names:
-        columns = columns_of(centroids_px)
+        columns = _columns_of_frame(centroids_px)
         if columns is not None:
-            centroids_px = _pixels_of(columns)
-            magnitudes = columns.get("mag") if magnitudes is None else magnitudes
+            centroids_px = columns["centroids_px"]
+            mag = columns.get("mag") if mag is None else mag
             sigma_px = columns.get("sigma_px") if sigma_px is None else sigma_px
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     if given.ndim != 2 or given.shape[1] != 2:
         if given.size:
             raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
         given = given.reshape(0, 2)
-    mag = sigma = None
-    if magnitudes is not None:
-        mag = _one_each("magnitudes", magnitudes, len(given))
+    known = sigma = None
+    if mag is not None:
+        known = _one_each("mag", mag, len(given))
     if sigma_px is not None:
         sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(given)))
-    return given, mag, sigma
+    return given, known, sigma
+
+
+def is_frame(values: object) -> bool:
+    """Return whether this is a frame, as `HasCentroids` describes it."""
+    return hasattr(values, "centroids_px")
+
+
+def _columns_of_frame(values: Any) -> dict[str, Any] | None:
+    """Return what a frame or a table holds by name; None for plain numbers."""
+    if is_frame(values):
+        names = "centroids_px", "mag", "sigma_px"
+        return {name: getattr(values, name, None) for name in names}
+    if isinstance(values, list | tuple) and any(map(is_frame, values)):
+        raise ArgumentTypeError(
+            f"centroids_px is a {type(values).__name__} with {len(values)} frames; give one of "
+            "them, such as frames[0], or give all of them to identify_many",
+            key="centroids_px",
+            value=values,
+            fields=("centroids_px",),
+        )
+    columns = columns_of(values)
+    if columns is None or "centroids_px" in columns:
+        return columns
+    return {**columns, "centroids_px": _pixels_of(columns)}
 
 
 def _pixels_of(columns: dict[str, Any]) -> Pixels:
@@ -147,16 +186,16 @@ def _checked_sigma(sigma_px: Array) -> Array:
 
 
 def as_frames(
-    centroids_px: Iterable[ArrayLike],
+    centroids_px: Iterable[FrameLike],
     camera: Camera,
-    magnitudes: Iterable[ArrayLike] | None = None,
+    mag: Iterable[ArrayLike] | None = None,
     sigma_px: Iterable[ArrayLike] | None = None,
 ) -> Frames:
     """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
     pixels = _sequence("frames", centroids_px)
     beside = {
         name: None if given is None else _sequence(name, given)
-        for name, given in (("magnitudes", magnitudes), ("sigma_px", sigma_px))
+        for name, given in (("mag", mag), ("sigma_px", sigma_px))
     }
     for name, given in beside.items():
         if given is not None and len(given) != len(pixels):
@@ -181,12 +220,7 @@ def _sequence(name: str, values: Any) -> Sequence[Any]:
     if not isinstance(values, str | bytes) and columns_of(values) is None:
         with suppress(TypeError):
             return values if hasattr(values, "__len__") else list(values)
-    raise ArgumentTypeError(
-        f"{name} is of type {type(values).__name__}; expected a sequence with one array per frame",
-        key=name,
-        value=values,
-        fields=(name,),
-    )
+    raise wrong_type(name, values, "a sequence with one array per frame")
 
 
 def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
@@ -321,7 +355,7 @@ def observe(
     frame: Frame, settings: Settings, *, fov_error: float = 0.0, budget: Budget | None = None
 ) -> Observation:
     """Return the usable centroids of a frame, in order."""
-    given, mag, camera = frame.centroids_px, frame.magnitudes, frame.camera
+    given, mag, camera = frame.centroids_px, frame.mag, frame.camera
     if mag is not None:
         mag = known_magnitudes(mag)
     usable = camera.contains(given)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,10 +20,12 @@ from starcat.arrays import Array, Directions, Rows
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import Pose
-from starcat.matcher.result import MatchResult, Refusal, no_match
+from starcat.matcher.refusal import Refusal
+from starcat.matcher.result import MatchResult, no_match
 from starcat.matcher.settings import LOOKUP, REACH, in_range
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify_candidates
@@ -56,31 +59,87 @@ class Prior:
         turn_rad = math.hypot(*turn_between(self.q_body_from_icrs.tolist(), q_found))
         if turn_rad <= self.error_rad + turn_of_noise_rad(camera, tolerance_px):
             return answer
-        names = ("origin", "time_s", "frame", "database", "noise_px")
-        facts = {name: getattr(answer, name) for name in names}
-        return no_match(len(answer.star_index), answer.dropped, Refusal("prior"), **facts)
+        return _withheld(answer)
 
 
-def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | None:
-    """Return a prior attitude from what a caller states."""
-    if quaternion is None and error_deg is None:
+@dataclass(frozen=True)
+class BoresightPrior:
+    """A prior direction of the boresight, unit, and its largest error; the roll is unknown."""
+
+    direction: Array
+    error_rad: float
+
+    def checked(self, answer: MatchResult) -> MatchResult:
+        """Return an answer if its boresight is as near as the error says."""
+        if not answer.ok or separation(answer.matrix[2], self.direction) <= self.error_rad:
+            return answer
+        return _withheld(answer)
+
+
+def _withheld(answer: MatchResult) -> MatchResult:
+    names = ("origin", "time_s", "frame", "database", "noise_px", "n_not_searched")
+    facts = {name: getattr(answer, name) for name in names}
+    return no_match(len(answer.star_index), answer.dropped, Refusal("prior"), **facts)
+
+
+class HasQuaternion(Protocol):
+    """A scipy ``Rotation``, of which ``apply`` converts ICRS into camera components."""
+
+    def inv(self) -> Any:
+        """Return the inverse rotation."""
+
+    def as_quat(self) -> Any:
+        """Return the quaternion in the convention of scipy."""
+
+
+class HasIcrs(Protocol):
+    """A ``SkyCoord`` of astropy."""
+
+    @property
+    def icrs(self) -> Any:
+        """Return the direction in ICRS."""
+
+
+PriorLike = ArrayLike | HasQuaternion | HasIcrs
+"""What a caller can give as a prior: an attitude, or the direction of the boresight."""
+
+
+def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | BoresightPrior | None:
+    """Return a prior from what a caller states."""
+    if prior is None and error_deg is None:
         return None
-    if quaternion is None or error_deg is None:
-        missing = "prior" if quaternion is None else "prior_error_deg"
+    if prior is None or error_deg is None:
+        missing = "prior" if prior is None else "prior_error_deg"
         raise ConfigError(
             f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
         )
-    q = numbers_of("prior", quaternion, "(4,)")
+    given: Any = prior
+    if hasattr(given, "icrs"):
+        direction = _direction_of(given.icrs)
+        error_deg = in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+        return BoresightPrior(direction, math.radians(error_deg))
+    if hasattr(given, "as_quat"):
+        given = given.inv().as_quat()
+    q = numbers_of("prior", given, "(4,)")
     parts = q.tolist() if q.shape == (4,) else [math.nan]
     largest = max(map(abs, parts))
     if not (all(map(math.isfinite, parts)) and largest > 0.0):
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
-        raise ConfigError(text, key="prior", value=quaternion)
-    in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+        raise ConfigError(text, key="prior", value=prior)
+    error_deg = in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
     # Its length carries no meaning, and that of four times 1e308 would overflow.
     scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
     length = math.hypot(*scaled)
     return Prior(np.array([part / length for part in scaled]), math.radians(error_deg))
+
+
+def _direction_of(place: Any) -> Array:
+    ra, dec = (np.asarray(angle.deg, dtype=np.float64) for angle in (place.ra, place.dec))
+    if ra.shape or not (np.isfinite(ra) and np.isfinite(dec)):
+        raise ConfigError(
+            f"prior is a SkyCoord of shape {ra.shape}; expected one finite direction", key="prior"
+        )
+    return directions_from_radec(ra, dec)
 
 
 def search_near(

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass, field, replace
+import os
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array, Matrix
+from starcat.arguments import wrong_type
+from starcat.arrays import Matrix
 from starcat.errors import ConfigError, NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
-from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame
+from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
 from starcat.matcher.pose import fit_by_weights
+from starcat.matcher.refusal import Refusal
 from starcat.matcher.stars import (
     ARCSEC,
     NO_STARS,
@@ -36,145 +37,8 @@ if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
     from astropy.wcs import WCS
-
-Reason = Literal[
-    "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "mirrored",
-    "time", "steps",
-]  # fmt: skip
-
-MESSAGES: dict[Reason, str] = {
-    "too_few_stars": f"fewer than {MIN_STARS} centroids of the frame are usable",
-    "no_candidate": "no pattern of the frame is one of the database",
-    "prior": "no attitude as near to the prior as its error says explains the frame",
-    "chance": "no attitude fits better than chance",
-    "share_of_frame": "the best agreement explains too little of the frame",
-    "scale": "the frame has another scale or shape than the camera",
-    "mirrored": "the frame matches only mirrored: its y counts up",
-    "time": "the time limit ended the search",
-    "steps": "the limit of steps ended the search",
-}
-"""Each reason in words."""
-
-HINTS: dict[Reason, str] = {
-    "too_few_stars": (
-        "find more stars, with a longer exposure or a lower threshold, and look at 'dropped' for "
-        "those that were not used"
-    ),
-    "no_candidate": (
-        "check the field of view of the camera, try the image flipped, allow a wider tolerance "
-        "of centroids, or use a database of fainter stars"
-    ),
-    "prior": "state a larger error of the prior (prior_error_deg), or identify without a prior",
-    "chance": (
-        "give magnitudes, state their noise (noise_px, noise_mag) in place of a "
-        "tolerance, or find more stars; check the field of view, and try the image flipped"
-    ),
-    "share_of_frame": (
-        "leave out centroids that are no stars, give the camera its distortion, use a database "
-        "that is as deep as the frame, or ask for a smaller share (min_share)"
-    ),
-    "scale": "give the camera its true focal length, or allow a larger error of it (fov_error); "
-    "'starcat calibrate' finds pixels that are not square",
-    "mirrored": "turn the frame over (flip)",
-    "time": (
-        "allow more time (time_limit_s), give magnitudes, or leave out centroids that are no stars"
-    ),
-    "steps": (
-        "allow more steps (max_steps), give magnitudes, or leave out centroids that are no stars"
-    ),
-}
-"""What to try, by reason. Parameters of Python and of the service stand in brackets."""
-
-_BRACKETS = re.compile(r"\(([a-z_]+(?:, [a-z_]+)*)\)")
-
-
-def bracketed(hint: str) -> list[str]:
-    """Return the parameters that a hint names.
-
-    Examples
-    --------
-    >>> bracketed(HINTS["chance"])
-    ['noise_px', 'noise_mag']
-    """
-    return [name for names in _BRACKETS.findall(hint) for name in names.split(", ")]
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why a frame was not identified.
-
-    Attributes
-    ----------
-    reason : str
-        ``too_few_stars``, ``no_candidate`` (no pattern of the frame is in the database),
-        ``prior`` (no attitude near the prior explains the frame), ``chance``,
-        ``share_of_frame`` and ``scale`` (why the best agreement was withheld),
-        ``mirrored`` (it would be found upside down), or ``time`` and ``steps`` (the limit that
-        ended the search).
-    n_matched : int
-        Centroids with a star in the best agreement; 0 where there was none.
-    false_match_probability : float
-        Bound on the probability that chance agrees as well as it; 1 where there was none.
-    share : float
-        Share of the frame that it explains, by weight; 0 where there was none.
-    n_centroids : int
-        Usable centroids of the frame; 0 where that is not known.
-    camera : Camera or None
-        The camera that a second look found the frame with, if there was one.
-    focal_error : float or None
-        By how much its focal length is longer than stated, relative.
-    flip : bool or None
-        Whether the caller stated that the frame is turned over (``flip``); None without a
-        statement. It changes the words about a mirrored frame.
-    """
-
-    reason: Reason
-    n_matched: int = 0
-    false_match_probability: float = 1.0
-    share: float = 0.0
-    n_centroids: int = 0
-    camera: Camera | None = None
-    focal_error: float | None = None
-    flip: bool | None = None
-
-    @property
-    def message(self) -> str:
-        """The reason as a sentence begins, with the numbers of the best agreement."""
-        text = MESSAGES[self.reason]
-        if self.reason == "mirrored" and self.flip:
-            text = "the frame matches only mirrored: it was turned over, and was upright before"
-        if self.focal_error is not None:
-            longer = "longer" if self.focal_error > 0.0 else "shorter"
-            text = f"the focal length is {abs(self.focal_error):.1%} {longer} than stated"
-        if self.n_matched == 0:
-            return text
-        of_all = f" of {self.n_centroids}" if self.n_centroids else ""
-        best = f"best: {self.n_matched}{of_all} centroids"
-        if self.false_match_probability < 1.0:
-            best += f", chance {self.false_match_probability:.1e}"
-            best += f", {self.share:.0%} of the frame" if self.share else ""
-        return f"{text} ({best})"
-
-    @property
-    def hint(self) -> str:
-        """What to try."""
-        if self.reason == "mirrored" and self.flip is not None:
-            return "leave this option out (flip)"
-        if self.focal_error is None or self.camera is None:
-            return HINTS[self.reason]
-        return (
-            f"describe the camera with {self.camera.focal_length_px:.1f} px "
-            f"({self.camera.fov_x_deg:.2f} deg across), or allow a larger error (fov_error)"
-        )
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Parameters that the hint names."""
-        return tuple(bracketed(self.hint))
-
-    def __repr__(self) -> str:
-        return f"<Refusal {self.reason}: {self.message}>"
-
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
 
 Status = Literal["identified", "no_match", "too_few_stars"]
 
@@ -196,6 +60,9 @@ class MatchResult:
         Only ``identified`` comes with stars and an attitude.
     star_index : ndarray of int32, shape (N,)
         Row of the database, -1 where none.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, body from ICRS: ``v_body = matrix @ v_icrs``, with x right, y down and z along
+        the boresight. NaN unless identified.
     residual_arcsec : float
         Root mean square angle between matched centroids and their stars.
     false_match_probability : float
@@ -225,7 +92,7 @@ class MatchResult:
 
     status: Status
     star_index: NDArray[np.int32]
-    matrix: Matrix  # attitude, ``body = matrix @ icrs``; NaN unless identified
+    matrix: Matrix
     residual_arcsec: float
     false_match_probability: float
     dropped: Dropped = ()
@@ -262,6 +129,15 @@ class MatchResult:
         return self.ok
 
     @property
+    def fits_fov_deg(self) -> float | None:
+        """Field across the width that explains a frame which the stated field does not, degrees.
+
+        None if the frame was identified, if no other field was searched (``explain``), or if none
+        explains it.
+        """
+        return None if self.refusal is None else self.refusal.fits_fov_deg
+
+    @property
     def n_matched(self) -> int:
         """Centroids with a star."""
         return int(np.count_nonzero(self.star_index >= 0))
@@ -281,7 +157,8 @@ class MatchResult:
     def q_body_from_icrs(self) -> NDArray[np.float64]:
         """Attitude [x, y, z, w], shape (4,); NaN unless identified.
 
-        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components;
+        `rotation` returns it.
         """
         if self._record is not None:
             return np.ndarray(4, np.float64, self._record, Q_AT)
@@ -378,7 +255,7 @@ class MatchResult:
             )
         return tuple(told)
 
-    def with_noise(self, sigma_px: Array) -> MatchResult:
+    def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
 
         ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
@@ -386,18 +263,101 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
+        if sigma is None:
+            raise ConfigError(
+                "sigma_px is missing; give the noise of each centroid", key="sigma_px"
+            )
         px = np.column_stack([stars.x_px, stars.y_px])
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
             self.database.directions[stars.star_index],
-            sigma_px[stars.spot],
+            sigma[stars.spot],
         )
         return replace(
             self,
             matrix=matrix,
             residual_arcsec=residual_rad * ARCSEC,
-            frame=replace(self.frame, sigma_px=sigma_px),
+            frame=replace(self.frame, sigma_px=sigma),
         )
+
+    def rotation(self) -> Rotation:
+        """Return the attitude as scipy has it: ``rotation().apply(v_icrs)`` is ``v_body``.
+
+        Returns
+        -------
+        scipy.spatial.transform.Rotation
+            Of `matrix`. Its ``as_quat()`` is [-x, -y, -z, w] for `q_body_from_icrs` [x, y, z, w],
+            or its negative: scipy uses the other convention of quaternions.
+
+        Raises
+        ------
+        NotIdentifiedError
+            Unless identified.
+        ConfigError
+            If scipy is not installed.
+        """
+        self._expect_ok("attitude")
+        return sky_objects.rotation(self.matrix)
+
+    def to_dict(self, frame: HasCentroids | None = None) -> dict[str, Any]:
+        """Return the result as ``starcat identify --json`` prints it.
+
+        Parameters
+        ----------
+        frame : frame, optional
+            The frame to list in ``stars``, with as many centroids; by default the frame that was
+            searched. A frame in which planets were found was searched without their centroids.
+
+        Returns
+        -------
+        dict
+            Numbers, texts, lists, dicts and None only, so that ``json.dumps`` writes it: what is
+            NaN is None. ``stars`` has one entry per centroid, in the order of the frame.
+
+        Raises
+        ------
+        ConfigError
+            If the result does not hold its frame, as after pickling, and none is given.
+        """
+        listed = frame or self.frame
+        if listed is None:
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        if not is_frame(listed):
+            raise wrong_type("frame", listed, "a frame, as starcat.read_frames returns them")
+        return {**_facts(self), "stars": _star_rows(self, listed)}
+
+    def plot(
+        self,
+        output: str | os.PathLike[str] | None = None,
+        *,
+        image: ArrayLike | None = None,
+        name: str = "",
+    ) -> Figure:
+        """Draw the frame with its stars circled and named, as ``starcat identify --picture``.
+
+        Parameters
+        ----------
+        output : str or path-like, optional
+            PNG or SVG file to write; the suffix decides.
+        image : array_like, shape (height, width), optional
+            The picture that the centroids were found in; by default the centroids are drawn on a
+            dark sky.
+        name : str, optional
+            Name of the frame, with which the title begins.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Which a notebook shows.
+
+        Raises
+        ------
+        ConfigError
+            If the result does not hold its frame, as after pickling, the image has another size
+            than the camera, the output is neither PNG nor SVG, or matplotlib is not installed.
+        """
+        return sky_objects.plot(self, output, image, name)
 
     def table(self) -> QTable:
         """Return the stars as an astropy table.
@@ -419,7 +379,9 @@ class MatchResult:
         if self.ok:
             facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
             facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
-        return sky_objects.sky_object_table(self.stars, facts)
+        stars = {one.name: getattr(self.stars, one.name) for one in fields(MatchedStars)}
+        stars["star"] = np.array(self.stars.star, dtype=np.str_)
+        return sky_objects.sky_object_table(stars, facts)
 
     @property
     def skycoord(self) -> SkyCoord:
@@ -518,6 +480,72 @@ class MatchResult:
             for row in zip(*columns.values(), strict=True)
         )
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+def _facts(result: MatchResult) -> dict[str, Any]:
+    """Return what an answer says of the whole frame, as JSON has it."""
+    found: dict[str, Any] = {"status": result.status, "origin": result.origin}
+    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
+    if result.ok:
+        camera, database = result.camera, result.database
+        found |= {
+            "database": None if database is None else database.name,
+            "camera": None if camera is None else _camera_facts(camera),
+            "boresight_ra_deg": result.boresight_ra_deg,
+            "boresight_dec_deg": result.boresight_dec_deg,
+            "roll_deg": result.roll_deg,
+            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
+            "covariance_arcsec2": [
+                [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
+            ],
+            "residual_arcsec": result.residual_arcsec,
+            "reduced_chi_square": _or_none(result.reduced_chi_square),
+            "false_match_probability": result.false_match_probability,
+            "focal_length_px": None if camera is None else camera.focal_length_px,
+            "focal_length_error_px": result.focal_length_error_px,
+        }
+    elif result.refusal is not None:
+        why = result.refusal
+        found["refusal"] = {
+            "reason": why.reason,
+            "words": why.message,
+            "advice": why.hint,
+            "n_matched": why.n_matched,
+            "false_match_probability": why.false_match_probability,
+            "share": why.share,
+        }
+        if result.fits_fov_deg is not None:
+            found["fits_fov_deg"] = result.fits_fov_deg
+    return {**found, "time_s": _or_none(result.time_s)}
+
+
+def _camera_facts(camera: Camera) -> dict[str, Any]:
+    return {**asdict(camera), "principal_point_px": list(camera.principal_point_px)}
+
+
+def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]:
+    """Return one entry per centroid of a frame, with its star if it has one."""
+    reasons, stars = dict(result.dropped), result.stars
+    row_of = {spot: row for row, spot in enumerate(stars.spot.tolist())}
+    names = "mag", "ra_deg", "dec_deg", "dx_px", "dy_px", "separation_arcsec", "difference_mag"
+    columns = {name: getattr(stars, name).tolist() for name in names}
+    rows, mag = [], getattr(frame, "mag", None)
+    for number, (x, y) in enumerate(frame.centroids_px.tolist()):
+        seen = None if mag is None else _or_none(float(mag[number]))
+        one: dict[str, Any] = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
+        one |= {"star": None, "mag": None}
+        row = row_of.get(number)
+        if row is not None:
+            one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
+            one |= {name: _or_none(column[row]) for name, column in columns.items()}
+        if number in reasons:
+            one["dropped"] = reasons[number]
+        rows.append(one)
+    return rows
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 NOTABLE_CHI_SQUARE = 2.0

@@ -7,8 +7,9 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
 
 Engine = Literal["auto", "c", "numpy"]
@@ -157,13 +158,14 @@ class Settings:
     time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
+        check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
         for name, most in LARGEST.items():
             if getattr(self, name) is not None:
-                in_range(name, getattr(self, name), most)
+                self._take(name, most)
         for name in ("max_false_match_probability", "min_share"):
-            in_range(name, getattr(self, name), 1.0, with_zero=True)
+            self._take(name, 1.0, with_zero=True)
         for name in ("max_steps", "time_limit_s"):
-            in_range(name, getattr(self, name), math.inf)
+            self._take(name, math.inf)
         of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
         if self.tolerance_px is None:
             object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
@@ -179,16 +181,24 @@ class Settings:
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
 
+    def _take(self, name: str, most: float, *, with_zero: bool = False) -> None:
+        checked = in_range(name, getattr(self, name), most, with_zero=with_zero)
+        object.__setattr__(self, name, checked)
 
-def in_range(name: str, value: object, most: float, *, with_zero: bool = False) -> None:
-    """Check that an argument is a number above 0, or from 0 on, and at most ``most``."""
+
+def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:
+    """Return an argument that has to be a number above 0, or from 0 on, and at most ``most``.
+
+    A quantity is converted to the unit of the parameter.
+    """
     if type(value) is float and 0.0 < value <= most:  # in nearly all calls, so at once
-        return
+        return value
+    value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number may be too large for a float
             number = float(value)
             if 0.0 < number <= most or (with_zero and number == 0.0):
-                return
+                return value
     above = "" if most == math.inf else f", at most {most:g}"
     expected = f"0 to {most:g}" if with_zero else f"a number above 0{above}"
     raise ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)

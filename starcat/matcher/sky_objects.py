@@ -1,30 +1,32 @@
-"""Answers as astropy has them: a table, a place in the sky, the world coordinates of a picture.
+"""Answers as astropy, scipy and matplotlib have them: tables, world coordinates, pictures.
 
-astropy is imported when one of them is asked for; a program that only matches needs none.
+Each library is imported when it is needed; a program that only matches needs none of them.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arguments import unit_of_argument
+from starcat.arrays import Array, Matrix
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import tangent_axes
-from starcat.matcher.stars import MatchedStars
+from starcat.version import missing_packages
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
     from astropy.wcs import WCS
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
 
 
 SIP_ORDERS = range(2, 10)
@@ -36,26 +38,27 @@ SIP_ERROR_PX = 0.005
 FIRST_CENTRE_PX = 0.5
 """Where the centre of the first pixel is, which FITS calls 1."""
 
-_UNITS = {"px": "pix", "arcsec": "arcsec", "deg": "deg", "mag": "mag"}
-
 _log = logging.getLogger(__name__)
 
 
-def sky_object_table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
-    """Return stars as a table of astropy."""
+def sky_object_table(columns: Mapping[str, Any], facts: Mapping[str, Any]) -> QTable:
+    """Return columns as a table of astropy, with the units that their names end with."""
     made = _astropy("table").QTable(meta=dict(facts))
-    for field in fields(stars):
-        unit = _UNITS.get(field.name.rpartition("_")[2])
-        column = getattr(stars, field.name)
-        if field.name == "star":
-            column = np.array(column, dtype=np.str_)
-        made[field.name] = column if unit is None else _astropy("units").Quantity(column, unit)
+    for name, values in columns.items():
+        column, unit = np.array(values), unit_of_argument(name)
+        made[name] = _astropy("units").Quantity(column, unit) if unit else column
     return made
 
 
 def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
     """Return a direction as astropy has it."""
     return _astropy("coordinates").SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs")
+
+
+def rotation(matrix: Matrix) -> Rotation:
+    """Return the rotation of scipy that applies a matrix to vectors."""
+    made: Rotation = _library("scipy.spatial.transform").Rotation.from_matrix(matrix)
+    return made
 
 
 def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
@@ -128,11 +131,28 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
     return made[0], made[1]
 
 
-def _astropy(module: str) -> Any:
+def plot(result: Any, output: Any, image: Any, name: str) -> Figure:
+    """Return the picture of a result, drawn by the room of pictures where it is installed."""
     try:
-        return import_module(f"astropy.{module}")
+        # That room stands below this one, and is as far from it as astropy is: whoever only
+        # matches has neither.
+        pictures = import_module("starcat.images.picture")
+        drawn: Figure = pictures.draw_result(result, output, image, name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(missing_packages("MatchResult.plot", error)) from error
+    return drawn
+
+
+def _astropy(module: str) -> Any:
+    return _library(f"astropy.{module}")
+
+
+def _library(module: str) -> Any:
+    package = module.partition(".")[0]
+    try:
+        return import_module(module)
     except ImportError as error:
-        text = (
-            f"astropy is not installed ({error}), which this is an object of; pip install astropy"
-        )
-        raise ConfigError(text) from error
+        raise ConfigError(
+            f"{package} is not installed ({error}), which this is an object of; pip install "
+            f"{package}"
+        ) from error

@@ -111,7 +111,7 @@ def matched_stars(
     seen = camera.directions_from_pixels(seen_px) @ matrix
     ra_deg, dec_deg = radec_from_directions(u)
     mag = np.asarray(database.mag[row], dtype=np.float64)
-    given = np.full(len(spot), np.nan) if frame.magnitudes is None else frame.magnitudes[spot]
+    given = np.full(len(spot), np.nan) if frame.mag is None else frame.mag[spot]
     sigma_px = np.full(len(spot), noise_px or np.nan)
     if frame.sigma_px is not None:
         sigma_px = np.where(np.isfinite(frame.sigma_px[spot]), frame.sigma_px[spot], np.nan)

@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.arguments import check_type, without_unit
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.prior import WIDEST_PRIOR_DEG, turn_of_noise_rad
+from starcat.matcher.observation import FrameLike
+from starcat.matcher.prior import WIDEST_PRIOR_DEG, PriorLike, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
 
 FLOOR = 2.0
@@ -72,15 +74,8 @@ class Tracker:
     _time: float = field(default=-math.inf, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        matcher: object = self.matcher
-        if not isinstance(matcher, Matcher):
-            raise ArgumentTypeError(
-                f"matcher is of type {type(matcher).__name__}; expected a starcat.Matcher",
-                key="matcher",
-                value=matcher,
-                fields=("matcher",),
-            )
-        turn_deg: object = self.max_turn_deg
+        check_type("matcher", self.matcher, Matcher, "a starcat.Matcher")
+        turn_deg = self.max_turn_deg = without_unit("max_turn_deg", self.max_turn_deg)
         if (
             not isinstance(turn_deg, int | float | np.floating)
             or not 0.0 < turn_deg <= WIDEST_PRIOR_DEG
@@ -97,13 +92,13 @@ class Tracker:
 
     def identify(
         self,
-        centroids_px: ArrayLike,
+        centroids_px: FrameLike,
         camera: Camera | None = None,
         *,
-        magnitudes: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
@@ -111,7 +106,7 @@ class Tracker:
 
         Parameters
         ----------
-        centroids_px, camera, magnitudes, sigma_px, fov_error, prior, prior_error_deg
+        centroids_px, camera, mag, sigma_px, fov_error, prior, prior_error_deg
             As for `Matcher.identify`; a prior, of a gyroscope for example, takes the place of the
             prediction.
         time_s : float, optional
@@ -130,7 +125,7 @@ class Tracker:
             As `Matcher.identify`, or if the time is no later than the one before.
         """
         found = self.attempt(
-            centroids_px, camera, magnitudes=magnitudes, sigma_px=sigma_px, fov_error=fov_error,
+            centroids_px, camera, mag=mag, sigma_px=sigma_px, fov_error=fov_error,
             prior=prior, prior_error_deg=prior_error_deg, time_s=time_s,
         )  # fmt: skip
         self.record(found, camera, time_s=time_s)
@@ -138,13 +133,13 @@ class Tracker:
 
     def attempt(
         self,
-        centroids_px: ArrayLike,
+        centroids_px: FrameLike,
         camera: Camera | None = None,
         *,
-        magnitudes: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
         fov_error: float = 0.0,
-        prior: ArrayLike | None = None,
+        prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
@@ -158,7 +153,7 @@ class Tracker:
         expected, error_deg = prior, prior_error_deg
         if expected is None and error_deg is None:
             expected, error_deg = self._predicted(now, camera)
-        beside: dict[str, Any] = {"magnitudes": magnitudes, "sigma_px": sigma_px}
+        beside: dict[str, Any] = {"mag": mag, "sigma_px": sigma_px}
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
@@ -193,7 +188,7 @@ class Tracker:
             )
         )
 
-    def follow(self, frames: Iterable[ArrayLike]) -> Iterator[MatchResult]:
+    def follow(self, frames: Iterable[FrameLike]) -> Iterator[MatchResult]:
         """Identify frames one after the other, each when its answer is asked for.
 
         Parameters
@@ -206,12 +201,13 @@ class Tracker:
         MatchResult
             As `identify` gives it.
         """
+        check_type("frames", frames, Iterable, "an iterable of frames")
         return (self.identify(frame) for frame in frames)
 
     def _next_time(self, time_s: float | None) -> float:
         if time_s is None:
             return 0.0 if math.isinf(self._time) else self._time + 1.0
-        now: object = time_s
+        now = without_unit("time_s", time_s)
         if not isinstance(now, int | float | np.floating) or not self._time < now < math.inf:
             raise ConfigError(
                 f"time_s is {now!r}; expected a number above {self._time}, the time of the frame "

@@ -8,9 +8,11 @@ the source is for such machines only; compilers that say their byte order refuse
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 
 import numpy as np
 
+from starcat.geometry.camera import Camera
 from starcat.onboard.layout import ByteOrder, in_order
 
 _WORDS_A_LINE = 4
@@ -41,6 +43,36 @@ extern const uint64_t {symbol}[{size_bytes // 8}];
 #ifdef __cplusplus
 }}
 #endif
+#endif
+"""
+
+
+def c_camera(name: str, camera: Camera) -> str:
+    """Return the header that defines a calibrated camera for the library."""
+    symbol = f"{c_symbol(name)}_camera"
+    lens, (x0_px, y0_px) = camera.distortion, camera.principal_point_px
+    values = {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "focal_length_px": camera.focal_length_px,
+        "x0_px": x0_px,
+        "y0_px": y0_px,
+        **asdict(lens),
+        "fold_radius": 0.0 if lens.is_none else lens.fold_radius,
+    }
+    lines = [f"    (starcat_real){float(value)!r}, /* {key} */" for key, value in values.items()]
+    numbers = "\n".join(lines)
+    return f"""\
+/* The calibrated camera for {name}, in place of that of starcat_get_camera: camera = {symbol}; */
+#ifndef {symbol.upper()}_H
+#define {symbol.upper()}_H
+
+#include "starcat.h"
+
+static const starcat_camera {symbol} = {{
+{numbers}
+}};
+
 #endif
 """
 

@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.errors import OnboardSizeError
 from starcat.geometry.sphere import separation
-from starcat.onboard.grid import grid_for
 from starcat.onboard.image import Contents, feature_values, longest_pair_rad, quantised
 from starcat.onboard.layout import FEATURES, MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN, Sizes
+from starcat.onboard.profiles import FULL, Profile
 from starcat.onboard.reading import OnboardImage
 from starcat.products.tiling import FieldStars
-
-MIN_SHARE = {"triangle": 1.0 / 3.0, "pyramid": 0.5}
-"""Of the sightings of all triangles, or of the longest pair's length, so much is left at least."""
 
 MIN_STARS = 4
 """Fewer stars in a field identify nothing."""
@@ -55,13 +52,19 @@ def shrink(
     times_seen: NDArray[np.int32] | None,
     fields: Callable[[], FieldStars],
     max_bytes: int | None,
+    profile: Profile = FULL,
 ) -> Shrunk:
-    """Leave out as little as makes an image fit."""
+    """Leave out what a profile leaves out, and as little more as makes an image fit."""
     limit = math.inf if max_bytes is None else max_bytes
+    least = profile.least[contents.method]
     whole, weight = _by_use(contents, times_seen)
+    whole = replace(whole, stars_per_cell=profile.stars_per_cell)
     sizes = []
-    for most, thinner, left in _thinned(whole, weight, fields):
-        sizes.append(_sizes(thinner, _least(left, contents.method)).total_bytes)
+    for most, thinner, left in _thinned(whole, weight, fields, profile.stars_per_field):
+        if profile.most < 1.0:
+            kept = thinner.features[: _count(left, profile.most)]
+            thinner = replace(thinner, features=kept)
+        sizes.append(_sizes(thinner, _count(left, least)).total_bytes)
         if sizes[-1] <= limit:
             fewer = _fewer_features(thinner, limit)
             return Shrunk(fewer, len(contents.star_id), len(whole.features), most)
@@ -92,19 +95,29 @@ def _by_use(
     return replace(contents, features=contents.features[order]), weight
 
 
-def _least(weight: NDArray[np.float64], method: str) -> int:
+def _count(weight: NDArray[np.float64], part: float) -> int:
+    """Return how many of the first features have a part of the use of all."""
     use = np.cumsum(weight)
-    return int(np.searchsorted(use, MIN_SHARE[method] * use[-1])) + 1 if len(use) else 0
+    return int(np.searchsorted(use, part * use[-1])) + 1 if len(use) else 0
 
 
 def _thinned(
-    contents: Contents, weight: NDArray[np.float64], fields: Callable[[], FieldStars]
+    contents: Contents,
+    weight: NDArray[np.float64],
+    fields: Callable[[], FieldStars],
+    stars_per_field: int | None,
 ) -> Iterator[tuple[int | None, Contents, NDArray[np.float64]]]:
-    """Yield the contents, then what is left with ever fewer stars a field."""
-    yield None, contents, weight
+    """Yield the contents with all stars, or so many a field, then with ever fewer a field."""
+    if stars_per_field is None:
+        yield None, contents, weight
     stars = fields()
-    before = len(contents.star_id)
-    for most in range(int(stars.count.max(initial=0)) - 1, MIN_STARS - 1, -1):
+    first = fullest = int(stars.count.max(initial=0))
+    if stars_per_field is not None:
+        first = min(stars_per_field, fullest)
+        if first == fullest:
+            yield None, contents, weight
+    before = len(contents.star_id) if stars_per_field is None else -1
+    for most in range(min(first, fullest - 1), MIN_STARS - 1, -1):
         is_left = np.zeros(len(contents.star_id), dtype=bool)
         is_left[stars.brightest(most)[1]] = True
         if np.count_nonzero(is_left) == before:
@@ -123,9 +136,7 @@ def _thinned(
 
 
 def _sizes(contents: Contents, n_features: int) -> Sizes:
-    n_stars = len(contents.star_id)
-    n_cells = grid_for(n_stars, contents.camera.radius_rad).n_cells
-    return Sizes(contents.method, n_stars, n_features, n_cells)
+    return Sizes(contents.method, len(contents.star_id), n_features, contents.grid.n_cells)
 
 
 def _fewer_features(contents: Contents, max_bytes: float) -> Contents:

@@ -12,6 +12,9 @@ FLIGHT_CENTROIDS = 64
 FLIGHT_STARS = 192
 """``STARCAT_MAX_CENTROIDS`` and ``STARCAT_MAX_STARS`` of ``starcat.h``, unless they are changed."""
 
+FLIGHT_STEPS = 4_000_000
+"""``max_steps`` of ``starcat_set_default_options``."""
+
 
 def stars_in_flight(most_near: int) -> Iterator[str]:
     """Yield a sentence if the library in flight refuses an image with this density."""

@@ -75,11 +75,11 @@ def quarter_turns(u: Array) -> Array:
     return turns
 
 
-def grid_for(n_stars: int, radius_rad: float) -> CellGrid:
-    """Return a grid of about as many cells as stars, but no finer than a camera has use for."""
+def grid_for(n_stars: int, radius_rad: float, stars_per_cell: int = 1) -> CellGrid:
+    """Return a grid with about so many stars per cell, but no finer than a camera has use for."""
     useful = math.ceil(BANDS_OF_A_FIELD / math.sin(min(radius_rad, 0.5 * math.pi)))
     largest = math.isqrt(MAX_CELLS // 2)
-    bands = max(1, min(round(math.sqrt(n_stars / 2.0)), useful, largest))
+    bands = max(1, min(round(math.sqrt(n_stars / (2.0 * stars_per_cell))), useful, largest))
     return CellGrid(bands, 2 * bands)
 
 

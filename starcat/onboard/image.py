@@ -19,7 +19,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
 from starcat.onboard import layout
-from starcat.onboard.grid import grid_for, most_near
+from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.layout import ByteOrder, Sizes, check_blocks, in_order
 
 Rows = NDArray[np.integer[Any]]
@@ -44,6 +44,12 @@ class Contents:
     method: str
     features: Rows  # rows of the stars of each triangle or pair, in any order
     manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros where there is no manifest
+    stars_per_cell: int = 1  # of the grid, on average
+
+    @property
+    def grid(self) -> CellGrid:
+        """The grid of the image."""
+        return grid_for(len(self.star_id), self.camera.radius_rad, self.stars_per_cell)
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     _check_name(contents.name)
     directions = quantised(contents.directions)
     u = directions / layout.DIRECTION_SCALE
-    grid = grid_for(len(u), contents.camera.radius_rad)
+    grid = contents.grid
     cells = grid.cells(u)
     star_rows = np.lexsort((contents.star_id, cells))
     place = np.empty(len(u), dtype=np.int64)

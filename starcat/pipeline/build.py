@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import BuildError
+from starcat.artifact.manifest import read_manifest, software_versions
+from starcat.errors import BuildError, StarcatError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.log import write_build_log
@@ -17,7 +18,7 @@ from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
-from starcat.storage.atomic import Outcome, move_into_place, whole_folder
+from starcat.storage.atomic import Outcome, another_is_there, move_into_place, whole_folder
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ def build_database(
 ) -> Built:
     """Build a database."""
     final = output / f"{spec.name}-{spec.version}"
+    if not replace:
+        _expect_same_spec(final, spec)
     draft = Draft(
         spec,
         inputs,
@@ -80,6 +83,18 @@ def build_database(
         draft.clock.lap("verify")
     write_build_log(final, outcome, draft.clock.times_s)
     return _built(draft, final, outcome)
+
+
+def _expect_same_spec(final: Path, spec: BuildSpec) -> None:
+    """Refuse the name of a database that this build cannot equal, before the build starts."""
+    if not final.exists() or (final.is_dir() and not any(final.iterdir())):
+        return
+    try:
+        manifest = read_manifest(final)
+    except StarcatError:
+        raise another_is_there(final) from None
+    if manifest["spec"] != spec.recorded() or manifest["software"] != software_versions():
+        raise another_is_there(final)
 
 
 def _built(draft: Draft, folder: Path, outcome: Outcome) -> Built:

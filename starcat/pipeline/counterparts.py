@@ -35,7 +35,6 @@ from starcat.selection.merging import MERGED
 from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import sort_rows
-from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
@@ -187,12 +186,11 @@ def source_facts(read: Ingested, role: str) -> SourceFacts:
     return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
 
 
-def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
+def match_files(a: Path, b: Path, wanted: Crossmatch) -> tuple[pa.Table, Summary]:
     """Find the counterparts of the stars of one file in another."""
     stars, counterparts = read_star_table(a), read_star_table(b)
     table, summary = match_tables(stars, counterparts, wanted)
-    write_table(with_own_names(table, stars), output)
-    return summary
+    return with_own_names(table, stars), summary
 
 
 def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:

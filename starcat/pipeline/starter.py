@@ -148,8 +148,12 @@ def starter_spec(
     *,
     sky: pa.Table | None = None,
     most_field_stars: int = MAX_LOOKED_AT,
+    reach_mag: float = -np.inf,
 ) -> Starter:
-    """Return a spec for a camera, from the embedded sky."""
+    """Return a spec for a camera, from the embedded sky.
+
+    Unless a limit is given, it is one with enough stars, or ``reach_mag`` if that is fainter.
+    """
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
         sky = ingest_catalog(SOURCE, locate(SOURCE, {}), progress=progress).stars
@@ -163,7 +167,7 @@ def starter_spec(
     if limit is None:
         exposure = camera.exposure.exposure(response)
         seen = np.inf if exposure is None else exposure.limit_mag(USUAL_SIGNAL_TO_NOISE)
-        limit = min(enough_limit(sky, shape), round(float(seen), 2))
+        limit = min(max(enough_limit(sky, shape), round(reach_mag, 2)), round(float(seen), 2))
     check_tiling(int(np.searchsorted(mag, limit, side="right")), shape, None, most_field_stars)
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
@@ -185,8 +189,10 @@ def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int
     return True
 
 
-def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
-    """Write a first spec as a TOML file in which every key is explained."""
+def write_starter(
+    starter: Starter, path: Path, *, replace: bool, remarks: Sequence[str] = ()
+) -> None:
+    """Write a first spec as a TOML file in which every key is explained, below some remarks."""
     if path.exists() and not replace:
         raise OutputError(
             f"{path} is there already; choose another name or pass replace=True",
@@ -194,7 +200,8 @@ def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
             fields=("replace=True",),
         )
     with whole_file(path) as partial:
-        partial.write_text(spec_toml(starter.spec), encoding="utf-8")
+        above = "".join(f"# {line}\n" for line in remarks)
+        partial.write_text(above + spec_toml(starter.spec), encoding="utf-8")
 
 
 def boresight_count(camera: CameraSpec) -> int:

@@ -148,6 +148,11 @@ def remembered(address: str) -> Path:
     return state_folder() / "trust" / hashlib.sha256(here.encode()).hexdigest()[:32]
 
 
+def is_registry(text: str) -> bool:
+    """Return whether a text is the address or the folder of a registry; nothing is read."""
+    return is_address(text, "registry") or Path(text, INDEX_NAME).is_file()
+
+
 def is_trusted(address: str) -> bool:
     """Return whether a registry was pulled from with a trusted key before."""
     return (remembered(address) / ANCHOR).is_file()

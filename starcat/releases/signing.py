@@ -32,7 +32,7 @@ from starcat.releases.metadata import (
     sign_tree,
     unknown_key,
 )
-from starcat.releases.registry import FolderRegistry, Registry, open_registry
+from starcat.releases.registry import FolderRegistry, Registry, has_signatures, open_registry
 from starcat.releases.tree import LOCK, MAX_METADATA_BYTES, METADATA, Listed, release_bytes
 from starcat.storage.atomic import locked, writing
 from starcat.storage.download import NotFound
@@ -151,14 +151,36 @@ def change_roles(
 
 def roles_of(registry: str) -> tuple[RoleFacts, ...]:
     """Return who may sign what in a folder or at an address, after checking all signatures."""
+    return _facts(_checked_tree(registry))
+
+
+def signatures_of(registry: str, listed: Sequence[Listed]) -> list[str]:
+    """Return of each release of a registry whether it is signed: yes, no, or that it was changed.
+
+    The signatures are checked against the registry's own keys, which nobody need trust.
+    """
+    if not has_signatures(open_registry(registry)):
+        return ["no"] * len(listed)
+    targets = _checked_tree(registry).targets.signed.targets
+    states = []
+    for release in listed:
+        wanted = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
+        signed = targets.get(release.path)
+        states.append(
+            "no" if signed is None else "yes" if signed == wanted else "changed since it was signed"
+        )
+    return states
+
+
+def _checked_tree(registry: str) -> SignedTree:
     opened = open_registry(registry)
     if isinstance(opened, FolderRegistry):
-        return _facts(_signed(Path(registry)))
+        return _signed(Path(registry))
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         copy = Path(folder)
         _copy_metadata(opened, copy / METADATA)
         try:
-            return _facts(load_tree(copy))
+            return load_tree(copy)
         except ProductError as error:
             found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
             raise ProductError(

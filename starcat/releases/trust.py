@@ -201,8 +201,8 @@ def _what(error: exceptions.RepositoryError) -> str:
 
 def _refused(registry: Registry, path: str, what: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} {what}; {_NOT_USED}. Ask who publishes there, by another way "
-        "than this registry"
+        f"{registry.address}: {path} {what}; {_NOT_USED}. Ask the publisher by mail or phone, not "
+        "through this registry"
     )
 
 

@@ -120,7 +120,7 @@ class _Outcome(NamedTuple):
 
 
 def _outcome(matcher: Matcher, frame: SimulatedFrame, mag: Array | None) -> _Outcome:
-    result = matcher.identify(frame.centroids_px, magnitudes=mag)
+    result = matcher.identify(frame.centroids_px, mag=mag)
     if not result.ok:
         return _Outcome(frame.n_stars, is_right=False, residual_arcsec=None)
     return _Outcome(frame.n_stars, answers_rightly(result, frame, matcher), result.residual_arcsec)

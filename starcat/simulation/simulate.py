@@ -52,11 +52,24 @@ class Noise:
 def simulate_frames(
     directions: Array, camera: Camera, count: int, noise: Noise, seed: int, mag: Array | None = None
 ) -> Iterator[SimulatedFrame]:
-    """Simulate frames of guide stars at attitudes uniform over all rotations."""
+    """Simulate frames of guide stars at attitudes uniform over all rotations.
+
+    All attitudes are drawn first, so that frames depend on how many there are. Self-tests and the
+    figures of the documentation are of these frames; `simulate_sequence` is for users.
+    """
     generator = np.random.default_rng(seed)
-    stars = np.arange(len(directions), dtype=np.int32)
-    sky = Sky(directions, np.zeros(len(directions)) if mag is None else mag, stars)
+    sky = sky_of_guide_stars(directions, mag)
     for matrix in random_attitudes(count, generator):
+        yield simulate_frame(sky, camera, matrix, noise, generator)
+
+
+def simulate_sequence(
+    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int
+) -> Iterator[SimulatedFrame]:
+    """Simulate frames one after the other: each is the same however many follow it."""
+    generator = np.random.default_rng(seed)
+    for _ in range(count):
+        [matrix] = random_attitudes(1, generator)
         yield simulate_frame(sky, camera, matrix, noise, generator)
 
 
@@ -118,3 +131,9 @@ class Sky:
         """Return the points up to a magnitude."""
         seen = self.mag <= limit_mag
         return Sky(self.directions[seen], self.mag[seen], self.star_index[seen])
+
+
+def sky_of_guide_stars(directions: Array, mag: Array | None = None) -> Sky:
+    """Return the guide stars of a database as a sky; without magnitudes all are of 0 mag."""
+    rows = np.arange(len(directions), dtype=np.int32)
+    return Sky(directions, np.zeros(len(directions)) if mag is None else mag, rows)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import numbers_of
+from starcat.arguments import check_type, numbers_of, wrong_type
 from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -21,7 +21,7 @@ from starcat.geometry.attitude import (
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, as_database
-from starcat.matcher.observation import as_frame
+from starcat.matcher.observation import FrameLike, as_frame
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.resources import PathLike
@@ -39,11 +39,11 @@ BRIGHTEST = 3  # so many of the brightest spots may be planets that a frame was 
 def identify_in_time(
     identify: Callable[..., MatchResult],
     database: Database | PathLike,
-    centroids_px: ArrayLike,
+    centroids_px: FrameLike,
     camera: Camera,
     observer: Observer,
     *,
-    magnitudes: ArrayLike | None = None,
+    mag: ArrayLike | None = None,
     tolerance_px: float = TOLERANCE_PX,
     max_false_match_probability: float = CERTAIN,
 ) -> MatchResult:
@@ -55,8 +55,8 @@ def identify_in_time(
         `Matcher.identify`, its camera and options filled in.
     database, observer : Database (or Artifact or path), Observer
         The stars that it names; when and from where the frame was taken.
-    centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
-        Pixels, and magnitudes of any zero point.
+    centroids_px, mag : array_like of float64, shape (N, 2) and (N,)
+        Pixels, or a frame or a table as for `Matcher.identify`; magnitudes of any zero point.
     camera : Camera
         The camera that took the frame; a focal length that the answer has found counts instead.
     tolerance_px, max_false_match_probability : float
@@ -69,10 +69,14 @@ def identify_in_time(
         not identified is asked again without one or two of its three brightest spots; such an
         answer counts if planets are there, with the probability of all these questions.
     """
+    if not callable(identify):
+        raise wrong_type("identify", identify, "a function, such as Matcher.identify")
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("observer", observer, Observer, "a starcat.Observer")
     database = as_database("database", database)
-    given = as_frame(centroids_px, camera, magnitudes)
-    frame, mag = given.centroids_px, given.magnitudes
-    found = identify(frame, magnitudes=mag)
+    given = as_frame(centroids_px, camera, mag)
+    frame, frame_mag = given.centroids_px, given.mag
+    found = identify(frame, mag=frame_mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:
         if result.status != "identified":
@@ -81,19 +85,19 @@ def identify_in_time(
         matrix = _apparent_matrix(result, eye, frame, observer)
         star_mag = np.where(result.star_index >= 0, database.mag[result.star_index], np.nan)
         return planets_among(
-            frame, matrix, eye, bodies_seen(observer), magnitudes=mag, star_mag=star_mag,
+            frame, matrix, eye, bodies_seen(observer), mag=frame_mag, star_mag=star_mag,
             tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
         )  # fmt: skip
 
     if found.status == "identified":
         names = rows_of(found)
-        return _without(identify, frame, mag, names) if names else found
-    for left_out in (questions := _bright_rows(mag)):
-        again = identify(_unset(frame, left_out), magnitudes=mag)
+        return _without(identify, frame, frame_mag, names) if names else found
+    for left_out in (questions := _bright_rows(frame_mag)):
+        again = identify(_unset(frame, left_out), mag=frame_mag)
         names = rows_of(again)
         chance = again.false_match_probability * (1 + len(questions))
         if set(left_out) <= set(names) and chance <= max_false_match_probability:
-            again = _without(identify, frame, mag, names)
+            again = _without(identify, frame, frame_mag, names)
             if again.status == "identified":
                 return replace(again, false_match_probability=chance)
     return found
@@ -105,7 +109,7 @@ def planets_among(
     camera: Camera,
     seen: Bodies,
     *,
-    magnitudes: Array | None = None,
+    mag: Array | None = None,
     star_mag: Array | None = None,
     tolerance_px: float = TOLERANCE_PX,
     faint_limit_mag: float = np.inf,
@@ -135,7 +139,7 @@ def planets_among(
         free[list(rows)] = False
         near = np.flatnonzero((distance <= reach_px) & free)
         if len(near):
-            rank = distance if magnitudes is None else np.nan_to_num(magnitudes, nan=np.inf)
+            rank = distance if mag is None else np.nan_to_num(mag, nan=np.inf)
             order = np.lexsort((distance[near], rank[near]))
             rows[int(near[order[0]])] = seen.names[body].lower()
     return rows
@@ -166,7 +170,7 @@ def _without(
     identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
 ) -> MatchResult:
     """Identify a frame without the spots of planets, and say what they were."""
-    found = identify(_unset(frame, tuple(names)), magnitudes=mag)
+    found = identify(_unset(frame, tuple(names)), mag=mag)
     dropped = tuple((row, names.get(row, reason)) for row, reason in found.dropped)
     return replace(found, dropped=dropped)
 
@@ -247,7 +251,7 @@ class SkyInTime:
 def sky_in_time(
     result: MatchResult,
     database: Database | PathLike,
-    centroids_px: ArrayLike,
+    centroids_px: FrameLike,
     camera: Camera,
     observer: Observer,
     *,
@@ -276,6 +280,9 @@ def sky_in_time(
     SkyInTime or None
         None unless the frame is identified.
     """
+    check_type("result", result, MatchResult, "a MatchResult, as Matcher.identify returns it")
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("observer", observer, Observer, "a starcat.Observer")
     if result.status != "identified":
         return None
     database = as_database("database", database)

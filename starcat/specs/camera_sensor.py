@@ -21,7 +21,8 @@ MAX_ROWS = 2000
 Column = Annotated[tuple[float, ...], Field(max_length=MAX_ROWS, strict=False)]
 
 
-def _response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
+def response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a response that a CSV file holds; a section can state name and per."""
     made = read_response(path, section.get("per"))
     table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
     return {"name": section.get("name", path.stem), "per": made.counts, **table}
@@ -47,7 +48,7 @@ class CameraResponse(Section):
         "of the one that follows; default: magnitudes stay in the catalog's band",
         examples=["silicon-cmos"],
     )
-    file: Annotated[str, LocalFile("wavelength_nm and value", _response_of_file)] | None = Field(
+    file: Annotated[str, LocalFile("wavelength_nm and value", response_of_file)] | None = Field(
         None,
         description="CSV of wavelengths in nm and responses, beside the spec; the built spec has "
         "its numbers",

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from starcat.arguments import path_of
 from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
+from starcat.failures import expected_words
 from starcat.local_files import with_files_read
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
@@ -211,7 +212,10 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
     found = _SHOWN.repr(error["input"])
-    return f"found {found if len(found) < 60 else found[:57] + '...'}; {error['msg']}"
+    expected = expected_words(error)
+    if kind == "less_than" and str(error["loc"][-1]).startswith("fov_"):
+        expected += ": specs are for a flat detector; give the part of a wider field that is used"
+    return f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}"
 
 
 def _known_keys(location: tuple[Any, ...], model: Any) -> list[str]:

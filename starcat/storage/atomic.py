@@ -230,12 +230,7 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
     if _holds_all(final, partial):
         return "unchanged"
     if not replace:
-        raise OutputError(
-            f"{final} already exists and differs; raise the version in the spec, choose another "
-            "output, or pass replace=True",
-            path=final,
-            fields=("output", "replace=True"),
-        )
+        raise another_is_there(final)
     aside = partial.with_name(f"{partial.name}.old.partial")
     try:
         final.rename(aside)
@@ -246,6 +241,16 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
         raise
     shutil.rmtree(aside, ignore_errors=True)
     return "replaced"
+
+
+def another_is_there(final: Path) -> OutputError:
+    """Return the error of a folder that another database has the name of."""
+    return OutputError(
+        f"{final} already exists and differs; raise the version in the spec, choose another "
+        "output, or pass replace=True",
+        path=final,
+        fields=("output", "replace=True"),
+    )
 
 
 def _rename(partial: Path, final: Path) -> bool:

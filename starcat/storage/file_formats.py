@@ -37,7 +37,7 @@ _BEGINNINGS: tuple[tuple[int, bytes, str], ...] = (
 )
 """Offset, bytes there, and name; the first that agrees counts."""
 
-_RAW_SUFFIXES = {
+RAW_MAKERS = {
     ".nef": "Nikon", ".nrw": "Nikon", ".cr2": "Canon", ".cr3": "Canon", ".arw": "Sony",
     ".dng": "Adobe", ".orf": "Olympus", ".rw2": "Panasonic", ".raf": "Fujifilm",
     ".pef": "Pentax",
@@ -54,8 +54,8 @@ def unread_format(path: Path, data: bytes) -> str | None:
     ('a WebP image', 'a raw image of Nikon (NEF)')
     """
     suffix = path.suffix.lower()
-    if suffix in _RAW_SUFFIXES:
-        return f"a raw image of {_RAW_SUFFIXES[suffix]} ({suffix[1:].upper()})"
+    if suffix in RAW_MAKERS:
+        return f"a raw image of {RAW_MAKERS[suffix]} ({suffix[1:].upper()})"
     for offset, beginning, name in _BEGINNINGS:
         if data[offset : offset + len(beginning)] == beginning:
             return name

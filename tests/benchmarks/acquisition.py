@@ -121,7 +121,7 @@ def solve(
     scene = Scene(matcher.database, matcher.database, kind.noise_px)
     for frame in frames:
         start = time.process_time()
-        answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        answer = matcher.identify(frame.centroids_px, mag=frame.mag)
         if answer.ok:
             _ = answer.q_body_from_icrs, answer.star_ids
         found.milliseconds.append(1e3 * (time.process_time() - start))

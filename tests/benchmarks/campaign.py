@@ -61,7 +61,7 @@ def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
     scene = Scene(database, database, NOISE_PX)
     mags = [frame.mag for frame in frames] if is_stated else None
     px = [frame.centroids_px for frame in frames]
-    found = matcher.identify_many(px, magnitudes=mags, threads=1)
+    found = matcher.identify_many(px, mag=mags, threads=1)
     counted: Counter[str] = Counter()
     for frame, answer in zip(frames, found, strict=True):
         counted["too few"] += frame.n_stars < MIN_STARS

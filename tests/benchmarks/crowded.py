@@ -52,7 +52,7 @@ def measure(rows: Rows, engine: Engine, artifact: Path, *, is_judged: bool) -> N
         px = np.concatenate([frames[0].centroids_px, random.random((false, 2)) * size])
         mag = np.concatenate([frames[0].mag, random.uniform(7.0, 14.0, false)])
         for name, known in (("with magnitudes", mag), ("without", None)):
-            ms, mb = measured(partial(matcher.identify, px, magnitudes=known))
+            ms, mb = measured(partial(matcher.identify, px, mag=known))
             print(f"{engine:6}{count:7,} {name:16}{ms:8.1f} ms{mb:8.1f} MB")
             rows.expect(mb <= MAX_MB, f"{engine}: {count} centroids take {mb:.0f} MB")
             is_slow = is_judged and engine == "c" and ms > MAX_MS

@@ -139,7 +139,7 @@ def _identify(
     steps = {"max_steps": MAX_STEPS} if engine == "numpy" else {}
     matcher = replace(plain, engine=engine, **settings, **steps)
     identify: Callable[..., MatchResult] = matcher.identify
-    return identify(trial.centroids_px, magnitudes=trial.mag, **asked)
+    return identify(trial.centroids_px, mag=trial.mag, **asked)
 
 
 def main(rows: Rows) -> None:

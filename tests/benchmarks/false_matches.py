@@ -192,7 +192,7 @@ def _ask_c(
         if least > CERTAIN:
             counts.outcomes["no_match"] += 1
             return
-    answer = matcher.identify(px, magnitudes=mag)
+    answer = matcher.identify(px, mag=mag)
     verdict = judge_answer(answer, trial, scene, matcher.tolerance_px)
     counts.outcomes[verdict or answer.status] += 1
     if verdict not in (None, "right"):
@@ -211,7 +211,7 @@ def _least_chance(matcher: Matcher, trial: Trial) -> float:
     least, allowed = 1.0, PROBABILITIES[0]
     while allowed >= CERTAIN:
         lenient = replace(matcher, max_false_match_probability=allowed)
-        found = lenient.identify(trial.centroids_px, magnitudes=trial.mag)
+        found = lenient.identify(trial.centroids_px, mag=trial.mag)
         least = min(least, found.false_match_probability if found.ok else 1.0)
         if least > 0.01 * allowed:
             break

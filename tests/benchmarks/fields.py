@@ -69,7 +69,7 @@ def median_ms(matcher: Matcher, *, is_bright: bool) -> float:
     times = []
     for frame in frames:
         start = time.perf_counter()
-        matcher.identify(frame.centroids_px, magnitudes=frame.mag if is_bright else None)
+        matcher.identify(frame.centroids_px, mag=frame.mag if is_bright else None)
         times.append(time.perf_counter() - start)
     # The first frames wait for what a matcher makes once.
     return 1e3 * float(np.median(times[10:]))

@@ -37,7 +37,7 @@ def main(rows: Rows) -> None:
         for number in range(given.first, given.first + given.frames):
             kind, px, mag, fov_error = hostile_frame(number, matcher.database)
             start = time.perf_counter()
-            result = matcher.identify(px, magnitudes=mag, fov_error=fov_error)
+            result = matcher.identify(px, mag=mag, fov_error=fov_error)
             key = kind, fov_error
             seconds[key].append(time.perf_counter() - start)
             answers[key] += result.ok

@@ -314,9 +314,9 @@ def by_the_frame(artifact: Path, frames: dict[str, list[SimulatedFrame]]) -> dic
     matcher, times = Matcher.open(artifact, engine="c"), {}
     for kind, given in frames.items():
         px, mags = [frame.centroids_px for frame in given], [frame.mag for frame in given]
-        asked = partial(map, lambda one, mag: matcher.identify(one, magnitudes=mag), px, mags)
+        asked = partial(map, lambda one, mag: matcher.identify(one, mag=mag), px, mags)
         ways: list[Callable[[], object]] = [
-            lambda px=px, mags=mags: list(matcher.identify_many(px, magnitudes=mags, threads=1)),
+            lambda px=px, mags=mags: list(matcher.identify_many(px, mag=mags, threads=1)),
             lambda asked=asked: list(asked()),
             lambda asked=asked: [found.q_body_from_icrs for found in asked()],
         ]

@@ -128,7 +128,7 @@ def drive_starcat(
     def solve(given: Any) -> Any:
         px, mag, prior, camera = given
         near = {"prior": prior, "prior_error_deg": PRIOR_DEG} if track else {}
-        return matcher.identify(px, camera, magnitudes=mag, fov_error=off, **near)
+        return matcher.identify(px, camera, mag=mag, fov_error=off, **near)
 
     def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray, part: float) -> Any:
         own = matcher.database.camera

@@ -145,7 +145,7 @@ def _least_squares_rows(shot: Shot) -> list[tuple[object, ...]]:
 
 def attitude_section(shot: Shot) -> str:
     frame, matcher = shot.frame, shot.matcher
-    result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    result = matcher.identify(frame.centroids_px, mag=frame.mag)
     right = int((result.star_index == frame.star_index).sum())
     q = ", ".join(f"{part:+.5f}" for part in result.q_body_from_icrs)
     truth = ", ".join(f"{part:+.5f}" for part in quaternion_from_matrix(frame.matrix))

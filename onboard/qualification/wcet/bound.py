@@ -5,6 +5,8 @@ inlined, to a line of the source, and so to how often loops.md lets that run in 
 is the largest sum over an event for one of its steps, and what a call does without steps:
 
     instructions <= once + per_step * steps + per_look_up * min(steps, 5000)
+
+With a table of neighbours, 10,000 takes the place of 5,000, as triangles may be searched twice.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from types import CodeType
 
@@ -22,19 +24,23 @@ from machine import COPIES, LARGEST_COPY, Place, Program, machine_loops
 N, S = 64, 192  # STARCAT_MAX_CENTROIDS, STARCAT_MAX_STARS
 BANDS = 64  # of the image; a wider grid makes the bound larger
 C = min(N, 32)
-LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "max": max}
-MOST_LOOK_UPS = 5000
+LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "V": 32, "max": max}
+MOST_LOOK_UPS = 5000  # of one search by triangles
+MOST_LEADERS = 72
+FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
 MOST_MORE_FITS = 5  # of a try: smaller reaches, wider ones, other scales, if four centroids matched
-VERIFY = ("band", "star", "try", "iteration", "rival", "bound")
-IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark")
+VERIFY = ("band", "star", "try", "iteration", "rival", "bound", "miss")
+VOTES = ("reference", "ballot")
+IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
-PAID_LATER = ("take", "look_up", "third", "star", "try", "predict", "two")
+PAID_LATER = ("take", "look_up", "third", "star", "try", "predict", "two", "reference")
 ROOTS = (
     "starcat_identify_frame",
     "starcat_track_frame",
     "starcat_fit_attitude",
     "starcat_open_image",
     "starcat_scrub_image",
+    "starcat_list_neighbours",
 )
 Form = Counter[tuple[str, str]]
 """How often something runs: a sum of expressions of events."""
@@ -49,18 +55,17 @@ CROWDED = (
     "is_earlier",
     "starcat_measure_side>starcat_angle_of_chord",
 )
-VOTES = (
-    "starcat_search_votes",
-    "list_voters",
-    "count_votes",
-    "list_votes",
-    "try_star",
-    "keep_star",
-)
-"""Functions that run only if there is a table of neighbours, for which there is no bound."""
 LENS = ("undistort_point", "distort_point", "differentiate_distortion", "apply_distortion")
 LONGEST = ("search_by_longest_side", "search_with_longest_side", "sift_heap")
 MAGNITUDES = ("sum_polynomials", "count_compatible")
+VOTING = (
+    "starcat_search_votes",
+    "list_voters",
+    "count_votes",
+    "keep_star",
+    "try_star",
+    "list_votes",
+)
 TRIANGLES = (
     "starcat_look_up_triangle",
     "look_up_features",
@@ -80,6 +85,7 @@ class Case:
     is_unknown: bool = False
     has_lens: bool = False
     has_magnitudes: bool = True
+    has_votes: bool = False
 
     @property
     def root(self) -> str:
@@ -89,10 +95,10 @@ class Case:
     def excluded(self) -> set[str]:
         """Functions, or one inlined in another, that do not run."""
         left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_look_up_pyramid",))
-        left_out |= set(VOTES)
         left_out |= set() if self.is_crowded else set(CROWDED)
         left_out |= set(LONGEST if self.has_magnitudes else ("search_by_brightness", *MAGNITUDES))
         left_out |= set(LONGEST) if self.is_crowded else set()
+        left_out |= set() if self.has_votes else set(VOTING)
         left_out |= {"is_same"} if self.is_unknown else set(SCALES)
         return left_out | (set() if self.has_lens else set(LENS))
 
@@ -107,13 +113,16 @@ class Counts:
     """How often lines and functions run in a call."""
 
     def __init__(self, program: Program, source: Source, root: str, excluded: set[str], *,
-                 is_unknown: bool = False) -> None:  # fmt: skip
+                 is_unknown: bool = False, has_votes: bool = False) -> None:  # fmt: skip
         self.program, self.excluded, self.root = program, excluded, root
         self.loops: dict[tuple[str, str], list[Loop]] = defaultdict(list)
         for loop in source.loops:
-            self.loops[loop.file, loop.function].append(loop)
+            counts = loop.counts.replace("votes", str(int(has_votes)))
+            self.loops[loop.file, loop.function].append(replace(loop, counts=counts))
         self.stated = {
-            (file, name): parse(runs.replace("unknown", str(int(is_unknown))))
+            (file, name): parse(
+                runs.replace("unknown", str(int(is_unknown))).replace("votes", str(int(has_votes)))
+            )
             for file, name, runs in rows_of("Functions")
         }
         self.callers: dict[str, list[tuple[str, int]]] = defaultdict(list)
@@ -323,6 +332,8 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
             bound = total(costs, "bound", **v)
             found("bound", bound, paid)
             tries.append((cost + bound, steps + paid, MOST_MORE_FITS))
+            if matched < within:
+                found("miss", total(costs, "miss", **v), n * within)
         else:
             tries.append((cost, steps, 0))
     low, high = 0.0, 1e6
@@ -357,7 +368,32 @@ def per_step(costs: Form, has_magnitudes: bool) -> dict[str, float]:
         worst["predict"] = max(
             worst.get("predict", 0.0), (predicted + onward) / (steps + 1.0 + 2.0 * k)
         )
-    return worst | of_fits(costs, has_magnitudes)
+    return worst | of_votes(costs) | of_fits(costs, has_magnitudes)
+
+
+def of_votes(costs: Form) -> dict[str, float]:
+    """The most instructions for a step of what votes."""
+    worst: dict[str, float] = defaultdict(float)
+    for voters, k in itertools.product(FEW_VOTERS, (0, 1, 2, 8, 32, S)):
+        ballot = total(costs, "ballot", ring=voters, neighbours=k) / (32 + k * (1 + voters // 2))
+        worst["ballot"] = max(worst["ballot"], ballot)
+    for voters, stars in itertools.product((0, *FEW_VOTERS), (1, 10**6)):
+        reference = total(costs, "reference", voters=voters, stars=stars)
+        worst["reference"] = max(worst["reference"], reference / (stars + 128 * voters))
+    return worst
+
+
+def of_leaders(costs: Form, each: float) -> float:
+    """Instructions of all leaders of a call that their steps do not pay, at `each` for a step.
+
+    They are few, and their pairs are compared with each other, however few stars are around.
+    """
+    most = 0.0
+    for voters, near in itertools.product(FEW_VOTERS, (1, 2, 3, 5, 9, 17, 33, S)):
+        pairs = min(C, (near - 1) * voters)  # the star in the middle votes for nothing
+        leader = total(costs, "leader", near=near, voters=voters, pairs=pairs)
+        most = max(most, leader - each * near * (voters + 1))
+    return MOST_LEADERS * most
 
 
 def once(costs: Form) -> float:
@@ -366,7 +402,8 @@ def once(costs: Form) -> float:
     Those include what it may have begun when the steps were used up: the largest event of each
     kind whose steps are not taken before it, and seven fits that find nothing more to do.
     """
-    most = {"n": N, "near": S, "within": S, "matched": min(N, S), "before": N - 1, "rows": 32}
+    most = {"n": N, "near": S, "within": S, "matched": min(N, S), "before": N - 1, "rows": 32,
+            "voters": C, "stars": 0}  # fmt: skip
     unpaid = sum(total(costs, event, **most) for event in PAID_LATER)
     unpaid += 8 * total(costs, "candidate")
     unpaid += 7 * (total(costs, "fit", **most) + BANDS * total(costs, "band"))
@@ -381,26 +418,37 @@ class Bound:
     per_step: float
     per_look_up: float
     events: dict[str, float]
+    searches: int = 1  # by triangles; where there are votes, they may be followed by another one
 
     def of(self, steps: int) -> float:
         """Instructions, with so many steps."""
-        return self.once + self.per_step * steps + self.per_look_up * min(steps, MOST_LOOK_UPS)
+        return (
+            self.once
+            + self.per_step * steps
+            + self.per_look_up * min(steps, MOST_LOOK_UPS * self.searches)
+        )
 
 
 def bound_of(program: Program, source: Source, case: Case) -> Bound:
     """Find the bound of calls of a case, whether magnitudes have a stated noise or not."""
     events: dict[str, float] = defaultdict(float)
     at_once = of_look_up = 0.0
+    every: list[Form] = []
+    searches = 1 + case.has_votes
     for without in ((), MAGNITUDES) if case.has_magnitudes else (MAGNITUDES,):
         excluded = case.excluded() | set(without)
-        counts = Counts(program, source, case.root, excluded, is_unknown=case.is_unknown)
+        counts = Counts(program, source, case.root, excluded, is_unknown=case.is_unknown,
+                        has_votes=case.has_votes)  # fmt: skip
         costs = counts.costs()
-        at_once = max(at_once, once(costs))
+        every.append(costs)
+        at_once = max(at_once, searches * once(costs))
         of_look_up = 0.0 if case.is_track else max(of_look_up, total(costs, "look_up"))
         for event, value in per_step(costs, not without).items():
             events[event] = max(events[event], value)
     events = {event: events[event] for event in (TRACK if case.is_track else IDENTIFY)}
-    return Bound(at_once, max(events.values()), of_look_up, dict(events))
+    each = max(events.values())
+    at_once += max(of_leaders(costs, each) for costs in every)
+    return Bound(at_once, each, of_look_up, dict(events), searches)
 
 
 def of_image(program: Program, source: Source) -> tuple[float, float]:

@@ -5,7 +5,8 @@
  *   KIND NUMBER instructions steps status flags genes
  *
  * KIND is o, r or s; flags: 1 lens, 2 focal length sought, 4 crowded, 8 tracked, 16 pyramids, 32
- * magnitudes.
+ * magnitudes, 64 votes. Half of the calls have a table of neighbours, if there is memory for it;
+ * these have as many more steps as are taken before votes are counted.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -23,6 +24,9 @@
 #define SEED 1
 #endif
 #define N_WORST 8u
+#define STEPS_BEFORE_VOTES 150000u /* of identify.c */
+#define TABLE_STARS 1000u
+#define TABLE_NEIGHBOURS 6000u
 #define WEIGHT 2000.0 /* steps that the work before the first one is worth in the search */
 
 extern const uint64_t image_begin[], image_end[]; /* image.S */
@@ -31,6 +35,9 @@ static starcat_workspace work;
 static starcat_result result;
 static starcat_image image;
 static adversary made;
+static uint32_t first_neighbour[TABLE_STARS + 1u];
+static starcat_neighbour neighbour[TABLE_NEIGHBOURS];
+static starcat_neighbours table;
 static uint8_t worst[N_WORST][N_GENES];
 static double worst_ratio[N_WORST];
 
@@ -45,17 +52,39 @@ static int has_magnitudes(void) {
   return known;
 }
 
+static int can_vote(void) {
+  return (image.neighbours != NULL) && !made.is_tracked &&
+         !(made.options.fov_error > (starcat_real)0.0);
+}
+
 static uint32_t flags_of(void) {
   return (uint32_t)((made.camera.k1 != (starcat_real)0.0 ? 1 : 0) |
                     (made.options.fov_error > (starcat_real)0.0 ? 2 : 0) |
                     ((result.n_usable > 32u) && !has_magnitudes() ? 4 : 0) |
                     (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0) |
-                    (has_magnitudes() ? 32 : 0));
+                    (has_magnitudes() ? 32 : 0) |
+                    (can_vote() ? 64 : 0));
+}
+
+/* List the neighbours of the stars. Returns whether the table can be used. */
+static int list_neighbours(void) {
+  starcat_camera camera;
+  starcat_get_camera(&image, &camera);
+  table.radius_rad = (starcat_real)atan(hypot((double)camera.width_px, (double)camera.height_px) /
+                                        (2.0 * (double)camera.focal_length_px));
+  table.capacity = TABLE_NEIGHBOURS;
+  table.first = first_neighbour;
+  table.neighbour = neighbour;
+  return (image.n_stars <= TABLE_STARS) &&
+         (starcat_list_neighbours(&image, &work, &table) == STARCAT_OK);
 }
 
 /* Make a call and print it. Returns instructions for a step. */
 static double measure(char kind, unsigned id, const uint8_t *genes) {
   adversary_make(&image, genes, &made);
+  if (can_vote() && (kind != 'o')) {
+    made.options.max_steps += STEPS_BEFORE_VOTES;
+  }
   memset(&result, 0, sizeof result);
   const uint64_t before = clock_now();
   const starcat_status status = adversary_call(&image, &made, &work, &result);
@@ -122,12 +151,15 @@ int main(void) {
     (void)printf("the image is not opened\n");
     return 2;
   }
+  const int has_table = list_neighbours();
   measure_attitude();
   for (unsigned n = 0; n < FRAMES / 10u; n++) {
+    image.neighbours = has_table && (n % 2u == 1u) ? &table : NULL;
     adversary_draw(&state, 1, genes);
     (void)measure('o', n, genes);
   }
   for (unsigned n = 0; n < FRAMES; n++) {
+    image.neighbours = has_table && (n / 2u % 2u == 1u) ? &table : NULL;
     const int is_search = (n > FRAMES / 4u) && (n % 2u == 1u);
     if (is_search) {
       memcpy(genes, worst[n / 2u % N_WORST], N_GENES);

@@ -25,6 +25,8 @@ NAMES = {
     "triangles, unknown focal length": Case(is_unknown=True),
     "triangles, lens": Case(has_lens=True),
     "pyramids, lens": Case(has_pairs=True, has_lens=True),
+    "triangles, votes": Case(has_votes=True),
+    "pyramids, votes": Case(has_pairs=True, has_votes=True),
     "`starcat_track_frame`": Case(is_track=True),
 }
 
@@ -56,6 +58,7 @@ def read_calls(path: Path) -> tuple[list[Call], dict[str, list[int]]]:
                 is_unknown=bool(flags & 2),
                 has_lens=bool(flags & 1),
                 has_magnitudes=bool(flags & 32),
+                has_votes=bool(flags & 64),
             )
             number, took, steps, status = map(int, words[1:5])
             calls.append(Call(words[0], number, took, steps, status, case, words[6]))
@@ -141,6 +144,7 @@ class Target:
             for event, value in self.bound(Case(has_pairs=True)).events.items()
             if event in ("pair", "third", "mark")
         }
+        found |= self.bound(Case(has_votes=True)).events
         found |= self.bound(Case(is_track=True)).events
         found["part"] = self.bound(Case(is_unknown=True)).events["part"]
         return ", ".join(f"{event} {value:,.0f}" for event, value in sorted(found.items()))

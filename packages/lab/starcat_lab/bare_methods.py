@@ -128,7 +128,7 @@ def with_matcher(
     matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
 ) -> MatchResult:
     """Answer as starcat does: ranked candidates and the shared verification."""
-    return matcher.identify(centroids_px, camera, magnitudes=mag)
+    return matcher.identify(centroids_px, camera, mag=mag)
 
 
 def bare(name: Name) -> Answerer:

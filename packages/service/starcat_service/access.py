@@ -104,6 +104,20 @@ Builder = Annotated[Principal, Depends(needs(Role.BUILDER))]
 Publisher = Annotated[Principal, Depends(needs(Role.PUBLISHER))]
 
 
+async def _with_token(principal: Publisher) -> Principal:
+    if principal.name != ANONYMOUS:
+        return principal
+    raise Problem(
+        401,
+        "this needs a token with the role publisher, even where everybody may publish; sign in",
+        headers={"WWW-Authenticate": BEARER},
+    )
+
+
+TokenManager = Annotated[Principal, Depends(_with_token)]
+"""A publisher with a token: whoever has none could otherwise create one."""
+
+
 class Identities:
     """Who there is: tokens and sign-ins."""
 

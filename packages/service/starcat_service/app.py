@@ -12,7 +12,17 @@ from starlette.middleware import Middleware
 from starcat.version import __version__
 from starcat_service import pages
 from starcat_service.access import Authentication, Identities
-from starcat_service.api import catalogs, databases, identify, jobs, nova, releases, specs, sql
+from starcat_service.api import (
+    catalogs,
+    databases,
+    identify,
+    jobs,
+    nova,
+    releases,
+    specs,
+    sql,
+    tokens,
+)
 from starcat_service.jobs.slots import JobSlots
 from starcat_service.pages.rendering import add_missing_page
 from starcat_service.problems import REFUSALS, add_problem_handlers
@@ -36,6 +46,7 @@ RESOURCES: tuple[APIRouter, ...] = (
     releases.router,
     identify.router,
     sql.router,
+    tokens.router,
 )
 """Routers of the REST interface, under `API`."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,15 @@ class ListedDatabase(BaseModel):
         return {MANIFEST_NAME: self.manifest_blob, **tree_files(self.manifest, self.title)}
 
 
+@dataclass(frozen=True)
+class StoredCatalog:
+    """A star table that a job has read."""
+
+    name: str  # of its file or folder
+    source: str
+    bytes: int
+
+
 class Library:
     """The databases and catalogs of a service; a manifest is read once for each of its states."""
 
@@ -157,6 +167,16 @@ class Library:
             f"no database or catalog {name[:80]!r}; give the id or the title of one that "
             "/api/v1/databases lists, or the name of a catalog that was read"
         )
+
+    def stored_catalogs(self) -> list[StoredCatalog]:
+        """Return the star tables that jobs have read."""
+        found = []
+        for name in self.catalogs():
+            path = self._paths.catalogs / name
+            files = path.rglob("*") if path.is_dir() else [path]
+            size = sum(one.lstat().st_size for one in files)
+            found.append(StoredCatalog(name, name.rpartition("-")[0], size))
+        return found
 
     def catalogs(self) -> list[str]:
         """Return the names of the catalogs that jobs have read."""

@@ -15,6 +15,7 @@ import shutil
 import time
 from pathlib import Path
 
+from starcat.errors import TargetMissing
 from starcat.query import SCRATCH_PREFIX
 from starcat_service.jobs.job import ENDED, QUERY, State
 from starcat_service.paths import DATABASE_ID, checked
@@ -42,11 +43,26 @@ def remove_database(service: Service, database_id: str) -> None:
                     f"the job {job.id} ({job.title}), which is {job.state}, uses {database.title}; "
                     "cancel it, or wait until it has ended",
                 )
-    # It is gone in one step; then its files are.
+    _remove(service, service.paths.database(database_id), database.folder)
+
+
+def remove_catalog(service: Service, name: str) -> None:
+    """Remove a star table that a job has read."""
+    if name not in service.library.catalogs():
+        raise TargetMissing(f"no catalog {name[:80]!r} is stored; /api/v1/catalogs lists them")
+    path = service.paths.catalogs / name
+    _remove(service, path, path)
+
+
+def _remove(service: Service, path: Path, target: Path) -> None:
+    """Remove a file or folder in one step; then close its queries, and delete it."""
     gone = service.paths.scratch / f"removed-{secrets.token_hex(8)}"
-    service.paths.database(database_id).rename(gone)
-    service.query_pool.forget(database.folder)
-    shutil.rmtree(gone, ignore_errors=True)
+    path.rename(gone)
+    service.query_pool.forget(target)
+    if gone.is_dir():
+        shutil.rmtree(gone, ignore_errors=True)
+    else:
+        gone.unlink(missing_ok=True)
 
 
 def remove_old(service: Service, now_s: float) -> dict[str, int]:
@@ -89,10 +105,14 @@ def _renew_signatures(service: Service) -> None:
 
 def _remove_jobs(service: Service, before_s: float) -> int:
     marks = ", ".join("?" for _ in ENDED)
+    # An evaluation is kept as long as its database.
+    kept = [one.id for one in service.library.databases()]
     with service.records.writing() as connection:
         rows = connection.execute(
-            f"DELETE FROM jobs WHERE state IN ({marks}) AND ended_s < ? AND kind != ? RETURNING id",
-            (*ENDED, before_s, QUERY),
+            f"DELETE FROM jobs WHERE state IN ({marks}) AND ended_s < ? AND kind != ? AND NOT ("
+            "kind = 'evaluate' AND state = 'done' AND json_extract(request, '$.database') IN "
+            f"({', '.join('?' for _ in kept)})) RETURNING id",
+            (*ENDED, before_s, QUERY, *kept),
         ).fetchall()
     for row in rows:
         shutil.rmtree(service.paths.job(row["id"]), ignore_errors=True)

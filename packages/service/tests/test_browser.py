@@ -290,6 +290,8 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
         "/jobs",
         "/databases",
         "/identify",
+        "/catalogs",
+        "/jobs?q=browser",
         "/releases",
         "/sign-in",
         "/api/docs",
@@ -398,7 +400,7 @@ def test_an_error_stands_beside_its_field_and_goes_again(built, page):
     settled(page)
     assert limit.get_attribute("aria-invalid") == "true"
     told = page.locator("[id='selection.faint_limit_mag-error']").inner_text()
-    assert "less than or equal to 40" in told
+    assert "at most 40" in told
     limit.fill("6")
     settled(page)
     assert limit.get_attribute("aria-invalid") is None

@@ -38,7 +38,7 @@ def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 def test_every_page_is_reached_by_the_menu_of_a_phone(page):
     look(page, "light", 360)
     names = []
-    for k in range(5):
+    for k in range(7):
         page.goto("/")
         assert not page.locator("#menu").is_visible()
         page.get_by_role("button", name="Menu").click()
@@ -109,6 +109,35 @@ def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_ar
         page.locator("#token").fill(token)
         page.locator("form button[type=submit]").last.click()
         page.wait_for_url("**/report")
-        page.locator("a").first.click()
+        page.get_by_role("link", name="small 1.0.0").click()
         page.wait_for_url(f"**/databases/{DATABASE}")
         assert "ann" in page.locator("header").inner_text()
+
+
+@pytest.mark.slow
+def test_a_token_is_created_copied_and_revoked(browser, tmp_path):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    root = tmp_path / "service"
+    root.mkdir()
+    token = token_of(root, "operator-with-a-long-name")
+    with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
+        page.goto("/sign-in")
+        page.locator("#token").fill(token)
+        page.locator("form button[type=submit]").last.click()
+        page.get_by_role("link", name="Signed in as").click()
+        page.get_by_role("link", name="Manage tokens").click()
+        page.get_by_label("Name", exact=True).fill("anna")
+        page.get_by_label("Role").select_option("builder")
+        page.get_by_role("button", name="Create the token").click()
+        assert page.locator("#new-token").inner_text().startswith("starcat_")
+        for theme, width in (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280)):
+            look(page, theme, width)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            # The menu of a phone does not take a line of its own.
+            assert page.locator(".head").bounding_box()["height"] < 60
+            assert axe.run(page).response["violations"] == []
+        page.get_by_role("button", name="Revoke the token of anna").click()
+        row = page.get_by_role("row").filter(has_text="anna")
+        row.get_by_text("revoked").wait_for()
+        assert page.get_by_role("button", name="Revoke the token").count() == 0
+        assert page.complaints == []

@@ -97,6 +97,23 @@ def test_task_the_weakest_sky(page, picky_artifact):
     page.locator("#answer-count", has_text=f"{least} row").wait_for()
 
 
+def test_the_field_is_in_sight_and_the_way_back_leads_through_the_fields(page):
+    page.goto(f"/databases/{DATABASE}/coverage")
+    sky_of(page)
+    chosen = page.locator(".skyview .chosen .what")
+    told = []
+    for _ in range(3):
+        click(page, "button", "Emptiest field, next")
+        told.append(chosen.inner_text())
+        box = page.locator(".skyview canvas").bounding_box()
+        assert 0 <= box["y"] < box["y"] + box["height"] <= page.viewport_size["height"]
+    for before in (told[1], told[0]):
+        page.go_back()
+        page.locator(".skyview .chosen .what", has_text=before).wait_for()
+    click(page, "button", "Emptiest field, next")
+    assert chosen.inner_text() == told[1]
+
+
 def test_the_sky_zooms_pans_and_names_its_stars(page):
     page.goto(f"/databases/{DATABASE}/coverage")
     sky_of(page)
@@ -173,6 +190,23 @@ def test_task_identify_a_picture(page, picture):
     page.reload()
     again = page.locator("#answer dl.facts dd code").first.inner_text()
     assert again[:8] == quaternion[:8]
+
+
+def test_the_picture_of_an_answer_is_zoomed(page):
+    page.goto(f"/identify?database={DATABASE}&seed=7")
+    box, picture = page.locator(".picture .zoom"), page.locator(".picture img")
+    assert picture.evaluate("image => image.naturalWidth") > 600
+    before = picture.bounding_box()["width"]
+    assert before <= box.bounding_box()["width"] + 1
+    click(page, "button", "Enlarge the picture")
+    assert picture.bounding_box()["width"] == pytest.approx(1.5 * before, rel=0.05)
+    assert box.evaluate("box => box.scrollLeft") > 0  # its middle stays where it was
+    click(page, "button", "Whole picture")
+    assert picture.bounding_box()["width"] == pytest.approx(before, rel=0.01)
+    look(page, "light", 360)  # names are readable: 8 of the 648 points that the picture is wide
+    assert 8 / 648 * picture.bounding_box()["width"] > 9
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    look(page, "light", 1280)
 
 
 def test_task_identify_one_of_another_camera(page, picky_artifact, tmp_path_factory):
@@ -265,6 +299,10 @@ def test_an_answer_of_sql_is_in_the_sky_and_in_its_address(page):
     page.get_by_text("In the sky").click()
     sky_of(page)
     assert page.evaluate("document.querySelector('#answer .skyview').sky.marks.length") == 8
+    page.goto(f"/databases/{DATABASE}/sql")
+    page.get_by_text("Recent queries").click()
+    page.locator("#recent a", has_text="LIMIT 8").click()
+    page.locator("#answer-count", has_text="8 rows").wait_for()
 
 
 ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",
@@ -287,3 +325,14 @@ def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
             details.evaluate("one => { one.open = true; }")
         found += complaints_of_axe(page)
     assert found == []
+
+
+@pytest.mark.slow
+def test_task_a_database_is_removed(page):
+    begin(page)
+    click(page, "link", "small 1.0.0")
+    page.get_by_text("Remove this database").click()
+    click(page, "button", "Remove small-1.0.0 for good")
+    page.wait_for_url("**/databases")
+    assert page.clicks + 1 <= 6
+    assert "No database yet" in page.locator("main").inner_text()

@@ -293,7 +293,7 @@ def test_another_catalog_takes_its_own_band():
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("selection.faint_limit_mag", "99", "less than or equal to 40"),
+        ("selection.faint_limit_mag", "99", "at most 40"),
         ("selection.faint_limit_mag", "", "missing"),
         ("selection.faint_limit_mag", "bright", "found 'bright'"),
         ("camera.width_px", "1.5", "found '1.5'"),

@@ -9,6 +9,7 @@ import io
 import json
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -62,8 +63,12 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert answer.status_code == 200
     assert ">identified<" in answer.text
     assert error_rad(answer.text, simulated.matrix) < 2e-3
-    [picture] = re.findall(r'<img src="data:image/jpeg;base64,([^"]+)"', answer.text)
-    assert Image.open(io.BytesIO(base64.b64decode(picture))).size[0] > 600
+    [picture] = re.findall(r'<img src="data:image/svg[+]xml;base64,([^"]+)"', answer.text)
+    drawn = ElementTree.fromstring(base64.b64decode(picture))
+    left, top, *size = map(float, drawn.get("viewBox").split())
+    assert min(left, top) > 40  # without the margins
+    assert size == pytest.approx([float(drawn.get(name)[:-2]) for name in ("width", "height")])
+    assert max(size) == pytest.approx(9 * 72)
     assert "SAO" in answer.text
     assert answer.text.count('<th scope="row"') >= 4
     assert f'name="seed" value="{SEED + 1}"' in answer.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 
 import pytest
 from fastapi.testclient import TestClient
@@ -10,6 +11,7 @@ from services import SPEC as SMALL
 from services import client_of, token_of
 
 from starcat.errors import ConfigError
+from starcat.products import USUAL_PRODUCTS
 from starcat.specs.reading import preset_names
 from starcat_service.pages.design import design_query, differences, draft_of_query, pinned_draft
 from starcat_service.pages.draft import SpecForm, draft_of_form, draft_of_text, draft_with
@@ -286,9 +288,17 @@ def test_no_limits_are_suggested_for_a_wrong_camera(client):
 @pytest.mark.parametrize(
     ("limit", "level", "words"),
     [
-        ("3.5", "bad", r"\d\d % of the sky is blind: .* a build fails .*90 % .* Go to G 5\.2\."),
-        ("4.3", "bad", r"^\d(\.\d)? % of the sky is blind: [^,]*guide stars\. Go to G 5\.2\."),
-        ("4.9", "warn", r"Thin: 1 % of the fields have 7 .* Go to G 5\.2\."),
+        (
+            "3.5",
+            "bad",
+            r"\d\d % of the sky is blind: .* identify 90 % of all pointings.* limit to G 5\.2\.",
+        ),
+        (
+            "4.3",
+            "bad",
+            r"^\d(\.\d)? % of the sky is blind: [^,]*guide stars\. Set the faint limit to G 5\.2\.",
+        ),
+        ("4.9", "warn", r"Thin: 1 % of the fields have 7 .* Set the faint limit to G 5\.2\."),
         ("5.5", "good", r"Good: 99 % of the fields have \d\d guide stars"),
         ("6.7", "good", r"more than are needed: G 5\.2, or a limit of stars per field"),
     ],
@@ -301,7 +311,7 @@ def test_an_estimate_has_a_verdict_in_words(client, limit, level, words):
     assert told is not None
     assert told[1] == level
     assert re.search(words, told[2]), told[2]
-    assert state["can_build"] == ("a build fails" not in told[2]), state["summary"]
+    assert state["can_build"] == ("has to identify" not in told[2]), state["summary"]
 
 
 def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
@@ -310,14 +320,34 @@ def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
     assert "is faint enough: the other rules remove the stars" in state["result"]
 
 
-def test_presets_of_catalogs_that_are_not_here_are_grey(client, monkeypatch):
+def test_presets_of_catalogs_that_are_not_here_are_in_one_closed_line(client, monkeypatch):
     monkeypatch.setenv("STARCAT_CACHE", "/nonexistent")
     monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
     text = client.get("/new").text
     assert 'href="/new?preset=gaia-12deg"' in text
     assert 'href="/new?preset=sao-12deg"' not in text
-    assert 'aria-describedby="presets-lack">sao-12deg<' in text
-    assert "gets each with starcat fetch sao and starcat fetch hipparcos" in text
+    told = re.search(r"<details>\s*<summary>(\d) more need catalogs.*?</details>", text, re.DOTALL)
+    assert told is not None
+    assert told[0].count("<li>") == int(told[1])
+    assert (
+        "sao-12deg: its operator gets the files with "
+        "<code>starcat fetch sao</code> and <code>starcat fetch hipparcos</code>" in told[0]
+    )
+
+
+def test_a_box_makes_a_database_of_many_fields(client):
+    own = {f"products.{name}.enabled": "on" for name in USUAL_PRODUCTS} | {"products": "shown"}
+    box = own | {"products.levels.enabled": "on"}
+    state = _sent(client, "/new/preview", SPEC, **box, **{"toml-before": SPEC}).json()
+    assert tomllib.loads(state["toml"])["products"] == {"levels": {"enabled": True}}
+    assert state["products"]["levels"]
+    text = state["toml"]
+    changed = {"toml-before": text, "products.levels.widest_fov_x_deg": "40"}
+    state = _sent(client, "/new/preview", text, **box, **changed).json()
+    levels = {"enabled": True, "widest_fov_x_deg": 40.0}
+    assert tomllib.loads(state["toml"])["products"] == {"levels": levels}
+    state = _sent(client, "/new/preview", text, **own, **{"toml-before": text}).json()
+    assert "enabled" not in state["toml"]
 
 
 @pytest.mark.parametrize(

@@ -177,6 +177,20 @@ def test_a_flight_image_has_the_bytes_of_export(client, starcat, picky_artifact,
     assert answer.content == (tmp_path / "made.img").read_bytes()
 
 
+def test_a_flight_image_of_a_profile_has_the_bytes_of_export(
+    client, starcat, picky_artifact, tmp_path
+):
+    answer = client.get(f"{PAGE}/image", params={"profile": "small"})
+    assert answer.status_code == 200
+    assert '<option value="small">small, with pyramids</option>' in client.get(PAGE).text
+    assert 'filename="small-1.0.0-small.img"' in answer.headers["content-disposition"]
+    to = ["--to", "onboard", "--profile", "small", "-o", tmp_path / "made.img"]
+    assert starcat(["export", picky_artifact, *to]).code == 0
+    assert answer.content == (tmp_path / "made.img").read_bytes()
+    clash = client.get(f"{PAGE}/image", params={"profile": "small", "method": "triangle"})
+    assert clash.status_code == 422
+
+
 def test_an_image_that_cannot_be_made_is_refused_on_a_page(client):
     wrong = client.get(f"{PAGE}/image?method=guess")
     assert wrong.status_code == 422

@@ -13,7 +13,7 @@ from PIL import Image
 from services import DATABASE, client_of
 from services import SPEC as SMALL
 
-from starcat.matcher.result import HINTS
+from starcat.matcher.refusal import HINTS
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_ingest
 from starcat_service.pages.wording import advice_in_page_words, in_page_words
@@ -169,4 +169,4 @@ def test_advice_of_a_refusal_names_fields_of_the_page():
     assert not [text for text in said.values() if re.search(r"_|--|\(flip\)|[;,] *$|,,", text)]
     assert said["scale"].endswith("allow a larger error of it (“Error of the field”)")
     assert said["mirrored"] == "turn the frame over (“y counts up”)"
-    assert said["chance"].startswith("give magnitudes, or find more stars; check the field")
+    assert said["chance"].startswith("give magnitudes, find more stars, or have")

@@ -448,8 +448,11 @@ REFUSED = {
     "changes of a spec": ({"kind": "build", "spec": {}, "changes": {"a": "1"}}, "changes"),
     "a foreign key": ({"kind": "build", "preset": "gaia-12deg", "output": "/etc"}, "output"),
     "an unknown catalog": ({"kind": "ingest", "source": "soa"}, "did you mean 'sao'"),
-    "a path of a catalog": ({"kind": "ingest", "source": "../sao"}, "source: String should match"),
-    "too many frames": ({"kind": "evaluate", "database": "0" * 16, "frames": 10**9}, "less than"),
+    "a path of a catalog": ({"kind": "ingest", "source": "../sao"}, "source: expected 1 to 64"),
+    "too many frames": (
+        {"kind": "evaluate", "database": "0" * 16, "frames": 10**9},
+        "at most 20,000",
+    ),
 }
 """What specs are refused for is tested with them; here that a job says it."""
 

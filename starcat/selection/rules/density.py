@@ -14,7 +14,8 @@ STEP = "density"
 COLUMNS = ("mag", "star_id", "x", "y", "z")
 DENSITY = RuleReason(
     "density",
-    "thinned to max_stars_per_field: fainter in every field, or as selection.thinning says",
+    "thinned to max_stars_per_field: not among the brightest of a field, or as selection.thinning "
+    "says",
 )
 REASONS = (DENSITY,)
 FORM = {

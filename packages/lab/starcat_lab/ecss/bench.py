@@ -339,7 +339,7 @@ def bench_answer(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> Benc
         spots = bench.spots(image)
     except ConfigError:  # too much stands out to tell stars from the rest
         return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
-    result = bench.matcher.identify(spots.centroids_px, magnitudes=spots.mag)
+    result = bench.matcher.identify(spots.centroids_px, mag=spots.mag)
     if not result.ok:
         return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
     error = error_arcsec(truth, result.q_body_from_icrs)

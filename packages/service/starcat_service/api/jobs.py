@@ -200,13 +200,20 @@ def list_jobs(
     state: Annotated[State | None, Query(description="Only those in it.")] = None,
     kind: Annotated[Kind | None, Query(description="Only those of it.")] = None,
     owner: Annotated[str | None, Query(max_length=200, description="Only theirs.")] = None,
+    database: Annotated[
+        str | None, Query(max_length=64, description="Only evaluations of this database.")
+    ] = None,
+    text: Annotated[
+        str | None, Query(max_length=100, description="Words of the title, kind, owner or id.")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=1000, description="So many at most.")] = 100,
     offset: Annotated[int, Query(ge=0, le=10**9, description="Leave out so many.")] = 0,
 ) -> JobPage:
     """Return jobs, the newest first."""
-    jobs = service.jobs.all(state=state, kind=kind, owner=owner, most=limit, skip=offset)
-    total = service.jobs.count(state=state, kind=kind, owner=owner)
-    return JobPage(jobs=jobs, total=total)
+    wanted: dict[str, Any] = {"state": state, "kind": kind, "owner": owner}
+    wanted |= {"database": database, "text": text}
+    jobs = service.jobs.all(**wanted, most=limit, skip=offset)
+    return JobPage(jobs=jobs, total=service.jobs.count(**wanted))
 
 
 @router.get("/{job_id}", summary="Look at a job")

@@ -100,19 +100,27 @@ class JobStore:
         state: State | None = None,
         kind: Kind | None = None,
         owner: str | None = None,
+        database: str | None = None,
+        text: str | None = None,
         most: int = 100,
         skip: int = 0,
     ) -> list[Job]:
-        """Return the jobs, the newest first."""
-        where, values = _where(state=state, kind=kind, owner=owner)
+        """Return the jobs, the newest first; those of a database are its evaluations."""
+        where, values = _where(text, state=state, kind=kind, owner=owner, database=database)
         newest = f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?"
         return [job_of(row) for row in self._records.rows(newest, *values, most, skip)]
 
     def count(
-        self, *, state: State | None = None, kind: Kind | None = None, owner: str | None = None
+        self,
+        *,
+        state: State | None = None,
+        kind: Kind | None = None,
+        owner: str | None = None,
+        database: str | None = None,
+        text: str | None = None,
     ) -> int:
         """Return how many jobs there are."""
-        where, values = _where(state=state, kind=kind, owner=owner)
+        where, values = _where(text, state=state, kind=kind, owner=owner, database=database)
         [[found]] = self._records.rows(f"SELECT count(*) FROM jobs {where}", *values)
         return int(found)
 
@@ -126,10 +134,17 @@ class JobStore:
         return [Event(number, at_s, kind, json.loads(data)) for number, at_s, kind, data in rows]
 
 
-def _where(**wanted: str | None) -> tuple[str, list[str]]:
+_COLUMNS = {"database": "json_extract(request, '$.database')"}
+
+
+def _where(text: str | None, **wanted: str | None) -> tuple[str, list[str]]:
     given = {name: value for name, value in wanted.items() if value is not None}
-    conditions = " AND ".join(["kind != ?", *(f"{name} = ?" for name in given)])
-    return f"WHERE {conditions}", [QUERY, *given.values()]
+    conditions = ["kind != ?", *(f"{_COLUMNS.get(name, name)} = ?" for name in given)]
+    values = [*given.values()]
+    for word in (text or "").split():
+        conditions.append("instr(lower(title || ' ' || kind || ' ' || owner || ' ' || id), ?) > 0")
+        values.append(word.lower())
+    return f"WHERE {' AND '.join(conditions)}", [QUERY, *values]
 
 
 def job_in(connection: sqlite3.Connection, job_id: str) -> Job:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from starcat_service.pages import (
+    catalogs,
     console,
     databases,
     documentation,
@@ -16,6 +17,7 @@ from starcat_service.pages import (
     releases,
     rendering,
     sky,
+    tokens,
 )
 
 ROUTERS: tuple[APIRouter, ...] = (
@@ -29,6 +31,8 @@ ROUTERS: tuple[APIRouter, ...] = (
     releases.router,
     documentation.router,
     sky.router,
+    catalogs.router,
+    tokens.router,
     downloads.router,
 )
 """Routers of the page, in the order in which they are asked."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
-from html import escape
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import Query, Request
+from fastapi import Form, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
@@ -15,22 +15,32 @@ from starcat.artifact import Difference
 from starcat.errors import TargetMissing
 from starcat.geometry import directions_from_radec
 from starcat.matcher import METHODS
-from starcat.report import Fields, colour_bins, field_at, nearest_raster, raster_png, sky_map
+from starcat.report import (
+    FIXED_BINS,
+    Fields,
+    colour_bins,
+    field_at,
+    nearest_raster,
+    raster_png,
+    sky_map,
+)
 from starcat.sections import version_numbers
-from starcat_service.access import Builder, Reader
-from starcat_service.api.databases import difference_of, fields_of
+from starcat_service.access import Builder, Publisher, Reader
+from starcat_service.api.databases import difference_of, fields_of, remove
 from starcat_service.jobs.submission import submit_evaluation
 from starcat_service.library import ListedDatabase
 from starcat_service.pages.downloads import image_choices
 from starcat_service.pages.facts import (
     database_rows,
     products_of,
+    readable_report,
     rejections_of,
     report_of,
     star_fact_columns,
 )
+from starcat_service.pages.jobs import evaluation_of
 from starcat_service.pages.notebook import Notebook, database_code, difference_code, query_code
-from starcat_service.pages.rendering import page_router, page_url, render
+from starcat_service.pages.rendering import ENVIRONMENT, page_router, page_url, render
 from starcat_service.pages.sky import CACHED, sky_view
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
@@ -76,6 +86,8 @@ def database_page(
     """Show what is known of a database."""
     database = service.library.database(database_id)
     manifest = database.manifest
+    evaluations = service.jobs.all(kind="evaluate", database=database.id)
+    done = next((job for job in evaluations if job.state == "done"), None)
     return render(
         request,
         "database.html",
@@ -93,6 +105,10 @@ def database_page(
         files=sorted(manifest["files"].items()),
         digest=database.manifest_sha256,
         may_evaluate=reader.role >= Role.BUILDER,
+        may_remove=reader.role >= Role.PUBLISHER,
+        evaluations=evaluations,
+        done=done,
+        **evaluation_of(done),
     )
 
 
@@ -173,19 +189,20 @@ def _ordered(fields: Fields, order: Order) -> list[int]:
 
 
 @lru_cache(maxsize=16)
-def _map_png(database_id: str, fields: Fields) -> bytes:
+def _map_png(database_id: str, fields: Fields, *, is_compared: bool) -> bytes:
     directions = directions_from_radec(fields.ra_deg, fields.dec_deg)
     nearest = nearest_raster(directions, np.arange(len(fields)), RASTER_WIDTH)
-    return raster_png(nearest, fields.stars)
+    return raster_png(nearest, fields.stars, FIXED_BINS if is_compared else ())
 
 
 @router.get("/databases/{database_id}/coverage.png")
-def coverage_raster(service: TheService, _: Reader, database_id: str) -> Response:
-    """Give the raster of the map of the sky."""
+def coverage_raster(
+    service: TheService, _: Reader, database_id: str, compared: Annotated[bool, Query()] = False
+) -> Response:
+    """Give the raster of the map of the sky; maps that are compared have the same colours."""
     database = service.library.database(database_id)
-    return Response(
-        _map_png(database.id, fields_of(database)), media_type="image/png", headers=CACHED
-    )
+    picture = _map_png(database.id, fields_of(database), is_compared=compared)
+    return Response(picture, media_type="image/png", headers=CACHED)
 
 
 @router.get("/databases/{database_id}/fields.json")
@@ -209,16 +226,16 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
         raise TargetMissing(f"{database.title} has no report; build it again to get one")
     headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
-    # It has no head of the service: a line above it leads back.
-    page = path.read_bytes().replace(b"<body>", b"<body>" + _way_back(database).encode(), 1)
+    head = ENVIRONMENT.get_template("report_head.html").render(database=database)
+    page = path.read_bytes().replace(b"<body>", b"<body>" + head.encode(), 1)
+    page = _COUNT.sub(
+        lambda found: found[0].replace(b",", "\N{NARROW NO-BREAK SPACE}".encode()), page
+    )
     return Response(page, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _way_back(database: ListedDatabase) -> str:
-    return (
-        f'<p><a href="/databases/{database.id}">← {escape(database.name)} '
-        f'{escape(database.version)}</a> · <a href="/databases">Databases</a></p>'
-    )
+_COUNT = re.compile(rb"(?<=>)\d{1,3}(,\d{3})+(?=<)")
+"""A count as reports write it; pages have a thin space between thousands."""
 
 
 @router.get("/databases/{database_id}/compare")
@@ -231,6 +248,7 @@ async def compare(
 ) -> Response:
     """Show what differs between this database and a later or other one."""
     difference = None
+    other = other or await run_in_threadpool(_another_version, service, database_id)
     if other:
         # In its turn among the queries: it reads whole tables.
         sides = await run_in_threadpool(_older_first, service, database_id, other)
@@ -244,22 +262,41 @@ def _comparison(
 ) -> Response:
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
+    others.sort(key=lambda one: one.name != database.name)  # its other versions first
     earlier, later = _older_first(service, database_id, other) if other else (database, None)
     code = later and difference_code(page_url(request, service), earlier.id, later.id)
-    versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
         "compare.html",
         **_head(service, database, "compare"),
         others=others,
-        suggested=other or (versions[-1] if versions else ""),
+        suggested=other,
         earlier=earlier,
         later=later,
         difference=difference,
+        sides=[_side(service, one) for one in (earlier, later)] if later else [],
         notebook=Notebook(f"{earlier.title}-{later.title}", code) if later and code else None,
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
     )
+
+
+def _another_version(service: Service, database_id: str) -> str:
+    """Return the id of the newest other version of a database; empty if there is none."""
+    database = service.library.database(database_id)
+    others = [one for one in service.library.databases() if one.id != database.id]
+    return next((one.id for one in reversed(others) if one.name == database.name), "")
+
+
+def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:
+    """Return what a comparison shows of one of the two databases."""
+    newest = service.jobs.all(kind="evaluate", state="done", database=database.id, most=1)
+    return {
+        "row": database_rows(service, database)[0],
+        "coverage": readable_report(database).get("coverage"),
+        "map": sky_map(fields_of(database), FIXED_BINS),
+        "measured": evaluation_of(newest[0] if newest else None)["rates"],
+    }
 
 
 def _older_first(
@@ -274,10 +311,22 @@ def _older_first(
 
 
 @router.post("/databases/{database_id}/evaluate")
-def evaluate_page(service: TheService, builder: Builder, database_id: str) -> Response:
+def evaluate_page(
+    service: TheService,
+    builder: Builder,
+    database_id: str,
+    frames: Annotated[int, Form(ge=1, le=20_000)] = 500,
+) -> Response:
     """Have it measured how often frames are identified, and show the job."""
-    submitted = submit_evaluation(service, database_id, builder.name)
+    submitted = submit_evaluation(service, database_id, builder.name, frames=frames)
     return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
+
+
+@router.post("/databases/{database_id}/remove")
+def remove_page(service: TheService, publisher: Publisher, database_id: str) -> Response:
+    """Remove a database, and show the others."""
+    remove(database_id, service, publisher)
+    return RedirectResponse("/databases", 303)
 
 
 def _head(service: Service, database: ListedDatabase, tab: str) -> dict[str, Any]:

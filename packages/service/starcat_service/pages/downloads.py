@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import tomlkit
 from fastapi import Query
 from fastapi.responses import Response
 
-from starcat.onboard import BYTE_ORDERS, FEATURES
+from starcat.onboard import BYTE_ORDERS, FEATURES, PROFILES
 from starcat_service.access import Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.pages.rendering import page_router
@@ -19,14 +20,21 @@ router = page_router()
 
 Method = Literal["triangle", "pyramid"]
 Endian = Literal["little", "big"]
+ProfileName = Literal["full", "small"]
+FULL_NAME: ProfileName = "full"
 
 
 def image_choices(database: ListedDatabase) -> dict[str, list[tuple[str, str]]]:
-    """Return the methods and the byte orders that an image of a database can have."""
+    """Return the methods, the byte orders and the profiles that an image of a database can have."""
     methods = [name for name, (product, _) in FEATURES.items() if product in database.products]
     return {
         "methods": [(name, f"{name}s") for name in methods],
         "orders": [(name, f"{name}-endian") for name in BYTE_ORDERS],
+        "profiles": [
+            (name, f"{name}, with {profile.methods[0]}s")
+            for name, profile in PROFILES.items()
+            if name != FULL_NAME and profile.methods[0] in methods
+        ],
     }
 
 
@@ -35,20 +43,25 @@ async def flight_image_page(
     service: TheService,
     _: Reader,
     database_id: str,
-    method: Annotated[Method, Query()] = "triangle",
+    method: Annotated[Method | None, Query()] = None,
     endian: Annotated[Endian, Query()] = "little",
+    profile: Annotated[ProfileName, Query()] = FULL_NAME,
 ) -> Response:
     """Give the image for flight software, the bytes that ``starcat export`` writes."""
     database = service.library.database(database_id)
-    return await service.sandbox.run(_image, service, database, method, endian)
+    options = {"method": method, "endian": endian, "profile": profile}
+    return await service.sandbox.run(_image, service, database, options)
 
 
-def _image(service: Service, database: ListedDatabase, method: str, endian: str) -> Response:
+def _image(
+    service: Service, database: ListedDatabase, options: Mapping[str, str | None]
+) -> Response:
+    name = "" if options["profile"] == FULL_NAME else f"-{options['profile']}"
     with scratch_folder(service.paths) as folder:
         target = folder / "image.img"
         arguments = {"artifact": str(database.folder), "target": str(target)}
-        service.sandbox.call("flight_image", {**arguments, "method": method, "endian": endian})
-        return open_attachment(target, f"{database.title}.img", BYTES)
+        service.sandbox.call("flight_image", {**arguments, **options})
+        return open_attachment(target, f"{database.title}{name}.img", BYTES)
 
 
 @router.get("/databases/{database_id}/spec.toml")

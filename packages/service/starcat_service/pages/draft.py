@@ -40,6 +40,11 @@ BEFORE = "toml-before"
 LENS = "lens"
 ENABLED = "enabled"
 
+FORM_PRODUCTS = (*USUAL_PRODUCTS, "levels")
+"""Products that the form has a box for: ``levels`` is for databases of many fields of view."""
+
+WIDEST = "products.levels.widest_fov_x_deg"
+
 RULE_FIELDS = form_fields()
 """How the form shows the keys of rules of selection, by key; the rules say it themselves."""
 
@@ -57,6 +62,7 @@ FIELDS = (
     "camera.pixel_um",
     "boresights.count",
     "boresights.brightest",
+    WIDEST,
     "camera.response.name",
     *RULE_FIELDS,
 )
@@ -89,14 +95,11 @@ class SpecForm:
     spec: BuildSpec | None  # None: something is wrong
     wrong: tuple[ConfigError, ...] = ()
 
-    @property
-    def tells_of_sensor(self) -> bool:
-        """Whether a rule that goes by the sensor is used."""
-        sensor = {key: shown for key, shown in RULE_FIELDS.items() if shown.group == "sensor"}
-        for key, shown in sensor.items():
-            value = self.values.get(key, "")
+    def uses_rule(self, group: str, *kinds: str) -> bool:
+        """Return whether a rule is used whose field has a group and one of some kinds."""
+        for key, shown in RULE_FIELDS.items():
             usual = shown.choices[0][0] if shown.choices else ""
-            if shown.kind != "number" and value not in ("", usual):
+            if shown.group == group and shown.kind in kinds and self.values[key] not in ("", usual):
                 return True
         return False
 
@@ -178,7 +181,7 @@ def _with_fields_of(form: Mapping[str, str], draft: SpecForm) -> SpecForm:
         draft,
         values=values,
         lens="focal" if form.get(LENS) == "focal" else "field",
-        products={name: f"products.{name}.{ENABLED}" in form for name in USUAL_PRODUCTS},
+        products={name: f"products.{name}.{ENABLED}" in form for name in FORM_PRODUCTS},
         bands=bands_of(form.get("catalog.source", "")),
         responses=responses_of(values[NAME]),
     )
@@ -210,17 +213,13 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
             if isinstance(found.__cause__, ValidationError):
                 wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN))
     has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
-    enabled = {
-        name: value_at(content, f"products.{name}.{ENABLED}") is not False
-        for name in USUAL_PRODUCTS
-    }
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
     return SpecForm(
         text=text,
         values=values,
         lens="focal" if has_focal else "field",
-        products=enabled,
+        products={name: _is_made(content, name) for name in FORM_PRODUCTS},
         bands=bands_of(source) if isinstance(source, str) else (),
         responses=responses_of(values[NAME]),
         content=content,
@@ -320,11 +319,18 @@ def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
     if lens in _OF_LENS:
         _change_lens(edit, lens)
     if "products" in form:
-        for name in USUAL_PRODUCTS:
-            is_wanted = f"products.{name}.{ENABLED}" in form
-            if is_wanted != (value_at(content, f"products.{name}.{ENABLED}") is not False):
-                edit.put(f"products.{name}.{ENABLED}", None if is_wanted else False)
+        for name in FORM_PRODUCTS:
+            key = f"products.{name}.{ENABLED}"
+            is_wanted = key in form
+            if is_wanted != _is_made(content, name):
+                edit.put(key, None if is_wanted == _KEYS[key].default else is_wanted)
     return edit
+
+
+def _is_made(content: Mapping[str, Any], name: str) -> bool:
+    key = f"products.{name}.{ENABLED}"
+    value = value_at(content, key)
+    return bool(_KEYS[key].default) if value is None else value is not False
 
 
 def _change_lens(edit: _Edit, lens: str) -> None:

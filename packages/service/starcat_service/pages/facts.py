@@ -63,12 +63,17 @@ def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]
 
 
 def _rates(database: ListedDatabase) -> list[Mapping[str, Any]]:
-    """Return the rates of the self-test: a damaged report does not hide other databases."""
+    """Return the rates of the self-test."""
+    # A report of an older version has no share of all pointings.
+    return [rates_of(one).as_dict() for one in readable_report(database).get("self_test", ())]
+
+
+def readable_report(database: ListedDatabase) -> dict[str, Any]:
+    """Return the report of a build, empty if it is damaged: it does not hide other databases."""
     try:
-        # A report of an older version has no share of all pointings.
-        return [rates_of(one).as_dict() for one in report_of(database).get("self_test", ())]
+        return report_of(database)
     except ProductError:
-        return []
+        return {}
 
 
 def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -179,7 +179,7 @@ def _frames(
     service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
 ) -> _Found:
     """Identify the frames of one file with one database after the other, until one succeeds."""
-    kind: Literal["png"] | None = "png" if draw else None
+    kind: Literal["svg"] | None = "svg" if draw else None
     is_chosen = bool(given["database"])
 
     def identify(database: ListedDatabase) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
@@ -389,14 +389,22 @@ def _simulated(service: Service, database: ListedDatabase, name: str, seed: int)
 
 
 def _address(picture: bytes) -> str | None:
-    """Return a picture as an address that holds it, as JPEG: nothing of a frame is kept."""
+    """Return a picture as an address that holds it, without the margins: nothing is kept."""
     if not picture:
         return None
-    from PIL import Image
+    if area := _AREA.search(picture):
+        left, bottom, right, top = map(float, area.groups())
+        size = right - left, bottom - top
+        box = b'width="%gpt" height="%gpt" viewBox="%g %g %g %g"' % (*size, left, top, *size)
+        picture = _SIZE.sub(box, picture, count=1)
+    return f"data:image/svg+xml;base64,{base64.b64encode(picture).decode()}"
 
-    file = io.BytesIO()
-    Image.open(io.BytesIO(picture)).convert("RGB").save(file, "JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+_SIZE = re.compile(rb'width="[^"]*" height="[^"]*" viewBox="[^"]*"')
+_AREA = re.compile(
+    rb'<g id="patch_2">\s*<path d="M ([\d.]+) ([\d.]+)\s+L ([\d.]+) [\d.]+\s+L [\d.]+ ([\d.]+)'
+)
+"""Corners of the sky in a picture of `starcat.images`: the second patch that is drawn."""
 
 
 def _errors(answer: dict[str, Any]) -> list[str] | None:

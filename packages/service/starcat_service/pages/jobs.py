@@ -53,15 +53,17 @@ def jobs_page(
     _: Reader,
     state: State | None = None,
     page: Annotated[int, Query(ge=1, le=10**6)] = 1,
+    q: Annotated[str, Query(max_length=100)] = "",
 ) -> Response:
     """List the jobs, the newest first."""
-    total = service.jobs.count(state=state)
-    jobs = service.jobs.all(state=state, most=JOBS_A_PAGE, skip=(page - 1) * JOBS_A_PAGE)
+    total = service.jobs.count(state=state, text=q)
+    jobs = service.jobs.all(state=state, text=q, most=JOBS_A_PAGE, skip=(page - 1) * JOBS_A_PAGE)
     return render(
         request,
         "jobs.html",
         jobs=jobs,
-        counts={name: service.jobs.count(state=name) for name in STATES},
+        counts={name: service.jobs.count(state=name, text=q) for name in STATES},
+        q=q,
         total=total,
         state=state,
         page=page,
@@ -89,11 +91,19 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
         took=took_s(job),
         progress=progress_text(job),
         may_change=may_change(job, who),
-        # A job of an older version has recorded no share of all pointings.
-        rates=[rates_of(one).as_dict() for one in (job.result or {}).get("rates", ())],
-        charts=charts_of(job),
-        chart=(CHART_WIDTH, CHART_HEIGHT),
+        **evaluation_of(job),
     )
+
+
+def evaluation_of(job: Job | None) -> dict[str, Any]:
+    """Return what pages show of an evaluation: rates, and curves where they are drawn."""
+    found = (job and job.result) or {}
+    return {
+        # A job of an older version has recorded no share of all pointings.
+        "rates": [rates_of(one).as_dict() for one in found.get("rates", ())],
+        "charts": charts_of(found),
+        "chart": (CHART_WIDTH, CHART_HEIGHT),
+    }
 
 
 @router.post("/jobs/{job_id}/cancel")
@@ -156,11 +166,12 @@ class Mark:
 
 @dataclass(frozen=True)
 class Chart:
-    """A curve as it is drawn: 0 to 100 % upwards."""
+    """A curve as it is drawn, up to 100 %."""
 
     label: str
     held: str  # what the other quantities are held at, where that is not nothing
     marks: list[Mark]
+    ticks: list[tuple[float, float]]  # percent, and where it is drawn
 
     @property
     def line(self) -> str:
@@ -168,17 +179,21 @@ class Chart:
         return " ".join(f"{mark.x:.1f},{mark.y:.1f}" for mark in self.marks)
 
 
-def charts_of(job: Job) -> list[Chart]:
-    """Return the curves of an evaluation."""
-    return [_chart(curve) for curve in (job.result or {}).get("curves", ())]
+def charts_of(result: Mapping[str, Any]) -> list[Chart]:
+    """Return the curves of an evaluation, with one axis for all."""
+    curves = result.get("curves", ())
+    lows = [point["low_percent"] or 0.0 for curve in curves for point in curve["points"]]
+    least = min(lows, default=0.0)
+    base = 10.0 * (least // 10.0) if least >= 50.0 else 0.0
+    return [_chart(curve, min(base, 90.0)) for curve in curves]
 
 
-def _chart(curve: Mapping[str, Any]) -> Chart:
+def _chart(curve: Mapping[str, Any], base: float) -> Chart:
     points = curve["points"]
     most = max(point["x"] for point in points) or 1.0
 
     def y(percent: float | None) -> float:
-        return CHART_HEIGHT * (1.0 - (percent or 0.0) / 100.0)
+        return CHART_HEIGHT * (100.0 - (percent or 0.0)) / (100.0 - base)
 
     marks = [
         Mark(
@@ -191,7 +206,8 @@ def _chart(curve: Mapping[str, Any]) -> Chart:
         )
         for point in points
     ]
-    return Chart(curve["label"], curve["held"], marks)
+    ticks = [(percent, y(percent)) for percent in (base, (base + 100.0) / 2.0, 100.0)]
+    return Chart(curve["label"], curve["held"], marks, ticks)
 
 
 def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:

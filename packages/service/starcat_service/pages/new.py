@@ -352,31 +352,20 @@ def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | N
     found = seen.figures
     stars = found.fields.stars
     return (
-        f"{count_text(found.guide_stars)} guide stars, {count_text(stars.median)} in the middle "
-        f"field ({stars.minimum} to {stars.maximum}), {size_text(found.total_bytes)}, built in "
+        f"{count_text(found.guide_stars)} guide stars, {stars.minimum} to {stars.maximum} in a "
+        f"field (median {count_text(stars.median)}), {size_text(found.total_bytes)}, built in "
         f"about {duration_text(max(1.0, found.build_seconds))}"
     )
 
 
-def _presets() -> list[tuple[str, str, str]]:
-    """Return name, description, and what is lacking, of the presets."""
+def _presets() -> list[tuple[str, str, list[str]]]:
+    """Return name, description, and the catalogs whose files are missing, of the presets."""
     found = []
     for name in preset_names():
         spec = preset(name)
         missing = [source for source in spec.sources if not is_here(source)]
-        found.append((name, spec.description, missing_sources(missing) if missing else ""))
+        found.append((name, spec.description, missing))
     return found
-
-
-def missing_sources(sources: list[str]) -> str:
-    """Return what to say where the files of catalogs are not on the server."""
-    known = [(one, data_source(one).identifier.partition(";")[0]) for one in sources]
-    names = " and ".join(f"{one} ({identifier})" for one, identifier in known)
-    is_one = len(sources) == 1
-    return (
-        f"the files of {names} are not on this server; whoever runs it gets "
-        f"{'them' if is_one else 'each'} with starcat fetch {' and starcat fetch '.join(sources)}"
-    )
 
 
 def _sources(service: Service) -> list[tuple[str, str]]:

@@ -93,8 +93,8 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
         hits = round(found.enough_share * test.frames)
         if wilson_interval(hits, test.frames)[1] >= test.min_identified:
             return Verdict("bad", f"{words}. {advice}")
-        asked = f"{_percent(test.min_identified)} of all pointings (self_test.min_identified)"
-        words += f", and a build fails that does not identify {asked}"
+        needed = _percent(test.min_identified)
+        words += f", and the self-test of a build has to identify {needed} of all pointings"
         return Verdict("bad", f"{words}. {advice}", will_fail=True)
     if stars.one_percent < ENOUGH_STARS - 2:
         words = (
@@ -106,7 +106,7 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
     if stars.median > MANY_FIELDS * STARS_A_FIELD:
         limit, _ = catalogs.enough_limit(spec)
         words += (
-            f". The middle one has {count_text(stars.median)}, more than are needed: "
+            f". The median field has {count_text(stars.median)}, more than are needed: "
             f"{_band(spec)} {limit:.1f}, or a limit of stars per field, would do"
         )
     return Verdict("good", f"{words}.")
@@ -118,7 +118,7 @@ def _advice(spec: BuildSpec, catalogs: Catalogs) -> str:
     if limit > own + 0.04:
         ends = limit >= deepest - 0.1
         more = f", where the catalog ends, or take {_OTHERS}" if ends else ""
-        return f"Go to {_band(spec)} {limit:.1f}{more}."
+        return f"Set the faint limit to {_band(spec)} {limit:.1f}{more}."
     if own >= deepest - 0.1:
         return f"The catalog ends at {_band(spec)} {deepest:.1f}: take {_OTHERS}."
     return (

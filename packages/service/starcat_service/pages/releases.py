@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
@@ -27,9 +27,13 @@ def releases_page(
     reader: Reader,
     database: Annotated[str, Query(max_length=64)] = "",
     published: Annotated[str, Query(max_length=200)] = "",
+    q: Annotated[str, Query(max_length=100)] = "",
+    order: Annotated[Literal["newest", "name", "size"], Query()] = "newest",
 ) -> Response:
     """Show what was published, and the form to publish what was not."""
-    return _page(request, service, reader, database=database, published=published)
+    return _page(
+        request, service, reader, database=database, published=published, q=q, order=order
+    )
 
 
 @router.post("/releases")
@@ -62,17 +66,25 @@ def _page(
     database: str = "",
     note: str = "",
     published: str = "",
+    q: str = "",
+    order: str = "newest",
     problem: ProblemDetails | None = None,
     asked: ListedDatabase | None = None,
 ) -> Response:
     listed = api.all_releases(service, principal).releases
-    newest_first = sorted(listed, key=lambda one: one.published_s or 0.0, reverse=True)
+    found = [one for one in listed if _has_words(one, q)]
+    if order != "name":
+        by = "bytes" if order == "size" else "published_s"
+        found.sort(key=lambda one: getattr(one, by) or 0.0, reverse=True)
     rows = database_rows(service)
     return render(
         request,
         "releases.html",
         status=problem.status if problem else 200,
-        releases=newest_first,
+        releases=found,
+        count=len(listed),
+        q=q,
+        order=order,
         address=page_url(request, service),
         unreleased=[
             (row.database.id, f"{row.database.name} {row.database.version}")
@@ -88,3 +100,9 @@ def _page(
         published=published if published in {one.title for one in listed} else "",
         problem=problem,
     )
+
+
+def _has_words(release: api.ReleaseFacts, text: str) -> bool:
+    """Return whether a release has all words of a text."""
+    told = f"{release.title} {release.owner or ''} {release.note or ''}".lower()
+    return all(word in told for word in text.lower().split())

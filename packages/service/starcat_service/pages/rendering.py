@@ -27,11 +27,21 @@ NAVIGATION = (
     ("/jobs", "Jobs"),
     ("/databases", "Databases"),
     ("/identify", "Identify"),
+    ("/catalogs", "Catalogs"),
     ("/releases", "Releases"),
     ("/docs", "Help"),
 )
 """Address and name of what the head of every page leads to."""
 
+
+DATABASE_TABS = (
+    ("overview", "Overview"),
+    ("coverage", "Sky and coverage"),
+    ("sql", "SQL"),
+    ("compare", "Compare"),
+    ("report", "Build report"),
+)
+"""End of the address, and name, of the pages of a database."""
 
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
@@ -137,6 +147,7 @@ def _environment() -> Environment:
     environment.globals |= {
         "static": static_address,
         "navigation": NAVIGATION,
+        "tabs": DATABASE_TABS,
         "starcat_version": __version__,
     }
     return environment

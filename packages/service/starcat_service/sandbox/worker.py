@@ -62,12 +62,11 @@ def identify_confined(
         found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
-    is_any = any(answer.result.ok for answer in found)
     return {
         "database": answers.matcher.database.name,
         "method": answers.matcher.method,
         "frames": [answer.content() for answer in found],
-        "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
+        "notes": answers.notes(found[0] if found else None),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
         "size_px": [answers.camera.width_px, answers.camera.height_px],
     }
@@ -105,11 +104,14 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
         return write_batches(stream, Path(target), form, named)
 
 
-def make_flight_image(artifact: str, target: str, method: str, endian: str) -> int:
+def make_flight_image(
+    artifact: str, target: str, method: str | None, endian: str, profile: str
+) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
     from starcat.exchange import export_image
 
-    made = export_image(Path(artifact), "onboard", Path(target), method=method, endian=endian)
+    options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
+    made = export_image(Path(artifact), "onboard", Path(target), **options)
     return len(made.made.data)
 
 

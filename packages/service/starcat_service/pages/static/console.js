@@ -7,7 +7,27 @@ import { startTables } from "./tables.js";
 const form = document.getElementById("console");
 const query = document.getElementById("query");
 const answer = document.getElementById("answer");
+const recent = document.getElementById("recent");
+const MOST_RECENT = 20;
 let asking = null;
+
+// The queries that were answered are kept in this browser, the newest first.
+function remember(text) {
+  try {
+    const before = JSON.parse(localStorage.getItem("queries") ?? "[]");
+    const all = [...new Set([text, ...before])].filter(Boolean).slice(0, MOST_RECENT);
+    if (text) localStorage.setItem("queries", JSON.stringify(all));
+    recent.hidden = all.length === 0;
+    recent.querySelector("ul").replaceChildren(...all.map((one) => {
+      const [item, link] = ["li", "a"].map((name) => document.createElement(name));
+      Object.assign(link, { href: `?${new URLSearchParams({ query: one })}`, textContent: one });
+      item.append(link);
+      return item;
+    }));
+  } catch {
+    // A browser that keeps nothing shows none.
+  }
+}
 
 document.getElementById("keys").hidden = false;
 query.addEventListener("keydown", (event) => {
@@ -37,6 +57,7 @@ form.addEventListener("submit", async (event) => {
     if (found.headers.get("Content-Type")?.startsWith("text/html")) answer.innerHTML = text;
     else answer.textContent = JSON.parse(text).detail;
     history.replaceState(null, "", `?${wanted}`);
+    if (found.ok) remember(query.value.trim());
     startTables(answer);
     for (const root of answer.querySelectorAll(".skyview[data-sky]")) startSky(root);
     announce(document.getElementById("answer-count")?.textContent ?? "The query failed");
@@ -47,3 +68,5 @@ form.addEventListener("submit", async (event) => {
     if (asking === mine) answer.removeAttribute("aria-busy");
   }
 });
+
+remember(document.getElementById("answer-count") ? query.value.trim() : "");

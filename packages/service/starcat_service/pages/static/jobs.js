@@ -1,6 +1,7 @@
 // The list of jobs is loaded again while one of them waits or runs.
 
 import { announce } from "./starcat.js";
+import { startTables } from "./tables.js";
 
 const EVERY_MS = 2000;
 
@@ -37,6 +38,7 @@ function show(list, html) {
     }
   }
   list.replaceWith(news);
+  startTables(news);
   document.querySelector(".tabs").replaceWith(page.querySelector(".tabs"));
 }
 

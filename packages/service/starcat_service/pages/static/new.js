@@ -17,7 +17,6 @@ const pinned = document.getElementById("pinned");
 const share = document.getElementById("share");
 const build = document.getElementById("build");
 const response = document.getElementById("response_file");
-const sensor = document.getElementById("sensor-fields");
 const FIELDS_AFTER_MS = 120;
 const TEXT_AFTER_MS = 450;
 const BUSY_AFTER_MS = 2500;
@@ -36,7 +35,8 @@ function showErrors(errors) {
     if (told.textContent !== message) told.textContent = message;
     const control = document.getElementById(key);
     (control?.closest(".field") ?? control?.closest(".copybox"))?.classList.toggle("wrong", message !== "");
-    if (message && sensor.contains(told)) sensor.open = true;
+    const details = told.closest("details");
+    if (message && details) details.open = true;
     if (message) control?.setAttribute("aria-invalid", "true");
     else control?.removeAttribute("aria-invalid");
   }
@@ -83,7 +83,9 @@ function show(state) {
   showValues(state);
   showErrors(state.errors);
   wrong.innerHTML = state.wrong;
-  body.classList.toggle("stale", !state.is_known);
+  const first = body.querySelector(".waiting .soft");
+  if (first && !state.is_busy) first.textContent = state.summary || "No estimate.";
+  body.classList.toggle("stale", !state.is_known && !first);
   body.inert = !state.is_known;
   if (state.is_known) {  // else the last estimate stays, pale
     const hadFocus = body.querySelector(".sky svg") === document.activeElement;

@@ -15,7 +15,7 @@ const MOST_LABELS = 60; // of marks
 const STEPS_DEG = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30];
 const POLE = direction(192.85948, 27.12825); // of the Milky Way: ESA SP-1200, equation 1.5.11
 const COLOURS = {
-  ground: "#0b1017", grid: "rgb(190 215 240 / 30%)", text: "#b9c9d8", plane: "rgb(255 255 255 / 55%)",
+  ground: "#0b1017", grid: "rgb(190 215 240 / 30%)", text: "#b9c9d8", plane: "rgb(255 255 255 / 90%)",
   guide: "#ffffff", rejected: "#ffb454", faint: "#9fb2c4", frame: "#ff7f92", mark: "#6fe3f5",
 };
 
@@ -190,7 +190,19 @@ class Sky {
     else told.searchParams.set("at", [ra.toFixed(3), dec.toFixed(3), Number(size.toPrecision(4)), roll].join(","));
     if (this.field === null) told.searchParams.delete("field");
     else told.searchParams.set("field", this.field);
-    if (told.href !== location.href) history.replaceState(null, "", told);
+    if (told.href !== location.href) history[this.isStep ? "pushState" : "replaceState"](null, "", told);
+    this.isStep = false;
+  }
+
+  // The browser's Back and Forward lead through the fields that were stepped to.
+  comeBack() {
+    Object.assign(this.at, { ra: 0, dec: 0, size: WHOLE_DEG, roll: 0, ...this.data.at });
+    [this.field, this.wanted] = [null, undefined];
+    this.readAddress();
+    this.chosen.hidden = this.wanted === undefined;
+    if (this.wanted !== undefined && this.fields) this.choose(this.wanted);
+    this.rank = this.fields?.emptiest.indexOf(this.field) ?? -1;
+    this.moved();
   }
 
   // What is painted.
@@ -295,7 +307,8 @@ class Sky {
     const first = side.map((one) => one / length);
     const second = cross(POLE, first);
     pen.strokeStyle = COLOURS.plane;
-    pen.setLineDash([5, 4]);
+    pen.lineWidth = 1.8;
+    pen.setLineDash([7, 5]);
     this.line(even(0, 360).flatMap((one) => [one, one + 3]).map((one) => sum([Math.cos(one * DEG), first], [Math.sin(one * DEG), second])));
     pen.setLineDash([]);
   }
@@ -325,7 +338,11 @@ class Sky {
     pen.lineWidth = 3;
     pen.lineJoin = "round";
     for (const one of named.slice(0, NAMED + Math.min(this.marks.length, MOST_LABELS))) {
-      const [text, x, y] = [one.name || one.label, one.x + 9, one.y + 4];
+      const [text, y] = [one.name || one.label, one.y + 4];
+      const wide = pen.measureText(text).width;
+      const right = one.x + 9 + wide;
+      const fits = right < this.width && this.skyAt(right, y + 4) && this.skyAt(right, y - 12);
+      const x = fits ? one.x + 9 : one.x - 9 - wide;
       pen.strokeText(text, x, y);
       pen.fillText(text, x, y);
     }
@@ -338,15 +355,18 @@ class Sky {
     if (one.kind === "mark") {
       this.ring(x, y, 9, one.colour === "rejected" ? COLOURS.rejected : COLOURS.mark);
     } else if (one.kind === "rejected") {
+      const isWhole = this.at.size >= 180; // there are many: they must not hide the fields
       pen.strokeStyle = COLOURS.rejected;
-      pen.lineWidth = 1.6;
-      const arm = Math.max(2.5, r);
+      pen.globalAlpha = isWhole ? 0.5 : 1;
+      pen.lineWidth = isWhole ? 1 : 1.6;
+      const arm = isWhole ? 1.5 : Math.max(2.5, r);
       pen.beginPath();
       pen.moveTo(x - arm, y - arm);
       pen.lineTo(x + arm, y + arm);
       pen.moveTo(x + arm, y - arm);
       pen.lineTo(x - arm, y + arm);
       pen.stroke();
+      pen.globalAlpha = 1;
     } else {
       pen.beginPath();
       pen.arc(x, y, one.kind === "faint" ? 0.9 : r, 0, 2 * Math.PI);
@@ -480,6 +500,9 @@ class Sky {
     const now = this.rank ?? (by > 0 ? -1 : 1);
     this.rank = Math.max(0, Math.min(this.fields.size - 1, now + by));
     this.show(this.fields.emptiest[this.rank]);
+    this.isStep = true;
+    this.writeAddress();
+    this.canvas.scrollIntoView({ block: "nearest" });
   }
 
   setRoll(roll) {
@@ -539,6 +562,7 @@ class Sky {
       const button = event.target.closest("[data-do]");
       if (button) this.do(button.dataset.do);
     });
+    addEventListener("popstate", () => this.comeBack());
     this.root.addEventListener("input", (event) => {
       const { layer } = event.target.dataset;
       if (layer) this.layers[event.target.checked ? "add" : "delete"](layer);

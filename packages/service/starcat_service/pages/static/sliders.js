@@ -19,8 +19,9 @@ function valueOf(range) {
 export function follow(range) {
   const number = document.getElementById(range.dataset.of);
   if (range === document.activeElement && range.matches(":active")) return;
-  const value = Number(number.value);
-  if (number.value === "") range.value = range.dataset.noneAt === "low" ? range.min : range.max;
+  // An empty field may have a placeholder that counts instead.
+  const value = Number(number.value || number.placeholder);
+  if (number.value === "" && !(value > 0)) range.value = range.dataset.noneAt === "low" ? range.min : range.max;
   else if (range.dataset.scale !== "log") range.value = String(value);
   else range.value = String((1000 * Math.log(value / range.own.low)) / Math.log(range.own.high / range.own.low));
   const unit = document.querySelector(`label[for="${number.id}"] .unit`)?.textContent ?? "";

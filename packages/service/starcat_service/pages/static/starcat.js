@@ -77,7 +77,7 @@ export function announce(text) {
 function cardTables() {
   for (const table of document.querySelectorAll("table:not(.carded, .grid)")) {
     const heads = [...table.querySelectorAll("thead tr:last-child > *")];
-    if (heads.length < 4) continue;
+    if (heads.length < (table.matches(".as-cards") ? 2 : 4)) continue;
     table.classList.add("carded");
     for (const row of table.tBodies[0]?.rows ?? []) {
       [...row.cells].forEach((cell, k) => {

@@ -1,5 +1,6 @@
 // Tables whose rows sort and filter: <table id="..." data-sorts>. Both are kept in the address, as
-// sort.ID=COLUMN (-COLUMN: the largest first) and filter.ID=TEXT.
+// sort.ID=COLUMN (-COLUMN: the largest first) and filter.ID=TEXT. data-sorts="list": even few rows
+// have a filter.
 
 import { keep, kept } from "./address.js";
 import { announce } from "./starcat.js";
@@ -70,7 +71,7 @@ function startTable(table) {
     keep({ [filterName]: input.value });
     filter();
   });
-  if (rows.length > FEW || input.value) {
+  if (rows.length > FEW || input.value || table.dataset.sorts === "list") {
     const tools = document.createElement("div");
     tools.className = "row table-tools";
     tools.append(input, count);

@@ -1,0 +1,241 @@
+"""A camera of which nothing is known, from photographs: its field, lens, limit and noise.
+
+The frames are identified with a database for many fields of view. The field is that of a lens
+without distortion, as a spec has it; where the stars support terms of distortion, a camera with
+these is there too. The limit is the magnitude from which stars are seen half as often as the
+bright ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starcat.arrays import Array, Mask, Rows
+from starcat.calibration.fit import Fit, Seen, camera_of, project, values_of
+from starcat.calibration.rounds import supported_fit
+from starcat.errors import CalibrationError
+from starcat.geometry.camera import Camera
+from starcat.images.identify_options import IdentifyOptions
+from starcat.images.solve_files import FrameAnswer, identify_either_way
+from starcat.matcher.matcher import Matcher
+from starcat.progress import Progress, no_progress
+from starcat.specs.camera_file import camera_toml
+
+ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
+"""Distances within which a centroid is a star, in the rounds of fitting the lens."""
+
+ERROR_OF_LENS = 0.005
+"""Relative error of the field of one picture that its distortion makes: it depends on where on the
+detector the stars are. Fields of an IMX219 with 7 % of distortion in the corner scatter so."""
+
+BRIGHT = 15
+"""Stars at least that tell how many of the bright ones are seen."""
+
+AT_THE_END_MAG = 0.1
+"""A limit this near to the faintest star of the database is that of the database."""
+
+
+@dataclass(frozen=True)
+class FirstCamera:
+    """What photographs tell of their camera."""
+
+    camera: Camera  # without distortion, in the middle of its fields
+    fov_error_deg: float  # standard error of the field across the width
+    fit: Fit  # of the terms of the lens that the stars support
+    reach_mag: float  # magnitude from which stars are seen half as often as bright ones
+    n_reach: int  # stars that tell it
+    is_deeper: bool  # whether the database has hardly any star that is missed
+    names: tuple[str, ...]  # of the pictures that were identified
+    n_files: int
+    flip: bool | None  # how the pictures had to be read
+
+    @property
+    def lens(self) -> Camera:
+        """The camera with the distortion that the stars support."""
+        return camera_of(self.fit.values, (self.camera.width_px, self.camera.height_px))
+
+    @property
+    def has_distortion(self) -> bool:
+        """Whether they support any."""
+        return len(self.fit.free) > 1
+
+    def remarks(self, limit_mag: float, band: str, *, is_stated: bool) -> list[str]:
+        """Return where the values of a spec come from and how well they are known, in lines."""
+        count, stars = len(self.names), len(self.fit.seen)
+        named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
+        seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
+        origin = "what the pictures reach"
+        if limit_mag > round(self.reach_mag, 2):
+            origin = "deeper than the pictures, for 10 stars in nearly all fields"
+        if is_stated:
+            origin = "as stated"
+        lines = [
+            f"From {self.n_files} pictures or files of centroids, {count} of them identified: "
+            f"{named}.",
+            f"camera.fov_x_deg = {self.camera.fov_x_deg:.4f} +- {self.fov_error_deg:.4f}: of a "
+            "lens without distortion, from the stars of the pictures.",
+            f"selection.faint_limit_mag = {limit_mag:g}: {origin}. Stars of {band} = {seen} are",
+            f"  seen half as often as bright ones (+- {self._reach_error:.2f}, from {self.n_reach} "
+            "stars).",
+            f"self_test.noise_px = {self.noise_px:g} +- "
+            f"{self.fit.noise_px / math.sqrt(2.0 * max(1, 2 * stars - 4)):.2g}: centroids about "
+            f"the fitted lens, on each axis, from {stars} stars.",
+        ]
+        if self.flip is not None:
+            lines.append(f"Read the pictures with {'--flip' if self.flip else '--no-flip'}.")
+        if self.has_distortion:
+            terms = (f"{name} +- {error:.2g}" for name, error in self.fit.errors.items())
+            lines += [f"The lens ({', '.join(terms)}), as a camera file for --camera:"]
+            lines += [f"  {line}" for line in camera_toml(self.lens).splitlines() if line]
+        return lines
+
+    @property
+    def noise_px(self) -> float:
+        """Noise of a centroid as a spec states it."""
+        return min(50.0, round(self.fit.noise_px, 3))
+
+    @property
+    def _reach_error(self) -> float:
+        """Half a magnitude over the root of the stars: counts of stars grow threefold in one."""
+        return 0.5 / math.sqrt(max(1.0, 0.3 * self.n_reach))
+
+
+def first_camera(
+    matcher: Matcher,
+    paths: Sequence[Path],
+    fov_deg: tuple[float, float],
+    size_px: tuple[int, int] | None = None,
+    progress: Progress = no_progress,
+) -> FirstCamera:
+    """Find the camera of pictures or files of centroids; `CalibrationError` if none tells it."""
+    flip: bool | None = None
+    found: list[FrameAnswer] = []
+    why = []
+    for number, path in enumerate(paths, start=1):
+        options = IdentifyOptions(fov_deg=fov_deg, size_px=size_px, flip=flip)
+        answers, frames = identify_either_way(path, matcher, options)
+        for frame in frames:
+            refusal = frame.result.refusal
+            if frame.result.ok:
+                found.append(frame)
+            else:
+                words = frame.result.status if refusal is None else refusal.message
+                why.append(f"{frame.frame.name}: {words}")
+        if any(frame.result.ok for frame in frames):
+            flip = answers.options.flip
+        progress("identify", number, len(paths))
+    if not found:
+        raise CalibrationError(
+            f"none of {len(paths)} pictures is identified with fields of {fov_deg[0]:g} to "
+            f"{fov_deg[1]:g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky alone, "
+            "the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
+            fields=("fov_range", "fov_x_deg"),
+        )
+    return _camera_of(matcher, found, len(paths), flip)
+
+
+def _camera_of(
+    matcher: Matcher, found: list[FrameAnswer], n_files: int, flip: bool | None
+) -> FirstCamera:
+    cameras = [one.result.camera for one in found if one.result.camera is not None]
+    sizes = {(camera.width_px, camera.height_px) for camera in cameras}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
+        raise CalibrationError(f"the pictures have {listed} px; give those of one camera")
+    focal_px = np.array([camera.focal_length_px for camera in cameras])
+    errors = [one.result.focal_length_error_px or 0.0 for one in found]
+    middle = cameras[0].with_focal_length(float(np.median(focal_px)))
+    spread = 1.2533 * float(np.std(focal_px)) / math.sqrt(len(found))
+    of_lens = ERROR_OF_LENS * middle.focal_length_px / math.sqrt(len(found))
+    error = max(spread, min(errors), of_lens)
+    fit, reach_mag, seen = _lens_and_reach(matcher, found, middle)
+    faintest = float(matcher.database.mag.max())
+    return FirstCamera(
+        middle,
+        middle.fov_x_deg * error / middle.focal_length_px,
+        fit,
+        reach_mag,
+        seen,
+        reach_mag > faintest - AT_THE_END_MAG,
+        tuple(one.frame.name for one in found),
+        n_files,
+        flip,
+    )
+
+
+def _lens_and_reach(
+    matcher: Matcher, found: list[FrameAnswer], camera: Camera
+) -> tuple[Fit, float, int]:
+    """Return the lens, the magnitude that the frames reach, and the number of stars seen to it."""
+    size_px, database = (camera.width_px, camera.height_px), matcher.database
+    values = values_of(camera)
+    matrices = np.array([one.result.matrix for one in found])
+    # At first the stars that were identified, then all that are as bright.
+    rows = [np.flatnonzero(one.result.star_index >= 0) for one in found]
+    stars = [one.result.star_index[row] for one, row in zip(found, rows, strict=True)]
+    fit = supported_fit(
+        _seen(found, rows, [database.directions[star] for star in stars], matrices),
+        values, size_px, ROUNDS_PX[0],
+    )  # fmt: skip
+    mag, is_seen = np.empty(0), np.empty(0, dtype=bool)
+    limit_mag = float(max(database.mag[star].max() for star in stars))
+    for reach_px in ROUNDS_PX:
+        rows, there, mags, near = [], [], [], []
+        for one, matrix in zip(found, fit.seen.matrices, strict=True):
+            inside, predicted = _in_frame(database.directions @ matrix.T, fit.values, size_px)
+            offset = one.frame.centroids_px[:, None] - predicted
+            square = np.einsum("nmi,nmi->nm", offset, offset)
+            nearest, least = square.argmin(axis=0), square.min(axis=0)
+            # A star and its centroid are the nearest to each other.
+            has = (square.argmin(axis=1)[nearest] == np.arange(len(inside))) & (
+                least <= reach_px**2
+            )
+            mags.append(database.mag[inside])
+            near.append(has)
+            use = has & (mags[-1] <= limit_mag)
+            rows.append(nearest[use])
+            there.append(database.directions[inside[use]])
+        mag, is_seen = np.concatenate(mags), np.concatenate(near)
+        limit_mag = _reach(mag, is_seen)
+        if min(len(row) for row in rows) < 4:
+            break  # too few to be more than those that were identified
+        fit = supported_fit(
+            _seen(found, rows, there, fit.seen.matrices), fit.values, size_px, reach_px
+        )
+    return fit, limit_mag, int(np.count_nonzero(is_seen & (mag <= limit_mag)))
+
+
+def _seen(
+    found: list[FrameAnswer], rows: list[Rows], directions: list[Array], matrices: Array
+) -> Seen:
+    px = [one.frame.centroids_px[row] for one, row in zip(found, rows, strict=True)]
+    frame = np.repeat(np.arange(len(found)), [len(row) for row in rows])
+    return Seen(frame, np.concatenate(px), np.concatenate(directions), matrices)
+
+
+def _in_frame(body: Array, values: Array, size_px: tuple[int, int]) -> tuple[Rows, Array]:
+    """Return the rows of directions that lie in the frame, and their pixels."""
+    half = 0.5 * math.hypot(*size_px) / values[0]
+    rows = np.flatnonzero(body[:, 2] > 1.0 / math.hypot(1.0, 1.2 * half))
+    px = project(values, body[rows])
+    inside = ((px > 0.0) & (px < size_px)).all(axis=1)
+    return rows[inside], px[inside]
+
+
+def _reach(mag: Array, is_seen: Mask) -> float:
+    """Return the magnitude from which stars are seen half as often as the bright ones.
+
+    Clouds and trees hide stars of all magnitudes. The magnitude is the one up to which the stars
+    seen exceed half of those that would be seen among the bright ones by the most.
+    """
+    order = np.argsort(mag, kind="stable")
+    seen = np.cumsum(is_seen[order])
+    count = np.arange(1, len(seen) + 1)
+    first = min(BRIGHT, len(seen)) - 1
+    usual = float((seen / count)[first:].max())
+    return float(mag[order][int((seen - 0.5 * usual * count).argmax())])

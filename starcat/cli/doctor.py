@@ -1,0 +1,72 @@
+"""The command that reports what starcat finds on this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from starcat.cli.catalogs import source_facts
+from starcat.cli.console import print_facts, show
+from starcat.cli.options import Json
+
+app = typer.Typer()
+
+
+@app.command("doctor")
+def doctor(json: Json = False) -> None:
+    """Report versions, the C library, folders, catalogs, memory and disk, as a bug report needs.
+
+    Example: starcat doctor
+    """
+    facts = _facts()
+    show(json, facts, _print, facts)
+
+
+def _facts() -> dict[str, Any]:
+    from starcat.artifact.manifest import software_versions
+    from starcat.catalog.source_files import cache_folder
+    from starcat.matcher.c_engine import library_version
+    from starcat.pipeline.log import available_memory_bytes
+    from starcat.storage.atomic import state_folder
+
+    cache = cache_folder()
+    held = [path for path in cache.rglob("*") if path.is_file()]
+    variables = ("STARCAT_CATALOGS", "STARCAT_SOURCES", "STARCAT_CACHE")
+    return {
+        "software": software_versions(),
+        "c_library": library_version() or None,
+        "processors": os.cpu_count(),
+        "memory_bytes": available_memory_bytes(),
+        "disk_free_bytes": shutil.disk_usage(Path()).free,
+        "cache": {
+            "folder": str(cache),
+            "files": len(held),
+            "bytes": sum(path.stat().st_size for path in held),
+        },
+        "state_folder": str(state_folder()),
+        "environment": {name: os.environ[name] for name in variables if name in os.environ},
+        "catalogs": {one["name"]: one["found_at"] for one in source_facts()},
+    }
+
+
+def _print(facts: dict[str, Any]) -> None:
+    memory, cache = facts["memory_bytes"], facts["cache"]
+    found = {name: place for name, place in facts["catalogs"].items() if place}
+    rows = {
+        **facts["software"],
+        "C library": facts["c_library"] or "not compiled: the matcher computes with numpy",
+        "processors": facts["processors"],
+        "free memory": "not known" if memory is None else f"{memory / 2**30:.1f} GiB",
+        "free disk, this folder": f"{facts['disk_free_bytes'] / 1e9:,.1f} GB",
+        "download cache": f"{cache['folder']}: {cache['files']:,} files, "
+        f"{cache['bytes'] / 1e6:,.1f} MB",
+        "trusted registries": facts["state_folder"],
+        **{f"${name}": value for name, value in facts["environment"].items()},
+        **{f"catalog {name}": place for name, place in found.items()},
+        "catalogs not found": ", ".join(sorted(set(facts["catalogs"]) - set(found))) or "none",
+    }
+    print_facts("", rows)

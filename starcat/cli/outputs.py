@@ -1,0 +1,56 @@
+"""The one rule of ``-o``, for every command that writes.
+
+A command that makes one file takes the name of a file, and its suffix selects the format. A
+command that makes several files takes a folder. What exists is replaced with ``--replace`` only,
+and this is said before anything is computed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from starcat.errors import OutputError
+
+
+def _no_file(path: Path | None) -> Path | None:
+    if path is not None and path.is_file():
+        raise OutputError(f"{path}: is a file; choose a folder with --output", path=path)
+    return path
+
+
+def _no_folder(path: Path | None) -> Path | None:
+    if path is not None and path.is_dir():
+        raise OutputError(f"{path}: is a folder; choose a file with --output", path=path)
+    return path
+
+
+def to_folder(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes into a folder."""
+    return typer.Option("--output", "-o", metavar="FOLDER", callback=_no_file, help=what)
+
+
+def to_file(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes a file."""
+    return typer.Option("--output", "-o", metavar="FILE", callback=_no_folder, help=what)
+
+
+def to_either(what: str) -> Any:
+    """Return the option ``-o`` of a command that writes a file or a folder, by the format."""
+    return typer.Option("--output", "-o", metavar="FILE|FOLDER", help=what)
+
+
+Replace = Annotated[bool, typer.Option("--replace", help="Replace what has that name.")]
+
+
+def expect_free(*paths: Path | None, replace: bool) -> None:
+    """Refuse outputs that exist, unless they are to be replaced; an empty folder is free."""
+    for path in paths:
+        if path is None or replace or not path.exists():
+            continue
+        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+            raise OutputError(
+                f"{path} already exists; choose another --output, or pass --replace", path=path
+            )

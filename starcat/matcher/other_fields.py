@@ -1,0 +1,156 @@
+"""Why a frame was not identified: it is tried mirrored, and in fields of half to twice the stated.
+
+Nothing found here is an answer. It says what is wrong with the statement about the camera, and it
+has to pass the bound on false matches like an answer, with all searches of the frame counted.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from starcat.geometry.camera import Camera
+from starcat.matcher.centroids import MeasuredFrame, upside_down
+from starcat.matcher.refusal import Known, Reason, Refusal
+from starcat.matcher.result import MatchResult
+
+FOV_ERROR = 0.05
+"""Error of the focal length that is allowed where none is stated. Data sheets are off by so much:
+an IMX219 with 48.8 deg on paper has 50.5."""
+
+WIDE_FOV_ERROR = 0.15
+"""Error of the focal length that is tried first, with the distortion of the stated camera."""
+
+FACTOR = 2.0
+"""Fields from the stated one over this factor to that times it are tried."""
+
+WIDEST_DEG = 120.0
+"""Widest field that is tried; a spec takes no wider one."""
+
+MARGIN = 1.02
+"""Factor by which the focal lengths at both ends are exceeded, so that the ends are found too."""
+
+PARTS = 2
+"""Parts on each side of the first one. An error of the focal length bends the sides of triangles:
+the smaller the part, the fewer triangles are similar by chance."""
+
+TIME_S = 2.0
+"""Seconds of the processor that all this takes at most, however busy the machine is. No search
+begins that would exceed them if it took as long as the longest before."""
+
+SEARCHES = 2
+"""Searches for the answer, where the caller does not count them: as stated, and with an error."""
+
+
+Search = Callable[[MeasuredFrame, float, Camera | None, float], MatchResult]
+"""The answer to a frame with an error of its focal length, with another camera than that of the
+caller unless it is None, and within a time in seconds."""
+
+
+def parts_of_fields(camera: Camera) -> list[tuple[Camera, float]]:
+    """Return cameras and errors of the focal length that cover all fields, the nearest first."""
+    focal_px = camera.focal_length_px
+    wide_deg = min(FACTOR * camera.fov_x_deg, max(WIDEST_DEG, camera.fov_x_deg))
+    flat = (
+        Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg).focal_length_px
+        for fov_deg in (wide_deg, camera.fov_x_deg / FACTOR)
+    )
+    shortest, longest = next(flat) / MARGIN, next(flat) * MARGIN
+    inner = focal_px * (1.0 - WIDE_FOV_ERROR), focal_px / (1.0 - WIDE_FOV_ERROR)
+    parts = [(camera, WIDE_FOV_ERROR)]
+    for low_px, high_px in ((shortest, inner[0]), (inner[1], longest)):
+        if low_px < high_px:
+            for low, high in pairwise(np.geomspace(low_px, high_px, PARTS + 1).tolist()):
+                # The lens of another field has another distortion.
+                middle = Camera(camera.width_px, camera.height_px, math.sqrt(low * high))
+                parts.append((middle, 1.0 - math.sqrt(low / high)))
+    return sorted(parts, key=lambda part: abs(math.log(part[0].focal_length_px / focal_px)))
+
+
+def explained(
+    refused: MatchResult,
+    frame: MeasuredFrame,
+    camera: Camera,
+    search: Search,
+    *,
+    fov_error: float = 0.0,
+    with_fields: bool = True,
+    flip: bool | None = None,
+    limit: float,
+    searches: int = SEARCHES,
+) -> MatchResult:
+    """Return a refused answer with what a second look has found.
+
+    The frame is tried mirrored and, ``with_fields``, in other fields of view, the nearest first,
+    for `TIME_S` in all. The probability that chance agrees in any of K searches is at most the sum
+    of those in each. ``searches`` are those of the frame so far; a finding whose probability times
+    all of them, these included, is above the ``limit`` is not told.
+    """
+    refusal = refused.refusal
+    if refusal is None:
+        return refused
+    parts = parts_of_fields(camera) if with_fields else []
+    count, left = searches + 1 + len(parts), _Time()
+    found = left.of(search, upside_down(frame, camera.height_px), fov_error)
+    if _is_certain(found, limit / count):
+        why = _found(found, "mirrored", count, None, camera)
+        return replace(refused, refusal=replace(why, flip=flip))
+    tried = []
+    for part, error in parts:
+        if left.is_over:
+            break
+        found = left.of(search, frame, error, part)
+        tried += [part.focal_length_px * (1.0 - error), part.focal_length_px / (1.0 - error)]
+        if found.camera is not None and _is_certain(found, limit / count):
+            factor = found.camera.focal_length_px / camera.focal_length_px
+            is_near = abs(factor - 1.0) <= WIDE_FOV_ERROR
+            why = _found(found, "scale" if is_near else "other_field", count, factor - 1.0, camera)
+            return replace(refused, refusal=why)
+    fields = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / focal)) for focal in tried]
+    known: frozenset[Known] = refusal.known | frozenset[Known](("explained",))
+    between = (min(fields), max(fields)) if fields else None
+    return replace(refused, refusal=replace(refusal, known=known, tried_fov_deg=between))
+
+
+class _Time:
+    """What is left of the time of a second look."""
+
+    def __init__(self) -> None:
+        self._end_s, self._longest_s = time.thread_time() + TIME_S, 0.0
+
+    @property
+    def is_over(self) -> bool:
+        return time.thread_time() + self._longest_s > self._end_s
+
+    def of(
+        self, search: Search, frame: MeasuredFrame, error: float, camera: Camera | None = None
+    ) -> MatchResult:
+        before_s = time.thread_time()
+        found = search(frame, error, camera, max(1e-3, self._end_s - before_s))
+        self._longest_s = max(self._longest_s, time.thread_time() - before_s)
+        return found
+
+
+def _is_certain(found: MatchResult, limit: float) -> bool:
+    return found.ok and found.false_match_probability <= limit
+
+
+def _found(
+    found: MatchResult, reason: Reason, searches: int, focal_error: float | None, stated: Camera
+) -> Refusal:
+    own = None if found.database is None else found.database.camera
+    return Refusal(
+        reason,
+        found.n_matched,
+        min(1.0, searches * found.false_match_probability),
+        n_centroids=len(found.star_index) - len(found.dropped),
+        camera=found.camera,
+        focal_error=focal_error,
+        stated_fov_deg=None if focal_error is None else stated.fov_x_deg,
+        is_of_database=stated == own,
+    )

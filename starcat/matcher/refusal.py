@@ -1,0 +1,238 @@
+"""Why a frame was not identified, and what to try: only what would be new to the caller."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Literal
+
+from starcat.geometry.camera import Camera
+from starcat.matcher.chance import MIN_STARS
+
+Reason = Literal[
+    "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "other_field",
+    "mirrored", "time", "steps",
+]  # fmt: skip
+
+Known = Literal["magnitudes", "noise_mag", "noise_px", "dropped", "explained"]
+"""What a hint need not say, or can refer to: the caller has stated it, or it was tried."""
+
+MESSAGES: dict[Reason, str] = {
+    "too_few_stars": f"fewer than {MIN_STARS} centroids of the frame are usable",
+    "no_candidate": "no pattern of the frame is one of the database",
+    "prior": "no attitude as near to the prior as its error says explains the frame",
+    "chance": "no attitude fits better than chance",
+    "share_of_frame": "the best agreement explains too little of the frame",
+    "scale": "the frame has another scale or shape than the camera",
+    "other_field": "the frame fits another field of view",
+    "mirrored": "the frame matches only mirrored: its y counts up",
+    "time": "the time limit ended the search",
+    "steps": "the limit of steps ended the search",
+}
+"""Each reason in words."""
+
+
+@dataclass(frozen=True)
+class Clause:
+    """One thing to try, and when it is of use."""
+
+    text: str
+    unless: Known | None = None
+    only_if: Known | None = None
+
+
+def known_of(
+    has_magnitudes: bool, noise_px: float | None, noise_mag: float | None, has_dropped: bool
+) -> frozenset[Known]:
+    """Return what the caller of a search has given."""
+    stated: dict[Known, bool] = {
+        "magnitudes": has_magnitudes,
+        "noise_px": noise_px is not None,
+        "noise_mag": noise_mag is not None,
+        "dropped": has_dropped,
+    }
+    return frozenset(name for name, is_stated in stated.items() if is_stated)
+
+
+_MAGNITUDES = Clause("give magnitudes", unless="magnitudes")
+_FALSE_STARS = Clause("leave out centroids that are no stars")
+_EXPLAIN = Clause(
+    "have other fields and the mirrored frame tried: explain=True", unless="explained"
+)
+
+CLAUSES: dict[Reason, tuple[Clause, ...]] = {
+    "too_few_stars": (
+        Clause("find more stars, with a longer exposure or a lower threshold"),
+        Clause("look at 'dropped' for those that were not used", only_if="dropped"),
+    ),
+    "no_candidate": (
+        Clause("allow a wider tolerance of centroids (tolerance_px)"),
+        Clause("use a database of fainter stars"),
+        _EXPLAIN,
+    ),
+    "prior": (
+        Clause("state a larger error of the prior (prior_error_deg)"),
+        Clause("identify without a prior"),
+    ),
+    "chance": (
+        _MAGNITUDES,
+        Clause(
+            "state the noise of magnitudes (noise_mag)", unless="noise_mag", only_if="magnitudes"
+        ),
+        Clause(
+            "state the noise of centroids in place of a tolerance (noise_px)", unless="noise_px"
+        ),
+        Clause("find more stars"),
+        _EXPLAIN,
+    ),
+    "share_of_frame": (
+        _FALSE_STARS,
+        Clause("give the camera its distortion"),
+        Clause("use a database that is as deep as the frame"),
+        Clause("ask for a smaller share (min_share)"),
+    ),
+    "scale": (
+        Clause("give the camera its true focal length"),
+        Clause("allow a larger error of it (fov_error)"),
+    ),
+    "other_field": (
+        Clause("state the field that fits (fov_deg)"),
+        Clause("build a database for it"),
+    ),
+    "mirrored": (Clause("turn the frame over (flip)"),),
+    "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
+    "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
+}
+"""What to try, by reason. Parameters of Python and of the service stand in brackets."""
+
+
+def _joined(clauses: list[str]) -> str:
+    *first, last = clauses
+    return f"{', '.join(first)}, or {last}" if first else last
+
+
+HINTS: dict[Reason, str] = {
+    reason: _joined([clause.text for clause in clauses]) for reason, clauses in CLAUSES.items()
+}
+"""All that there is to try, by reason."""
+
+_NAME = r"[a-z_]+(?:=[\d.]+)?"
+_BRACKETS = re.compile(rf"\(({_NAME}(?:, {_NAME})*)\)")
+
+
+def bracketed(hint: str) -> list[str]:
+    """Return the parameters that a hint names.
+
+    Examples
+    --------
+    >>> bracketed(HINTS["chance"]), bracketed("state 15.4 deg (fov_deg=15.4)")
+    (['noise_mag', 'noise_px'], ['fov_deg=15.4'])
+    """
+    return [name for names in _BRACKETS.findall(hint) for name in names.split(", ")]
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a frame was not identified.
+
+    Attributes
+    ----------
+    reason : str
+        ``too_few_stars``, ``no_candidate`` (no pattern of the frame is in the database),
+        ``prior`` (no attitude near the prior explains the frame), ``chance``,
+        ``share_of_frame`` and ``scale`` (why the best agreement was withheld),
+        ``scale`` and ``other_field`` (another field explains it, by at most 15 % and by more),
+        ``mirrored`` (it would be found upside down), or ``time`` and ``steps`` (the limit that
+        ended the search).
+    n_matched : int
+        Centroids with a star in the best agreement; 0 where there was none.
+    false_match_probability : float
+        Bound on the probability that chance agrees as well as it; 1 where there was none.
+    share : float
+        Share of the frame that it explains, by weight; 0 where there was none.
+    n_centroids : int
+        Usable centroids of the frame; 0 where that is not known.
+    camera : Camera or None
+        The camera that explains the frame in another field of view or mirrored, if one does.
+    focal_error : float or None
+        By how much its focal length is longer than stated, relative; None if it is mirrored.
+    flip : bool or None
+        Whether the caller stated that the frame is turned over (``flip``); None without a
+        statement. It changes the words about a mirrored frame.
+    stated_fov_deg : float or None
+        Field across the width that was stated, where ``focal_error`` is known.
+    is_of_database : bool
+        Whether that is the field of the database's own camera.
+    tried_fov_deg : (float, float) or None
+        Narrowest and widest field that was searched, if other fields were.
+    known : frozenset of str
+        What the caller has given, and what was tried: advice of which the hint has none.
+    """
+
+    reason: Reason
+    n_matched: int = 0
+    false_match_probability: float = 1.0
+    share: float = 0.0
+    n_centroids: int = 0
+    camera: Camera | None = None
+    focal_error: float | None = None
+    flip: bool | None = None
+    stated_fov_deg: float | None = None
+    is_of_database: bool = False
+    tried_fov_deg: tuple[float, float] | None = None
+    known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
+
+    @property
+    def fits_fov_deg(self) -> float | None:
+        """Field across the width that explains the frame, degrees; None if none is known."""
+        if self.camera is None or self.focal_error is None:
+            return None
+        return self.camera.fov_x_deg
+
+    @property
+    def message(self) -> str:
+        """The reason as a sentence begins, with the numbers of the best agreement."""
+        text = MESSAGES[self.reason]
+        if self.reason == "mirrored" and self.flip:
+            text = "the frame matches only mirrored: it was turned over, and was upright before"
+        if self.fits_fov_deg is not None:
+            text = f"the frame fits a field of {self.fits_fov_deg:.4g} deg"
+            if self.stated_fov_deg is not None:
+                stated = "the database is for" if self.is_of_database else "the camera has"
+                text += f"; {stated} {self.stated_fov_deg:.4g} deg"
+        if self.n_matched == 0:
+            return text
+        of_all = f" of {self.n_centroids}" if self.n_centroids else ""
+        best = f"best: {self.n_matched}{of_all} centroids"
+        if self.false_match_probability < 1.0:
+            best += f", chance {self.false_match_probability:.1e}"
+            best += f", {self.share:.0%} of the frame" if self.share else ""
+        return f"{text} ({best})"
+
+    @property
+    def hint(self) -> str:
+        """What to try."""
+        if self.reason == "mirrored" and self.flip is not None:
+            return "leave this option out (flip)"
+        if self.fits_fov_deg is not None:
+            fits = f"state a field of {self.fits_fov_deg:.4g} deg (fov_deg={self.fits_fov_deg:.4g})"
+            if self.reason == "scale":
+                return f"{fits}, or allow a larger error (fov_error)"
+            return f"{fits}, or build a database for it"
+        text = _joined([clause.text for clause in CLAUSES[self.reason] if self._is_of_use(clause)])
+        if self.tried_fov_deg is not None:
+            low, high = self.tried_fov_deg
+            text += f"; fields of {low:.3g} to {high:.3g} deg and the mirrored frame were tried"
+        return text
+
+    def _is_of_use(self, clause: Clause) -> bool:
+        is_needed = clause.only_if is None or clause.only_if in self.known
+        return is_needed and clause.unless not in self.known
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Parameters that the hint names."""
+        return tuple(bracketed(self.hint))
+
+    def __repr__(self) -> str:
+        return f"<Refusal {self.reason}: {self.message}>"

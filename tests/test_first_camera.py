@@ -1,0 +1,145 @@
+"""A camera of which nothing is known: from pictures or centroids to a database."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+from starcat.calibration.first_camera import _reach, first_camera
+from starcat.errors import CalibrationError
+from starcat.geometry.camera import Camera
+from starcat.images.render import write_simulated
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+from starcat.simulation.simulate import Noise, simulate_frames
+
+TRUE = Camera(1024, 768, fov_x_deg=31.7)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def blind(cache, monkeypatch):
+    """The database of all fields, built by the first test."""
+    monkeypatch.setenv("STARCAT_CACHE", str(cache))
+    return Matcher.open(blind_database())
+
+
+@pytest.fixture
+def frames(blind):
+    sky, noise = blind.database, Noise(0.2, noise_mag=0.1, limit_mag=4.8)
+    return list(simulate_frames(sky.directions, TRUE, 3, noise, 11, mag=sky.mag))
+
+
+def pictures_of(frames, folder):
+    paths = [folder / f"photo{number}.png" for number in range(len(frames))]
+    for number, (frame, path) in enumerate(zip(frames, paths, strict=True)):
+        write_simulated(path, frame, TRUE, number)
+    return paths
+
+
+@pytest.mark.timeout(300)
+def test_pictures_become_a_database_that_identifies_the_next(
+    starcat, blind, frames, cache, tmp_path, monkeypatch
+):
+    made = list(cache.glob("blind/*/blind-1.0.0/database.h5"))
+    first, second, third = pictures_of(frames, tmp_path)
+    monkeypatch.setenv("STARCAT_CACHE", str(cache))  # the command has one of its own otherwise
+    spec = tmp_path / "mycam.toml"
+    run = starcat(["init", spec, "--from", first, second])
+    assert run.code == 0, run.err
+    assert list(cache.glob("blind/*/*/database.h5")) == made  # kept
+    text = spec.read_text()
+    given = tomllib.loads(text)
+    assert (given["camera"]["width_px"], given["camera"]["height_px"]) == (1024, 768)
+    assert given["camera"]["fov_x_deg"] == pytest.approx(TRUE.fov_x_deg, rel=0.003)
+    assert 0.02 < given["self_test"]["noise_px"] < 0.6
+    for key in ("camera.fov_x_deg", "selection.faint_limit_mag", "self_test.noise_px"):
+        assert f"# {key} = " in text
+    assert "2 of them identified: photo0, photo1." in text
+    assert starcat(["build", spec, "-o", tmp_path]).code == 0
+    [found] = json.loads(starcat(["identify", tmp_path / "mycam-1.0.0", third, "--json"]).out)
+    assert found["status"] == "identified"
+    q = np.array(found["q_body_from_icrs"])
+    boresight = frames[2].matrix[2]
+    ra, dec = np.radians([found["boresight_ra_deg"], found["boresight_dec_deg"]])
+    seen = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+    assert np.degrees(np.linalg.norm(boresight - seen)) < 0.1
+    assert np.linalg.norm(q) == pytest.approx(1.0)
+
+
+@pytest.mark.timeout(120)
+def test_one_file_of_centroids_is_enough(blind, frames, tmp_path):
+    path = tmp_path / "frame.csv"
+    rows = np.column_stack([frames[0].centroids_px, frames[0].mag])
+    np.savetxt(path, rows, delimiter=",", header="x_px,y_px,mag", comments="")
+    found = first_camera(blind, [path], FIELDS_DEG, (1024, 768))
+    assert abs(found.camera.fov_x_deg - TRUE.fov_x_deg) < found.fov_error_deg
+    assert found.reach_mag == pytest.approx(4.8, abs=0.3)
+    assert found.noise_px == pytest.approx(0.2, abs=0.1)
+    assert not found.has_distortion
+
+
+@pytest.mark.timeout(120)
+def test_distortion_is_found_where_the_stars_support_it(blind, frames, tmp_path):
+    paths = []
+    for number, frame in enumerate(frames):
+        away = frame.centroids_px - [512.0, 384.0]
+        square = (away**2).sum(axis=1) / TRUE.focal_length_px**2
+        rows = np.column_stack([away * (1.0 + 0.05 * square)[:, None] + [512.0, 384.0], frame.mag])
+        paths.append(tmp_path / f"bent{number}.csv")
+        np.savetxt(paths[-1], rows, delimiter=",", header="x_px,y_px,mag", comments="")
+    found = first_camera(blind, paths, FIELDS_DEG, (1024, 768))
+    assert found.lens.distortion.k1 == pytest.approx(0.05, abs=0.01)
+    assert any("k1 = 0.0" in line for line in found.remarks(5.0, "G", is_stated=True))
+    assert found.fit.noise_px < 0.3
+
+
+@pytest.mark.timeout(120)
+def test_centroids_of_no_sky_tell_no_camera(blind, tmp_path):
+    path = tmp_path / "noise.csv"
+    rows = np.random.default_rng(3).random((12, 3)) * [1024.0, 768.0, 5.0]
+    np.savetxt(path, rows, delimiter=",", header="x_px,y_px,mag", comments="")
+    with pytest.raises(CalibrationError, match=r"none of 1 pictures .* 20 to 30 deg \(noise"):
+        first_camera(blind, [path], (20.0, 30.0), (1024, 768))
+
+
+def test_the_reach_disregards_what_hides_bright_stars_too():
+    mag = np.linspace(0.0, 6.0, 601)
+    is_hidden = np.arange(601) % 5 < 2
+    assert _reach(mag, mag < 4.0) == pytest.approx(4.0, abs=0.02)
+    assert _reach(mag, (mag < 4.0) & ~is_hidden) == pytest.approx(4.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--from", "a.png", "--fov-x-deg", "12"], "--from finds the field of view"),
+        (["a.png", "--size", "10x10"], "'a.png' is not an option; pictures of the camera go"),
+        (["--fov-x-deg", "12"], "give the size of the detector, --size 1280x960, or pictures"),
+    ],
+)
+def test_options_that_do_not_go_together(starcat, tmp_path, arguments, words):
+    run = starcat(["init", tmp_path / "x.toml", *arguments])
+    assert run.code == 2
+    assert words in " ".join(run.err.split())
+
+
+@pytest.mark.timeout(300)
+def test_photographs_of_a_real_camera(starcat, nights, blind, cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("STARCAT_CACHE", str(cache))
+    spec = tmp_path / "imx219.toml"
+    chosen = [nights / "spel" / f"img_{number}.jpg" for number in (7, 23, 40)]
+    assert starcat(["init", spec, "--from", *chosen]).code == 0
+    assert tomllib.loads(spec.read_text())["camera"]["fov_x_deg"] == pytest.approx(50.5, abs=0.3)
+    assert starcat(["build", spec, "-o", tmp_path]).code == 0
+    others = [nights / "spel" / f"img_{number}.jpg" for number in (1, 11, 26, 31, 50)]
+    run = starcat(["identify", tmp_path / "imx219-1.0.0", *others, "--json"])
+    found = [json.loads(line) for line in run.out.splitlines()]
+    assert [one["status"] for one in found] == 5 * ["identified"]

@@ -1,0 +1,131 @@
+"""A new release of a catalog: other numbers, another epoch, and the same stars."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from starcat.artifact.diff import NOT_READ, Difference, diff_artifacts
+from starcat.artifact.reader import DatabaseFolder, open_artifact
+from starcat.catalog.source import data_source
+from starcat.pipeline.build import build_database
+from starcat.specs.reading import spec_from_dict
+
+COUNT = 700
+GONE, FADED, VARIABLE, NEW = 10, 20, 30, COUNT
+
+
+def gaia_source(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """Return rows with the columns that gaia_source has in DR3: stars with large motions."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=(COUNT + 1, 3))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    bands = {
+        f"phot_{band}_mean_mag": rng.uniform(2.0, 5.8, COUNT + 1) for band in ("g", "bp", "rp")
+    }
+    errors = {
+        f"{name}_error": np.full(COUNT + 1, 0.02)
+        for name in ("ra", "dec", "pmra", "pmdec", "parallax")
+    }
+    return {
+        "source_id": np.arange(COUNT + 1) * 4096 + 1,
+        "ra": np.degrees(np.arctan2(u[:, 1], u[:, 0])) % 360.0,
+        "dec": np.degrees(np.arcsin(u[:, 2])),
+        "pmra": rng.normal(0.0, 800.0, COUNT + 1),
+        "pmdec": rng.normal(0.0, 800.0, COUNT + 1),
+        "parallax": np.full(COUNT + 1, 20.0),
+        "radial_velocity": np.zeros(COUNT + 1),
+        "ruwe": np.ones(COUNT + 1),
+        "non_single_star": np.zeros(COUNT + 1, dtype=np.int64),
+        "phot_variable_flag": np.full(COUNT + 1, "NOT_AVAILABLE", dtype=object),
+        **{
+            f"phot_{band}_mean_flux_over_error": np.full(COUNT + 1, 500.0)
+            for band in ("g", "bp", "rp")
+        },
+        **bands,
+        **errors,
+    } | changes
+
+
+def later_release(old: dict[str, np.ndarray], years: float = 1.0) -> dict[str, np.ndarray]:
+    """Return the same stars with other numbers, in another order, at a later epoch."""
+    moved = {
+        "ra": (old["ra"] + years * old["pmra"] / 3.6e6 / np.cos(np.radians(old["dec"]))) % 360.0,
+        "dec": old["dec"] + years * old["pmdec"] / 3.6e6,
+        "source_id": (old["source_id"] // 4096) * 8192 + 77,
+        "ref_epoch": np.full(COUNT + 1, 2016.0 + years),
+        "phot_g_mean_mag": old["phot_g_mean_mag"] + 0.003,
+    }
+    new = {**old, **moved}
+    new["phot_g_mean_mag"][FADED] = 9.0
+    new["phot_variable_flag"] = old["phot_variable_flag"].copy()
+    new["phot_variable_flag"][VARIABLE] = "VARIABLE"
+    del new["non_single_star"]
+    return new
+
+
+def built(folder: Path, small_spec: str, source: str, rows: dict[str, Any]) -> DatabaseFolder:
+    path = folder / f"{source}.parquet"
+    pq.write_table(pa.table({name: pa.array(list(values)) for name, values in rows.items()}), path)
+    content = tomllib.loads(small_spec)
+    content |= {
+        "epoch_jyear": 2017.0,
+        "catalog": {"source": source, "band": "G"},
+        "name": source[:8].replace("_", "-"),
+    }
+    content["selection"]["variables"] = {"flags": "strict"}
+    spec = spec_from_dict(content, "small.toml")
+    return open_artifact(build_database(spec, {source: [path]}, folder / "dist").folder)
+
+
+@pytest.fixture(scope="module")
+def releases(tmp_path_factory, small_spec) -> tuple[DatabaseFolder, DatabaseFolder]:
+    folder, old = tmp_path_factory.mktemp("releases"), gaia_source()
+    keep_old, keep_new = np.arange(COUNT + 1) != NEW, np.arange(COUNT + 1) != GONE
+    new = later_release(old)
+    order = np.random.default_rng(1).permutation(np.flatnonzero(keep_new))
+    return (
+        built(folder, small_spec, "gaia_dr3_hats", {k: v[keep_old] for k, v in old.items()}),
+        built(folder, small_spec, "gaia_dr4_hats", {k: v[order] for k, v in new.items()}),
+    )
+
+
+def by_id(stars: Any) -> dict[int, str]:
+    return {one.star_id: one.reason for one in stars}
+
+
+def test_renumbered_stars_that_have_moved_are_paired(releases):
+    found: Difference = diff_artifacts(*releases)
+    n_old, n_new = (len(side.table("stars")) for side in releases)
+    assert found.paired_by_number == 0
+    assert found.paired_by_position == n_old - 3 == n_new - 1 > 500
+    assert by_id(found.went) == {
+        GONE * 4096 + 1: NOT_READ,
+        FADED * 4096 + 1: "too_faint",
+        VARIABLE * 4096 + 1: "flagged_variable",
+    }
+    assert by_id(found.came) == {NEW * 8192 + 77: NOT_READ}
+    # Both databases are for 2017.0: motions have brought the stars of DR3 to those of DR4.
+    assert max(one.moved_arcsec for one in found.moved) < 0.01
+    assert {round(one.mag_b - one.mag_a, 4) for one in found.moved} == {0.003}
+
+
+def test_the_command_prints_how_stars_were_paired(releases, starcat):
+    ran = starcat(["diff", *(side.folder for side in releases)])
+    count = len(releases[1].table("stars")) - 1
+    assert f"position, motion and magnitude    {count}" in ran.out
+    assert "number                              0" in ran.out
+
+
+def test_the_map_of_dr4_says_that_it_is_not_tested():
+    source = data_source("gaia_dr4_hats")
+    assert "never tested on real data" in source.title
+    assert source.table is not None
+    assert source.table.remote is not None
+    assert "never tried" in source.table.remote.checked

@@ -1,0 +1,139 @@
+"""Frames of another lens than the stated one: the field that explains them, and what to try."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher import other_fields
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.other_fields import SEARCHES, parts_of_fields
+from starcat.matcher.refusal import HINTS, Refusal, known_of
+from starcat.simulation.simulate import Noise, simulate_frames
+
+OWN = Camera(1024, 1024, fov_x_deg=12.0)
+NOISE = Noise(0.5, noise_mag=0.2, false_stars=2)
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions):
+    return sky_of(random_directions(6700, 3), OWN, boresights=10_000)
+
+
+def frame_of(sky, fov_deg, seed):
+    camera = Camera(1024, 1024, fov_x_deg=fov_deg)
+    return next(simulate_frames(sky.directions, camera, 1, NOISE, seed, mag=sky.mag))
+
+
+@pytest.mark.parametrize(
+    ("fov_deg", "engine"),
+    [*((fov_deg, "auto") for fov_deg in (7.5, 9.0, 13.0, 16.0, 23.5)), (8.0, "numpy")],
+)
+def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
+    matcher, frame = Matcher(sky, engine=engine), frame_of(sky, fov_deg, 5)
+    given = {"magnitudes": frame.mag}
+    assert matcher.identify(frame.centroids_px, **given).fits_fov_deg is None
+    found = matcher.identify(frame.centroids_px, **given, explain=True)
+    assert (found.status, found.camera) == ("no_match", None)
+    assert found.refusal.reason == ("scale" if fov_deg == 13.0 else "other_field")
+    assert found.fits_fov_deg == pytest.approx(fov_deg, rel=0.005)
+    assert found.refusal.message.startswith(
+        f"the frame fits a field of {found.fits_fov_deg:.4g} deg; the database is for 12 deg"
+    )
+    stated = float(f"{found.fits_fov_deg:.4g}")
+    assert f"(fov_deg={stated:g})" in found.refusal.hint
+    assert matcher.identify(frame.centroids_px, **given, fov_deg=stated, fov_error=0.01).ok
+
+
+def test_every_field_from_half_to_twice_is_searched_once():
+    for camera in (OWN, Camera(640, 480, fov_x_deg=70.0), Camera(100, 100, fov_x_deg=2.0)):
+        parts = parts_of_fields(camera)
+        assert parts[0] == (camera, other_fields.WIDE_FOV_ERROR)
+        ends = sorted((c.focal_length_px * (1 - e), c.focal_length_px / (1 - e)) for c, e in parts)
+        np.testing.assert_allclose([low for low, _ in ends[1:]], [high for _, high in ends[:-1]])
+        reach = [
+            2 * math.degrees(math.atan(0.5 * camera.width_px / f)) for f in sorted(sum(ends, ()))
+        ]
+        assert reach[0] > min(2 * camera.fov_x_deg, 120.0)
+        assert reach[-1] < 0.5 * camera.fov_x_deg
+
+
+def test_a_finding_passes_the_bound_with_all_searches(sky):
+    frame = frame_of(sky, 8.0, 5)
+    given = {"magnitudes": frame.mag, "explain": True}
+    told = Matcher(sky).identify(frame.centroids_px, **given).refusal
+    count = SEARCHES + 1 + len(parts_of_fields(OWN))
+    chance = told.false_match_probability
+    least = Matcher(sky, max_false_match_probability=1.01 * chance)
+    assert least.identify(frame.centroids_px, **given).fits_fov_deg is not None
+    # The search itself would accept this, as one of its own.
+    strict = Matcher(sky, max_false_match_probability=1.01 * chance / count)
+    found = strict.identify(frame.centroids_px, **given)
+    assert found.fits_fov_deg is None
+    assert "fields of 5.88 to 24.5 deg and the mirrored frame were tried" in found.refusal.hint
+
+
+def test_a_frame_without_a_field_takes_two_seconds_at_most(sky, monkeypatch):
+    px = np.random.default_rng(4).random((150, 2)) * 1024.0
+    clock = iter(np.arange(0.0, 100.0, 0.45).tolist())
+    monkeypatch.setattr(other_fields.time, "thread_time", lambda: next(clock))
+    found = Matcher(sky).identify(px, explain=True)
+    low, high = found.refusal.tried_fov_deg
+    assert 5.88 < low < 12.0 < high < 24.4
+
+
+def test_a_mirrored_frame_is_told_in_python_too(sky):
+    frame = frame_of(sky, 12.0, 5)
+    px = frame.centroids_px * [1.0, -1.0] + [0.0, 1024.0]
+    found = Matcher(sky).identify(px, magnitudes=frame.mag, explain=True)
+    assert (found.refusal.reason, found.fits_fov_deg) == ("mirrored", None)
+
+
+def test_advice_is_only_what_is_new_to_the_caller():
+    nothing = Refusal("chance")
+    assert nothing.hint.startswith("give magnitudes, state the noise of centroids")
+    assert "explain" in nothing.hint
+    given = known_of(True, 0.3, None, has_dropped=False)
+    told = Refusal("chance", known=given | {"explained"}, tried_fov_deg=(6.0, 24.0)).hint
+    assert told == (
+        "state the noise of magnitudes (noise_mag), or find more stars; fields of 6 to 24 deg and "
+        "the mirrored frame were tried"
+    )
+    assert "dropped" in HINTS["too_few_stars"]
+    assert "dropped" not in Refusal("too_few_stars").hint
+    assert "dropped" in Refusal("too_few_stars", known=known_of(True, None, None, True)).hint
+
+
+def test_the_command_states_the_field_and_takes_it(starcat, small_artifact, tmp_path):
+    database = Matcher.open(small_artifact).database
+    own = database.camera
+    camera = Camera(own.width_px, own.height_px, fov_x_deg=1.4 * own.fov_x_deg)
+    frame = next(simulate_frames(database.directions, camera, 1, NOISE, 3, mag=database.mag))
+    path = tmp_path / "frame.csv"
+    rows = np.column_stack([frame.centroids_px, frame.mag])
+    np.savetxt(path, rows, delimiter=",", header="x_px,y_px,mag", comments="")
+    [found] = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    assert found["fits_fov_deg"] == pytest.approx(camera.fov_x_deg, rel=0.01)
+    printed = " ".join(starcat(["identify", small_artifact, path]).out.split())
+    option = f"--fov {found['fits_fov_deg']:.4g}"
+    assert f"({option}), or build a database for it" in printed
+    assert "magnitudes" not in printed
+    run = starcat(["identify", small_artifact, path, *option.split(), "--json"])
+    assert json.loads(run.out)[0]["status"] == "identified"
+
+
+def test_a_field_is_a_number_of_degrees(sky, starcat, small_artifact, tmp_path):
+    with pytest.raises(ConfigError, match="fov_deg is 'wide'; expected a finite number"):
+        Matcher(sky).identify(np.ones((5, 2)), fov_deg="wide")
+    frame = tmp_path / "frame.csv"
+    frame.write_text("x_px,y_px\n1,2\n")
+    run = starcat(["identify", small_artifact, frame, "--fov", "200"])
+    assert run.code == 2
+    assert "--fov is 200; expected a field of view between 0 and 180 deg" in " ".join(
+        run.err.split()
+    )
