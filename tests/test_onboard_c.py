@@ -23,6 +23,7 @@ from starcat.simulation.simulate import Noise, simulate_frames
 
 ONBOARD = Path(__file__).parents[1] / "onboard"
 README = (ONBOARD / "README.md").read_text(encoding="utf-8")
+PAGE = (ONBOARD.parent / "docs" / "onboard.md").read_text(encoding="utf-8")
 LIBM = {"sqrt", "sin", "cos", "atan2", "log"}
 COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
 """What compilers call by themselves."""
@@ -154,8 +155,8 @@ int main(int argc, char **argv) {
 """
 
 
-def test_the_code_of_the_readme_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
-    example, *others = re.findall(r"```c\n(.*?)```", README, re.DOTALL)
+def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
+    example, *others = re.findall(r"```c\n(.*?)```", PAGE, re.DOTALL)
     strict = [compiler(), "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{tmp_path}"]
     strict.append(f"-I{folder / 'include'}")
     (tmp_path / "example.c").write_text(example)
