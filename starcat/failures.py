@@ -187,7 +187,8 @@ def expected_words(error: Mapping[str, Any]) -> str:
     if kind == "string_pattern_mismatch":
         from starcat.sections import PATTERN_WORDS
 
-        return f"expected {PATTERN_WORDS.get(context['pattern'], 'other characters')}"
+        words: str = PATTERN_WORDS.get(context["pattern"], "other characters")
+        return f"expected {words}"
     if kind in _EXPECTED:
         return f"expected {_EXPECTED[kind].format(**context)}".removesuffix(".0")
     return _LIBRARY_WORDS.sub("expected ", str(error["msg"]).removeprefix("Value error, "))

@@ -30,7 +30,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def broken(*_: object, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("starcat.cli.catalogs._source_facts", broken)
+        monkeypatch.setattr("starcat.cli.catalogs.source_facts", broken)
 
     return set_up
 
@@ -128,7 +128,7 @@ def test_a_recursion_without_end_is_a_defect(starcat, monkeypatch):
     def deeper(**given: Any) -> None:
         deeper(**given)
 
-    monkeypatch.setattr("starcat.cli.catalogs._source_facts", deeper)
+    monkeypatch.setattr("starcat.cli.catalogs.source_facts", deeper)
     run = starcat(["sources"])
     assert run.code == 70
     assert "RecursionError" in run.err

@@ -90,7 +90,7 @@ def test_a_frame_without_a_field_takes_two_seconds_at_most(sky, monkeypatch):
 def test_a_mirrored_frame_is_told_in_python_too(sky):
     frame = frame_of(sky, 12.0, 5)
     px = frame.centroids_px * [1.0, -1.0] + [0.0, 1024.0]
-    found = Matcher(sky).identify(px, magnitudes=frame.mag, explain=True)
+    found = Matcher(sky).identify(px, mag=frame.mag, explain=True)
     assert (found.refusal.reason, found.fits_fov_deg) == ("mirrored", None)
 
 

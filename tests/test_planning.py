@@ -83,7 +83,7 @@ def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_a
         turns = []
         for _ in range(20):
             frame = simulate_frame(sky, stars.camera, matrix, noise, generator)
-            answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            answer = matcher.identify(frame.centroids_px, mag=frame.mag)
             if answer.ok:
                 d = answer.matrix @ matrix.T
                 turns.append([d[1, 2] - d[2, 1], d[2, 0] - d[0, 2], d[0, 1] - d[1, 0]])

@@ -247,6 +247,15 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
+/* Whether a star within reach of the frame is that of a centroid. */
+static int has_centroid(const starcat_call *call, uint32_t star) {
+  int found = 0;
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    found |= call->work->match[i] == (int16_t)star;
+  }
+  return found;
+}
+
 /* Whether centroids without a star are close to stars without a centroid: more of them than half of
  * the matched ones, and twice what chance brings there. Then the frame has another shape than the
  * camera: stars match in a part of it, and beside that part they miss. */
@@ -256,9 +265,9 @@ static int has_near_misses(const starcat_call *call, uint32_t matched, real reac
   uint8_t is_near[STARCAT_MAX_CENTROIDS] = {0};
   uint32_t pairs = 0, stars = 0, centroids = 0;
   for (uint32_t k = 0; k < call->own->n_within; k++) {
-    const uint32_t owner = starcat_limit_place(w->nearest[k], STARCAT_MAX_CENTROIDS);
+    const uint32_t count = has_centroid(call, k) != 0 ? 0u : call->own->count;
     int is_near_one = 0;
-    for (uint32_t i = 0; (i < call->own->count) && (w->match[owner] != (int16_t)k); i++) {
+    for (uint32_t i = 0; i < count; i++) {
       if ((w->match[i] < 0) &&
           starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
         const real dx = w->x[i] - w->x_of[k], dy = w->y[i] - w->y_of[k];

@@ -36,7 +36,7 @@ from starcat.onboard.patching import (
     sign_image,
     signature_problems,
 )
-from starcat.onboard.profiles import method_of, profile_named
+from starcat.onboard.profiles import method_or_default, profile_named
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
@@ -128,7 +128,7 @@ def export_image(
     `camera`, a camera file, a header with this camera for the library is beside it.
     """
     kept = profile_named("full" if profile is None else profile)
-    method = method_of("full" if profile is None else profile, method)
+    method = method_or_default("full" if profile is None else profile, method)
     check_method(method)
     keys = [read_private(Path(path)) for path in sign]
     order = next((known for known in BYTE_ORDERS if known == endian), None)

@@ -307,7 +307,7 @@ class Search:
         if code != _IDENTIFIED:
             why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
             noises = self._settings.noise_px, self._settings.noise_mag
-            known = known_of(frame.magnitudes is not None, *noises, n_usable < count)
+            known = known_of(frame.mag is not None, *noises, n_usable < count)
             why = replace(why, known=known)
             content = {**vars(no_match(count, refusal=why))}
         else:

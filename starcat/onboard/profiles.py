@@ -59,7 +59,7 @@ def profile_named(name: str) -> Profile:
     return PROFILES[name]
 
 
-def method_of(profile: str, method: str | None) -> str:
+def method_or_default(profile: str, method: str | None) -> str:
     """Return the method of an image: the given one, or else the profile's default."""
     methods = profile_named(profile).methods
     if method is None:

@@ -42,7 +42,7 @@ AHEAD_OF_UTC_S = {"UTC": 0.0, "GPS": 18.0, "TAI": 37.0, "TT": 69.184, "TDB": 69.
 
 
 @dataclass(frozen=True, eq=False)
-class Attitudes:
+class PlannedAttitudes:
     """Attitudes in the order of their table."""
 
     matrices: Array  # camera from ICRS, shape (K, 3, 3)
@@ -89,7 +89,7 @@ class Orbit:
         ]
 
 
-def attitudes_of(given: Any, alignment: Any = None) -> Attitudes:
+def attitudes_of(given: Any, alignment: Any = None) -> PlannedAttitudes:
     """Return the attitudes of a file, a table or quaternions, shape (K, 4).
 
     ``alignment`` is the quaternion that turns the frame of the attitudes into the camera's.
@@ -123,7 +123,7 @@ def attitudes_of(given: Any, alignment: Any = None) -> Attitudes:
 
 def _aligned(
     matrices: list[Array], columns: Mapping[str, Any], name: str, alignment: Any
-) -> Attitudes:
+) -> PlannedAttitudes:
     _check_rows(name, len(matrices))
     turned = np.array(matrices)
     if alignment is not None:
@@ -133,7 +133,7 @@ def _aligned(
             raise ConfigError(text, key="alignment", fields=("alignment",))
         turned = matrix_from_quaternion(q) @ turned
     times = _times(name, columns["time"]) if "time" in columns else None
-    return Attitudes(turned, times)
+    return PlannedAttitudes(turned, times)
 
 
 def orbit_of(given: Any) -> Orbit:

@@ -17,7 +17,7 @@ from starcat.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageOfLimits:
     """The limits of one stage; ends are included."""
 
     min_detection: float  # probability to be detected
@@ -29,10 +29,10 @@ class Stage:
 
 
 STAGES = (
-    Stage(0.99, 0.02, 0.05, 0, 20.0, 0.10),
-    Stage(0.95, 0.05, 0.10, 0, 10.0, 0.05),
-    Stage(0.80, 0.20, 0.25, 2, 5.0, 0.02),
-    Stage(0.50, 0.50, 1.00, np.inf, 0.0, 0.0),
+    StageOfLimits(0.99, 0.02, 0.05, 0, 20.0, 0.10),
+    StageOfLimits(0.95, 0.05, 0.10, 0, 10.0, 0.05),
+    StageOfLimits(0.80, 0.20, 0.25, 2, 5.0, 0.02),
+    StageOfLimits(0.50, 0.50, 1.00, np.inf, 0.0, 0.0),
 )
 
 
@@ -40,7 +40,7 @@ STAGES = (
 class Choice:
     """The stars that are taken, with the stage of each, and the others, with the reason of each."""
 
-    stages: tuple[Stage, ...]
+    stages: tuple[StageOfLimits, ...]
     taken: tuple[Mapping[str, Any], ...]  # each with ``stage``, from 1
     left: tuple[Mapping[str, Any], ...]  # each with ``reason``
 
@@ -53,8 +53,11 @@ class Choice:
         return {"stages": stages, "taken": list(self.taken), "left": list(self.left)}
 
 
-def choose(
-    stars: Sequence[Mapping[str, Any]], camera: Camera, count: int, stages: Sequence[Stage] = STAGES
+def choose_best(
+    stars: Sequence[Mapping[str, Any]],
+    camera: Camera,
+    count: int,
+    stages: Sequence[StageOfLimits] = STAGES,
 ) -> Choice:
     """Choose guide stars of one attitude.
 
@@ -65,7 +68,7 @@ def choose(
     camera : Camera
     count : int
         Number of stars to take; fewer are taken if not as many meet the limits.
-    stages : sequence of Stage
+    stages : sequence of StageOfLimits
         Limits, the strictest first.
 
     Returns
@@ -97,7 +100,10 @@ def choose(
 
 
 def broken_limit(
-    star: Mapping[str, Any], stage: Stage, taken: Sequence[Mapping[str, Any]], camera: Camera
+    star: Mapping[str, Any],
+    stage: StageOfLimits,
+    taken: Sequence[Mapping[str, Any]],
+    camera: Camera,
 ) -> str:
     """Return which limit of a stage a star does not meet, with its value; empty if it meets all."""
     x, y = star["x_px"], star["y_px"]

@@ -23,8 +23,8 @@ from starcat.matcher.database import Database, open_database
 from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, in_range
 from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import acquisition_probability, expected_errors_arcsec
-from starcat.planning.attitudes import Attitudes, Orbit, attitudes_of, orbit_of
-from starcat.planning.choice import STAGES, Choice, Stage, choose
+from starcat.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
+from starcat.planning.choice import STAGES, Choice, StageOfLimits, choose_best
 from starcat.sky.bodies import RADII_KM, bodies_seen
 from starcat.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.sky.observer import Observer, aberrated
@@ -140,7 +140,7 @@ class Plan:
     database: Database
     camera: Camera
     expected: Expected
-    attitudes: Attitudes
+    attitudes: PlannedAttitudes
     error_arcsec: Array
     acquisition: Array
     stars_expected: Array
@@ -258,12 +258,12 @@ class Plan:
             "attitudes": [{**self.attitude(row), "stars": self.stars_of(row)} for row in rows],
         }
 
-    def best(self, count: int, row: int = 0, stages: Sequence[Stage] = STAGES) -> Choice:
-        """Choose guide stars of one attitude in stages of limits, as `choose`."""
+    def best(self, count: int, row: int = 0, stages: Sequence[StageOfLimits] = STAGES) -> Choice:
+        """Choose guide stars of one attitude in stages of limits, as `choose_best`."""
         if not 0 <= row < len(self):
             text = f"row is {row}; expected an attitude of the plan, 0 to {len(self) - 1}"
             raise ConfigError(text, key="row", fields=("row",))
-        return choose(self.stars_of(row), self.camera, count, stages)
+        return choose_best(self.stars_of(row), self.camera, count, stages)
 
 
 def _or_none(values: Array) -> list[float | None]:
@@ -340,7 +340,7 @@ def plan_attitudes(
     )
 
 
-def _observers(planned: Attitudes, orbit: Orbit | None) -> list[Observer] | None:
+def _observers(planned: PlannedAttitudes, orbit: Orbit | None) -> list[Observer] | None:
     if planned.times is None:
         if orbit is not None:
             raise ConfigError("orbit is given, but the attitudes have no time; add a column time")
@@ -362,7 +362,7 @@ _Bodies = tuple[tuple[dict[str, Any], ...], ...]
 
 
 def _surroundings(
-    planned: Attitudes, observers: list[Observer] | None, camera: Camera, database: Database
+    planned: PlannedAttitudes, observers: list[Observer] | None, camera: Camera, database: Database
 ) -> tuple[dict[str, Array], _Bodies, list[list[_Disc]]]:
     """Return angles of bodies, bodies in the frames, and discs that hide stars, by attitude."""
     if observers is None:
@@ -408,7 +408,7 @@ class _Block(PlannedStars):
 
 def _planned_block(
     database: Database,
-    planned: Attitudes,
+    planned: PlannedAttitudes,
     observers: list[Observer] | None,
     hidden: list[list[_Disc]],
     camera: Camera,

@@ -42,11 +42,11 @@ def frames(matcher: Matcher) -> Iterator[tuple[float, SimulatedFrame]]:
 def field_of(matcher: Matcher, px: np.ndarray, mag: np.ndarray | None) -> tuple[float, float]:
     """Return the field that is named, or that the frame is identified with, and the seconds."""
     before_s = time.process_time()
-    first = matcher.identify(px, magnitudes=mag, fov_error=0.05)
+    first = matcher.identify(px, mag=mag, fov_error=0.05)
     between_s = time.process_time()
     if first.ok:
         return first.camera.fov_x_deg, 0.0
-    found = matcher.identify(px, magnitudes=mag, fov_error=0.05, explain=True)
+    found = matcher.identify(px, mag=mag, fov_error=0.05, explain=True)
     return found.fits_fov_deg or np.nan, time.process_time() - 2.0 * between_s + before_s
 
 

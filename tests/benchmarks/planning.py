@@ -45,7 +45,7 @@ def simulated(plan: Plan, folder: Path, frames: int, noise: Noise) -> tuple[Arra
         turns = []
         for _ in range(frames):
             frame = simulate_frame(sky, stars.camera, matrix, noise, generator)
-            answer = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            answer = matcher.identify(frame.centroids_px, mag=frame.mag)
             if answer.ok:
                 d = answer.matrix @ matrix.T
                 turns.append([d[1, 2] - d[2, 1], d[2, 0] - d[0, 2], d[0, 1] - d[1, 0]])

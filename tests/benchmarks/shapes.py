@@ -40,7 +40,7 @@ def outcomes(matcher: Matcher, fov_error: float, frames: int, *, is_square: bool
         )
         px = camera.middle_px + (frame.centroids_px - camera.middle_px) * [stretch, 1.0 / stretch]
         inside = camera.contains(px)
-        answer = matcher.identify(px[inside], magnitudes=frame.mag[inside], fov_error=fov_error)
+        answer = matcher.identify(px[inside], mag=frame.mag[inside], fov_error=fov_error)
         if answer.refusal is not None:
             found[answer.refusal.reason] += 1
             continue

@@ -31,9 +31,7 @@ def releases_page(
     order: Annotated[Literal["newest", "name", "size"], Query()] = "newest",
 ) -> Response:
     """Show what was published, and the form to publish what was not."""
-    return _page(
-        request, service, reader, database=database, published=published, q=q, order=order
-    )
+    return _page(request, service, reader, database=database, published=published, q=q, order=order)
 
 
 @router.post("/releases")
