@@ -693,6 +693,12 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "database whose index leads out of its table": run("selftest {copy}", hdf5(set_index)),
     "no database": run("simulate {folder}/small-1.0.0 -o {out}/frame.csv"),
     "database and frame swapped": run("identify {frame} {artifact}"),
+    "field that is none": run("identify {artifact} {frame} --fov 200"),
+    "camera of photographs whose field is stated": run(
+        "init {folder}/a.toml --from {black} --fov-x-deg 12"
+    ),
+    "camera without a size and without photographs": run("init {folder}/a.toml --fov-x-deg 12"),
+    "photographs that go with no option": run("init {folder}/a.toml a.png"),
     "output that exists": run("simulate {artifact} -o {folder}/f.csv", {"f.csv": ""}),
     "frame of a kind that is not written": run("simulate {artifact} -o {folder}/frame.gif"),
     "frame missing": run(IDENTIFY),
