@@ -78,7 +78,7 @@ def draw_frame(folder: Path, path: Path) -> None:
     """Draw a frame, its stars and the triangles of its brightest stars."""
     matcher = starcat.Matcher.open(folder)
     [frame] = starcat.simulate(folder, seed=11, false_stars=4)
-    result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+    result = matcher.identify(frame)
     known, px = result.star_index >= 0, frame.centroids_px
     figure = Figure(figsize=(5.2, 5.2), layout="constrained")
     axes = figure.subplots()
@@ -110,7 +110,7 @@ def draw_time(folder: Path, path: Path) -> None:
         seconds, right = [], 0
         for frame in frames:
             begin = time.process_time_ns()
-            result = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            result = matcher.identify(frame)
             seconds.append(1e-6 * (time.process_time_ns() - begin))
             right += result.ok
         milliseconds.append(np.percentile(seconds, [50, 95]))
