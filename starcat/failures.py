@@ -183,7 +183,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
     """
     kind, context = error["type"], error.get("ctx", {})
     if kind == "missing":
-        return kind
+        return "missing"
     if kind == "string_pattern_mismatch":
         from starcat.sections import PATTERN_WORDS
 

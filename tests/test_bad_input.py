@@ -692,13 +692,13 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "database that points to another file": run("selftest {copy}", hdf5(point_elsewhere)),
     "database whose index leads out of its table": run("selftest {copy}", hdf5(set_index)),
     "no database": run("simulate {folder}/small-1.0.0 -o {out}/frame.csv"),
-    "database and frame swapped": run("identify {frame} {artifact}"),
     "field that is none": run("identify {artifact} {frame} --fov 200"),
     "camera of photographs whose field is stated": run(
-        "init {folder}/a.toml --from {black} --fov-x-deg 12"
+        "init {folder}/x.toml --from {frame} --fov-x-deg 20"
     ),
-    "camera without a size and without photographs": run("init {folder}/a.toml --fov-x-deg 12"),
-    "photographs that go with no option": run("init {folder}/a.toml a.png"),
+    "camera without a size and without photographs": run("init {folder}/x.toml"),
+    "photographs that go with no option": run("init {folder}/x.toml a.png"),
+    "database and frame swapped": run("identify {frame} {artifact}"),
     "output that exists": run("simulate {artifact} -o {folder}/f.csv", {"f.csv": ""}),
     "frame of a kind that is not written": run("simulate {artifact} -o {folder}/frame.gif"),
     "frame missing": run(IDENTIFY),

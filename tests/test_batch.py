@@ -192,9 +192,9 @@ def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
     assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
     for given in ("night", "night/*.csv"):
         monkeypatch.chdir(tmp_path)
-        run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml"])
+        run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml", "--replace"])
         assert run.code == 0, run.err
-    two = starcat(["calibrate", small_artifact, "night/[01].csv", "-o", "camera.toml"])
+    two = starcat(["calibrate", small_artifact, "night/[01].csv", "-o", "camera.toml", "--replace"])
     assert "2 of 2 frames are identified" in two.err
     assert "a calibration needs 3. Give more frames" in " ".join(two.err.split())
     assert calibrate(small_artifact, "night").n_identified == 4

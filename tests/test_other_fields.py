@@ -36,7 +36,7 @@ def frame_of(sky, fov_deg, seed):
 )
 def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
     matcher, frame = Matcher(sky, engine=engine), frame_of(sky, fov_deg, 5)
-    given = {"magnitudes": frame.mag}
+    given = {"mag": frame.mag}
     assert matcher.identify(frame.centroids_px, **given).fits_fov_deg is None
     found = matcher.identify(frame.centroids_px, **given, explain=True)
     assert (found.status, found.camera) == ("no_match", None)
@@ -65,7 +65,7 @@ def test_every_field_from_half_to_twice_is_searched_once():
 
 def test_a_finding_passes_the_bound_with_all_searches(sky):
     frame = frame_of(sky, 8.0, 5)
-    given = {"magnitudes": frame.mag, "explain": True}
+    given = {"mag": frame.mag, "explain": True}
     told = Matcher(sky).identify(frame.centroids_px, **given).refusal
     count = SEARCHES + 1 + len(parts_of_fields(OWN))
     chance = told.false_match_probability

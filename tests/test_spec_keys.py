@@ -204,7 +204,10 @@ def test_init_keeps_a_file_that_is_there(starcat, tmp_path):
         (["--size", "wide"], "not WIDTHxHEIGHT"),
         (["--size", "1280x960"], "give either --fov-x-deg, or --focal-mm and --pixel-um"),
         (["--size", "8x8", "--fov-x-deg", "10"], "--size WIDTH: found 8; expected at least 16"),
-        (["--size", "640x480", "--focal-mm", "0.001", "--pixel-um", "5"], "--focal-mm: found 0.001"),
+        (
+            ["--size", "640x480", "--focal-mm", "0.001", "--pixel-um", "5"],
+            "--focal-mm: found 0.001",
+        ),
     ],
 )
 def test_init_says_what_is_wrong_with_a_camera(starcat, tmp_path, options, words):

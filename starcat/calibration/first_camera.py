@@ -87,10 +87,11 @@ class FirstCamera:
             f"the fitted lens, on each axis, from {stars} stars.",
         ]
         if self.flip is not None:
-            lines.append(f"Read the pictures with {'--flip' if self.flip else '--no-flip'}.")
+            upside = "upside down (flip)" if self.flip else "as they are (no flip)"
+            lines.append(f"The pictures were read {upside}: state it when they are identified.")
         if self.has_distortion:
             terms = (f"{name} +- {error:.2g}" for name, error in self.fit.errors.items())
-            lines += [f"The lens ({', '.join(terms)}), as a camera file for --camera:"]
+            lines += [f"The lens ({', '.join(terms)}), as a camera file:"]
             lines += [f"  {line}" for line in camera_toml(self.lens).splitlines() if line]
         return lines
 

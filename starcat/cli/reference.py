@@ -191,7 +191,7 @@ no gain: the triangles are of each field's `boresights.brightest` stars, the oth
 database larger and the search longer. `selection.max_stars_per_field` thins the Milky Way and
 leaves the poles of the galaxy as they are. Where as many stars have to do as a tracker has room for
 (`selection.max_stars`), `selection.thinning = "information"` keeps those that make the sky even:
-[an even sky](algorithms.md#an-even-sky).
+[an even sky](algorithms-catalogs.md#an-even-sky).
 """
 
 
