@@ -1,4 +1,4 @@
-"""Documentation that cannot drift: commands and snippets of every page run, links lead somewhere."""
+"""Documentation that cannot drift: commands and snippets run, links lead somewhere."""
 
 import re
 import shlex

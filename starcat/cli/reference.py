@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import typer
-from click import Context
 
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.table_map import UNITS, ArchiveMap, Flags, Remote, StarColumns, TableMap
@@ -41,13 +40,13 @@ def cli_page() -> str:
     from starcat.cli.main import app
 
     page = [
-        "# Commands\n\n`-o` is the option for the result: a file if a command makes one file, else a "
-        "folder,\nwhich is made if it does not exist. Formats are `--to` and `--format`.\n"
+        "# Commands\n\n`-o` names the result: a file if a command makes one file, else a folder,\n"
+        "which is made if it does not exist. Formats are `--to` and `--format`.\n"
     ]
     commands = {"starcat": typer.main.get_command(app)}
     commands |= {f"starcat {name}": command for name, command in every_command().items()}
     for title, command in commands.items():
-        context = Context(command, info_name=title, terminal_width=96, max_content_width=96)
+        context = typer.Context(command, info_name=title, terminal_width=96, max_content_width=96)
         body = "\n".join(line.rstrip() for line in command.get_help(context).strip().splitlines())
         page.append(f"## {title}\n\n```text\n{body}\n```\n")
     return "\n".join(page)
@@ -57,9 +56,9 @@ def products_page() -> str:
     """Return the reference of all products, from their schemas."""
     page = [
         "# Products\n\n"
-        "Every product is a Parquet file; those that a matcher needs are groups of `database.h5`\n"
-        "too. Angles between stars are radians, positions degrees, all ICRS at the epoch of the\n"
-        "manifest. `i`, `j` and the like are rows of the database's own `stars`.\n"
+        "Every product is a Parquet file. Products that a matcher needs are also groups of\n"
+        "`database.h5`. Angles between stars are radians, positions degrees, in ICRS at the epoch\n"
+        "of the manifest. `i`, `j` and the like are rows of the table `stars` of the database.\n"
     ]
     for path in sorted(resource_folder("schemas").glob("*.json")):
         if path.stem.startswith("manifest-"):
@@ -74,8 +73,10 @@ def products_page() -> str:
                 f"{c.description} |"
             )
         page.append("")
-    page.append("## Reasons\n\nWhy a record is not a guide star, in the order in which they are")
-    page.append("tried; the first that applies is the verdict.\n\n| reason | meaning |\n|---|---|")
+    page.append(
+        "## Reasons\n\nReasons why a record is not a guide star, in the order in which they are"
+    )
+    page.append("tested; the first that applies counts.\n\n| reason | meaning |\n|---|---|")
     page += [f"| {name} | {words} |" for name, words in ALL_REASONS.items()]
     return "\n".join(page) + "\n"
 
@@ -158,11 +159,10 @@ def spec_page() -> str:
     """Return the reference of the build spec, from its own definition."""
     page = [
         "# The build spec\n",
-        "One TOML file says everything that a database depends on, but for its input files.",
-        "`starcat init` writes one for a camera, `starcat presets NAME --toml` prints one that",
-        "ships with starcat, both with every key explained; `starcat build --set KEY=VALUE`",
-        "changes a key for one build. A key that is not listed here is refused, with the nearest",
-        "that is.\n",
+        "A spec is a TOML file that determines a database, together with the input files.",
+        "`starcat init` writes a spec for a camera, `starcat presets NAME --toml` prints a spec that",
+        "ships with starcat, both with every key explained. `starcat build --set KEY=VALUE`",
+        "changes a key for one build. An unknown key is an error that names the nearest known key.\n",
         LIMIT_ADVICE,
     ]
     for section in spec_sections():
@@ -183,15 +183,14 @@ def spec_page() -> str:
 LIMIT_ADVICE = """\
 ## Choosing the faint limit
 
-A frame is identified from 4 stars on, and surely from about 8. Take the limit at which 99 of 100
-fields have 8: `starcat init` finds it (12 deg: G = 6.2 on a 4:3 detector; 50 deg: 3.6; 2 deg: 9.9)
-and prints the stars of a field for limits around it. It must not be fainter than what the camera
-sees; where it would be, the field is too small for that camera's stars. Much fainter than needed is
-no gain: the triangles are of each field's `boresights.brightest` stars, the others only make the
-database larger and the search longer. `selection.max_stars_per_field` thins the Milky Way and
-leaves the poles of the galaxy as they are. Where as many stars have to do as a tracker has room for
-(`selection.max_stars`), `selection.thinning = "information"` keeps those that make the sky even:
-[an even sky](algorithms-catalogs.md#an-even-sky).
+A frame needs 4 stars, and 8 for a safe match. Choose the limit at which 99 of 100 fields have 8:
+`starcat init` finds it (12 deg: G = 6.2 on a 4:3 detector; 50 deg: 3.6; 2 deg: 9.9) and prints the
+stars of a field for limits around it. The limit must not be fainter than the camera sees. A much
+fainter limit does not help: triangles are made from each field's `boresights.brightest` stars, and
+the other stars only make the database larger and the search longer. `selection.max_stars_per_field`
+thins the Milky Way and keeps the poles of the galaxy. If a tracker has room for a number of stars
+(`selection.max_stars`), `selection.thinning = "information"` keeps the stars that make the sky
+even: [an even sky](algorithms-catalogs.md#an-even-sky).
 """
 
 
@@ -209,10 +208,10 @@ def stages_page() -> str:
     """Return the list of the stages of a build, with what `--explain` says for a preset."""
     page = [
         "# The stages of a build\n",
-        "A build runs these stages in this order; one that has nothing to do for the spec is",
-        "skipped. All work on one `Draft` (`starcat/pipeline/draft.py`). An estimate runs the",
-        "first two lists. `starcat build --explain SPEC` says what a stage will do for a spec, and",
-        "which files it reads. It looks for files as the build does, and reads none of them.\n",
+        "A build runs these stages in this order. A stage that has nothing to do for the spec is",
+        "skipped. All stages work on one `Draft` (`starcat/pipeline/draft.py`). An estimate runs",
+        "the first two lists. `starcat build --explain SPEC` prints what each stage will do for a",
+        "spec, and which files it would read.\n",
     ]
     for title, stages in (
         ("Read", READ), ("Choose", CHOOSE), ("Make products", PRODUCTS), ("Finish", FINISH)

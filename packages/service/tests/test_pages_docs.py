@@ -16,7 +16,9 @@ SETTINGS = {"anonymous": "reader"}
 
 def test_every_page_of_the_documentation_is_in_the_contents():
     listed = [name for part in table_of_pages() for name, _ in part.pages]
-    assert sorted([*listed, "index"]) == sorted({path.stem for path in DOCS.glob("*.md")} | REFERENCE.keys())
+    assert sorted([*listed, "index"]) == sorted(
+        {path.stem for path in DOCS.glob("*.md")} | REFERENCE.keys()
+    )
     assert all(title[0].isupper() for part in table_of_pages() for _, title in part.pages)
 
 
