@@ -160,9 +160,9 @@ def spec_page() -> str:
     page = [
         "# The build spec\n",
         "A spec is a TOML file that determines a database, together with the input files.",
-        "`starcat init` writes a spec for a camera, `starcat presets NAME --toml` prints a spec that",
-        "ships with starcat, both with every key explained. `starcat build --set KEY=VALUE`",
-        "changes a key for one build. An unknown key is an error that names the nearest known key.\n",
+        "`starcat init` writes a spec for a camera, `starcat presets NAME --toml` prints one of",
+        "starcat's own, both with every key explained. `starcat build --set KEY=VALUE` changes a",
+        "key for one build. An unknown key is an error that names the nearest known key.\n",
         LIMIT_ADVICE,
     ]
     for section in spec_sections():

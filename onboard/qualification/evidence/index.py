@@ -68,7 +68,7 @@ def main(folder: Path) -> int:
         folder / "index.html",
         f"Evidence of starcat onboard {sbom.version()}",
         f"<p>Commit {commit or 'unknown'}{dirty}, {when}. {link('README.md')} has the status "
-        "codes and the tests; the page onboard-manual of the documentation has promises and duties.</p>",
+        "codes and the tests; the page onboard-manual of the documentation has the promises.</p>",
         pages.table(["what", "result", "figure", "command", "pages"], rows),
         "<h2>Tools</h2>",
         pages.table(["tool", "version"], [[tool, version_of(tool)] for tool in TOOLS]),

@@ -158,6 +158,9 @@ def _code(tokens: Sequence[Token], index: int, *_: Any) -> str:
     token = tokens[index]
     if token.info.strip() == "{eval-rst}":
         return "".join(map(_described, _AUTO.findall(token.content)))
+    if included := re.fullmatch(r"\{literalinclude\} notebooks/(\w+)\.py", token.info.strip()):
+        notebook = FOLDER / "notebooks" / f"{included[1]}.py"
+        return f'<pre tabindex="0"><code>{escape(notebook.read_text("utf-8"))}</code></pre>\n'
     return f'<pre tabindex="0"><code>{escape(token.content)}</code></pre>\n'
 
 
