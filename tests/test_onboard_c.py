@@ -336,10 +336,10 @@ def test_the_evidence_is_complete(folder):
 
 
 def test_every_loop_has_its_longest_count(folder, tmp_path):
-    """``loops.md`` has every loop; one that is added to the source is named."""
+    """``loops.txt`` has every loop; one that is added to the source is named."""
     compare = [sys.executable, "-B", "qualification/wcet/loops.py"]
     said = subprocess.run(compare, cwd=folder, capture_output=True, text=True, check=True).stdout
-    assert re.match(r"loops.md has all \d+ loops of the library", said)
+    assert re.match(r"loops.txt has all \d+ loops of the library", said)
     copy = tmp_path / "onboard"
     for name in ("src", "qualification"):
         shutil.copytree(folder / name, copy / name)
@@ -350,7 +350,7 @@ def test_every_loop_has_its_longest_count(folder, tmp_path):
     source.write_text(added, encoding="utf-8")
     ran = subprocess.run(compare, cwd=copy, capture_output=True, text=True, check=False)
     assert ran.returncode == 1
-    assert ran.stdout == "not in loops.md: sky.c gather_sectors while (count > 9u)\n"
+    assert ran.stdout == "not in loops.txt: sky.c gather_sectors while (count > 9u)\n"
 
 
 @pytest.mark.slow
