@@ -11,7 +11,7 @@ COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
-.PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reproduction docs pictures golden release clean
+.PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reports docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -107,17 +107,19 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 		$(BIN)/python tests/benchmarks/$$name.py || failed="$$failed $$name"; done; \
 	if [ "$$failed" ]; then echo "benchmarks that failed:$$failed"; exit 1; fi
 
-reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md
+reports: $(READY) ## measure the files of a release in dist/reports: five papers, ECSS (an hour)
 	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)
 	$(BIN)/python tests/builders/reproduction.py
+	$(BIN)/starcat evaluate --ecss-example > dist/reports/sensor.toml
+	for preset in gaia-12deg sao-12deg; do \
+		$(BIN)/starcat build --preset $$preset --output dist && \
+		$(BIN)/starcat evaluate dist/$$preset-1.0.0 --ecss dist/reports/sensor.toml --frames 100 -o dist/reports || exit 1; done
 
-docs: $(READY) ## rewrite the generated pages of docs/, build the site in dist/docs
-	$(BIN)/python tests/builders/docs.py
-	$(BIN)/python tests/builders/star_page.py
+docs: $(READY) ## build the site in dist/docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
 
-pictures: $(READY) ## draw the pictures of README.md again
-	$(BIN)/python tests/builders/pictures.py
+pictures: $(READY) ## draw the pictures of the documentation again
+	$(BIN)/python tests/builders/figures.py
 
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
 	$(BIN)/python tests/builders/golden.py

@@ -44,6 +44,17 @@ def write_block(page, node):
     raise nodes.SkipNode
 
 
+def write_reference(app):
+    """Write the pages of reference, whose source is the program itself."""
+    from starcat.cli import REFERENCE
+
+    for name, page in REFERENCE.items():
+        path, text = app.srcdir / f"{name}.md", page().rstrip() + "\n"
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
 def setup(app):
-    """Take the two in place of MathJax, which would be loaded from another server."""
+    """Write formulas without MathJax, which would be loaded from another server."""
+    app.connect("builder-inited", write_reference)
     app.add_html_math_renderer("mathml", (write_inline, None), (write_block, None))

@@ -1,7 +1,7 @@
-"""Bad input: every kind in docs/errors.md, given to the real commands.
+"""Bad input: every kind in tests/data/messages.tsv, given to the real commands.
 
-The page and this file hold each other up: a kind stands in both, and what the page says that
-starcat says (``…`` stands for anything), and its exit code, are looked for in what it says.
+The table and this file have the same kinds. The message of the table (``…`` stands for anything)
+and its exit code are compared with what the command prints.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from genuine_records import PSC
 from registry_files import blob_of, manifest_of, put_manifest
 from signed_registry import Forger, key_of, signing
 
+from starcat import errors
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.archives.gaia import embedded_sky
@@ -61,7 +62,7 @@ from starcat_service.security.tokens import TokenStore
 from starcat_service.settings import Role
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "errors.md"
+TABLE = ROOT / "tests" / "data" / "messages.tsv"
 
 Call = list[str] | Callable[[], object]
 
@@ -1311,14 +1312,12 @@ def place(
 
 
 @cache
-def page_rows() -> dict[str, tuple[str, int]]:
-    """Kind to (pattern of what starcat says, exit code), as the page has them."""
-    rows = re.findall(r"^\| (.+?) \| (.+?) \| (\d) \|$", PAGE.read_text(), re.MULTILINE)
+def messages() -> dict[str, tuple[str, int]]:
+    """Kind to (pattern of what starcat says, exit code), as the table has them."""
+    lines = [line for line in TABLE.read_text().splitlines() if not line.startswith("#")]
+    rows = [line.replace("`", "").split("\t") for line in lines]
     return {
-        kind.replace("`", ""): (
-            ".*".join(re.escape(part) for part in says.replace("`", "").split("…")),
-            int(code),
-        )
+        kind: (".*".join(re.escape(part) for part in says.split("…")), int(code))
         for kind, says, code in rows
     }
 
@@ -1352,7 +1351,7 @@ def run_call(place: Place, call: Call, starcat: Any) -> tuple[int, str]:
     "kind", [pytest.param(k, marks=[pytest.mark.slow] * (k in LONG), id=k) for k in CASES]
 )
 def test_bad_input(kind, place, starcat):
-    call, (pattern, expected_code) = CASES[kind](place), page_rows()[kind]
+    call, (pattern, expected_code) = CASES[kind](place), messages()[kind]
     before = bytes_of(place.folder)
     code, text = run_call(place, call, starcat)
     assert code == expected_code, text
@@ -1368,7 +1367,7 @@ def test_bad_input(kind, place, starcat):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in CASES if kind not in {*IN_JSON, *NO_JSON}])
 def test_bad_input_in_json(kind, place, starcat):
-    call, (pattern, code) = CASES[kind](place), page_rows()[kind]
+    call, (pattern, code) = CASES[kind](place), messages()[kind]
     if code and isinstance(call, list):
         check_json(code, pattern, starcat([*call, "--json"]))
 
@@ -1385,15 +1384,15 @@ def check_json(code: int, pattern: str, ran: Any) -> None:
     assert error["hint"] is None or error["hint"] in error["message"] or code == 2
 
 
-def test_the_page_lists_exactly_these_kinds():
-    assert page_rows().keys() == CASES.keys()
+def test_the_table_lists_exactly_these_kinds():
+    assert messages().keys() == CASES.keys()
     assert len(CASES) == sum(map(len, GROUPS)) >= 20
 
 
 @pytest.mark.parametrize("kind", ["file missing", "key unknown", "not a database", "no stars left"])
 def test_exit_codes_reach_the_shell(kind, place):
     code, text = run_apart(place, CASES[kind](place))
-    assert code == page_rows()[kind][1]
+    assert code == messages()[kind][1]
     assert text.startswith("starcat: error: ")
     assert text.count("\n") == 1
 
@@ -1409,3 +1408,18 @@ def test_a_malformed_record_costs_only_itself(place, starcat):
     assert rejected["reason"].to_pylist() == ["malformed_record"] * 2
     assert rejected["source_line"].to_pylist() == [3, 10]
     assert "bytes 81-84, v_mag" in rejected["detail"][0].as_py()
+
+
+def test_the_page_has_every_class_and_exit_code():
+    page = (ROOT / "docs" / "errors.md").read_text()
+    rows = re.findall(r"^\| (.*`\w+`.*?) \| (\d) \|", page, re.MULTILINE)
+    found = {name: int(code) for names, code in rows for name in re.findall(r"`(\w+)`", names)}
+    for name in ("ValueError", "TypeError"):
+        del found[name]
+    classes = {
+        name: kind.exit_code
+        for name, kind in vars(errors).items()
+        if isinstance(kind, type) and issubclass(kind, StarcatError) and kind is not StarcatError
+    }
+    del classes["ServiceError"]  # it has the code that the service answers
+    assert found == classes

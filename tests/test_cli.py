@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from every_command import every_command
 from typer.main import get_command
 
 import starcat as package
@@ -22,6 +21,7 @@ from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli.console import OPTIONS, PANELS
 from starcat.cli.main import app
+from starcat.cli.reference import every_command
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from every_command import every_command
 
 from starcat.cli.options import chosen_spec
+from starcat.cli.reference import every_command
 from starcat.images.solve_files import identify_file
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build_database

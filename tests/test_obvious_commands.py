@@ -15,10 +15,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
-from every_command import every_command
 
 import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
+from starcat.cli.reference import every_command
 from starcat.releases.metadata import read_signing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.keys import spec_toml

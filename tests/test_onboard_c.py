@@ -23,6 +23,7 @@ from starcat.simulation.simulate import Noise, simulate_frames
 
 ONBOARD = Path(__file__).parents[1] / "onboard"
 README = (ONBOARD / "README.md").read_text(encoding="utf-8")
+PAGE = (ONBOARD.parent / "docs" / "onboard.md").read_text(encoding="utf-8")
 LIBM = {"sqrt", "sin", "cos", "atan2", "log"}
 COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
 """What compilers call by themselves."""
@@ -154,8 +155,8 @@ int main(int argc, char **argv) {
 """
 
 
-def test_the_code_of_the_readme_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
-    example, *others = re.findall(r"```c\n(.*?)```", README, re.DOTALL)
+def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
+    example, *others = re.findall(r"```c\n(.*?)```", PAGE, re.DOTALL)
     strict = [compiler(), "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{tmp_path}"]
     strict.append(f"-I{folder / 'include'}")
     (tmp_path / "example.c").write_text(example)
@@ -335,10 +336,10 @@ def test_the_evidence_is_complete(folder):
 
 
 def test_every_loop_has_its_longest_count(folder, tmp_path):
-    """``loops.md`` has every loop; one that is added to the source is named."""
+    """``loops.txt`` has every loop; one that is added to the source is named."""
     compare = [sys.executable, "-B", "qualification/wcet/loops.py"]
     said = subprocess.run(compare, cwd=folder, capture_output=True, text=True, check=True).stdout
-    assert re.match(r"loops.md has all \d+ loops of the library", said)
+    assert re.match(r"loops.txt has all \d+ loops of the library", said)
     copy = tmp_path / "onboard"
     for name in ("src", "qualification"):
         shutil.copytree(folder / name, copy / name)
@@ -349,7 +350,7 @@ def test_every_loop_has_its_longest_count(folder, tmp_path):
     source.write_text(added, encoding="utf-8")
     ran = subprocess.run(compare, cwd=copy, capture_output=True, text=True, check=False)
     assert ran.returncode == 1
-    assert ran.stdout == "not in loops.md: sky.c gather_sectors while (count > 9u)\n"
+    assert ran.stdout == "not in loops.txt: sky.c gather_sectors while (count > 9u)\n"
 
 
 @pytest.mark.slow

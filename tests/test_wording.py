@@ -15,6 +15,7 @@ from services import DATABASE, add_database, client_of
 
 import starcat
 import starcat_service
+from starcat.cli import REFERENCE
 from starcat.errors import ConfigError, QueryError, worded
 from starcat.failures import failure_of, option_of
 from starcat.matcher.refusal import HINTS, bracketed
@@ -80,7 +81,7 @@ def test_messages_of_the_library_name_no_option_of_the_command_line():
 
 
 def test_every_parameter_of_a_message_has_an_option():
-    known = set(re.findall(r"--[a-z][a-z-]+", (PACKAGE.parent / "docs/cli.md").read_text("utf-8")))
+    known = set(re.findall(r"--[a-z][a-z-]+", REFERENCE["cli"]()))
     of_python = {"--centroids-px", "--matcher", "--host", "--port", "--root"}
     fields = [
         element.value

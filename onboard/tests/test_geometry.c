@@ -51,7 +51,7 @@ static void check_known_rotations(void) {
   CHECK_NEAR(q[3], sqrt(0.5), tight);
 }
 
-/* The example at the head of starcat.h, which MANUAL.md and the pages of the ground have too. */
+/* The example at the head of starcat.h, which the pages of the documentation have too. */
 static void check_worked_example(void) {
   static const double q_body_from_icrs[4] = {-0.781300520, 0.137764362, 0.208208671, 0.572048623};
   static const double v_icrs[3] = {-0.187455223, 0.939217529, -0.287629922};

@@ -1,4 +1,4 @@
-"""Write docs/reproduction.md from a full evaluation of the papers (`make reproduction`)."""
+"""Write reproduction.md, a file of a release, from a full evaluation of the papers."""
 
 from __future__ import annotations
 
@@ -9,5 +9,7 @@ from starcat_lab.report.files import RESULTS, write_reproduction
 ROOT = Path(__file__).resolve().parents[2]
 
 if __name__ == "__main__":
-    page = write_reproduction(ROOT / "dist" / "evaluation" / "all" / RESULTS, ROOT / "docs")
+    page = write_reproduction(
+        ROOT / "dist" / "evaluation" / "all" / RESULTS, ROOT / "dist" / "reports"
+    )
     print(f"wrote {page.relative_to(ROOT)}")

@@ -23,7 +23,8 @@ step cppcheck "cppcheck"
 step misuse "Misuse"
 step size "Code, stack, workspace"
 step sbom "Bill of materials"
-cp MANUAL.md README.md "$out"
+cp README.md "$out"
+if [ -f ../docs/onboard-manual.md ]; then cp ../docs/onboard-manual.md "$out"; fi
 echo
 python3 qualification/evidence/index.py "$out"
 status=$?

@@ -67,8 +67,8 @@ def main(folder: Path) -> int:
     pages.write(
         folder / "index.html",
         f"Evidence of starcat onboard {sbom.version()}",
-        f"<p>Commit {commit or 'unknown'}{dirty}, {when}. {link('MANUAL.md')} says what the "
-        "library promises and what its user has to do.</p>",
+        f"<p>Commit {commit or 'unknown'}{dirty}, {when}. {link('README.md')} has the status "
+        "codes and the tests; the page onboard-manual of the documentation has the promises.</p>",
         pages.table(["what", "result", "figure", "command", "pages"], rows),
         "<h2>Tools</h2>",
         pages.table(["tool", "version"], [[tool, version_of(tool)] for tool in TOOLS]),

@@ -1,7 +1,7 @@
 """The most instructions that a call may take, of a compiled program and the table of loops.
 
 Every instruction of the library is attributed, by the debug information and through what was
-inlined, to a line of the source, and so to how often loops.md lets that run in an event. The bound
+inlined, to a line of the source, and so to how often loops.txt lets that run in an event. The bound
 is the largest sum over an event for one of its steps, and what a call does without steps:
 
     instructions <= once + per_step * steps + per_look_up * min(steps, 5000)
@@ -165,7 +165,7 @@ class Counts:
         return sum(one in self.present for one in self.chain(places, function))
 
     def of_function(self, place: Place) -> Form | None:
-        """What loops.md states for a function, if it does."""
+        """What loops.txt states for a function, if it does."""
         if place[1] in ROOTS and place[1] != self.root:
             return Form()
         return self.stated.get(place[:2])
@@ -281,8 +281,8 @@ def largest(copies: Copies) -> Form:
 
 @cache
 def compiled(text: str) -> CodeType:
-    """Compile an expression of loops.md."""
-    return compile(text, "loops.md", "eval")
+    """Compile an expression of loops.txt."""
+    return compile(text, "loops.txt", "eval")
 
 
 def total(costs: Form, event: str, **values: float) -> float:

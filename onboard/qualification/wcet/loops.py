@@ -1,4 +1,4 @@
-"""The loops of the library as its source has them, and as loops.md lists them.
+"""The loops of the library as its source has them, and as loops.txt lists them.
 
 Run by itself it compares the two and says what differs.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parents[1] / "src"
-TABLE = HERE / "loops.md"
+TABLE = HERE / "loops.txt"
 FUNCTION = re.compile(r"^[A-Za-z_][^;{}#=]*?\b(\w+)\([^;{}]*\)\s*\{", re.MULTILINE)
 LOOP = re.compile(r"\b(?:for|while) ?\(")
 
@@ -96,15 +96,15 @@ def check(source: Source) -> list[str]:
     """Give the loops their rows; returns what the table lacks, or has and should not."""
     listed = [(row[0], row[1], row[2].replace("\\|", "|")) for row in rows_of("Loops")]
     found = [(loop.file, loop.function, loop.head) for loop in source.loops]
-    wrong = [f"not in loops.md: {' '.join(loop)}" for loop in found if loop not in listed]
-    wrong += [f"only in loops.md: {' '.join(row)}" for row in listed if row not in found]
+    wrong = [f"not in loops.txt: {' '.join(loop)}" for loop in found if loop not in listed]
+    wrong += [f"only in loops.txt: {' '.join(row)}" for row in listed if row not in found]
     functions = {(row[0], row[1]) for row in rows_of("Functions")}
     gone = sorted(functions - set(source.functions))
-    wrong += [f"only in loops.md: {' '.join(function)}" for function in gone]
+    wrong += [f"only in loops.txt: {' '.join(function)}" for function in gone]
     if wrong:
         return wrong
     if listed != found:
-        return ["loops.md has the loops in another order than the source"]
+        return ["loops.txt has the loops in another order than the source"]
     for loop, row in zip(source.loops, rows_of("Loops"), strict=True):
         loop.longest, loop.counts = row[3], row[4]
     return [f"no count: {loop.head}" for loop in source.loops if not loop.counts]
@@ -113,7 +113,7 @@ def check(source: Source) -> list[str]:
 def main() -> int:
     source = read_source()
     wrong = check(source)
-    print("\n".join(wrong) or f"loops.md has all {len(source.loops)} loops of the library")
+    print("\n".join(wrong) or f"loops.txt has all {len(source.loops)} loops of the library")
     return int(bool(wrong))
 
 

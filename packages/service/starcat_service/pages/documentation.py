@@ -1,4 +1,4 @@
-"""The documentation as pages: the Markdown files of ``docs``, which a wheel carries too."""
+"""The documentation as pages: files of ``docs``, which a wheel has too, and pages of reference."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from mdit_py_plugins.dollarmath import dollarmath_plugin
 
+from starcat.cli import REFERENCE
 from starcat.resources import resource_folder
 from starcat_service.pages.rendering import page_router, render
 from starcat_service.problems import Problem
@@ -26,7 +27,7 @@ from starcat_service.problems import Problem
 router = page_router()
 
 FOLDER = resource_folder("docs")
-NAMES = frozenset(path.stem for path in FOLDER.glob("*.md"))
+NAMES = frozenset(path.stem for path in FOLDER.glob("*.md")) | frozenset(REFERENCE)
 FIGURES = {path.name: path for path in (FOLDER / "figures").iterdir() if path.is_file()}
 """Pages and pictures that there are: no path is ever made of a request."""
 
@@ -89,23 +90,29 @@ def _shown(request: Request, name: str) -> Response:
 @cache
 def table_of_pages() -> list[PagePart]:
     """Return the pages by part, as the index has them."""
-    text = (FOLDER / f"{INDEX}.md").read_text(encoding="utf-8")
     return [
         PagePart(caption, [(name, _title(name)) for name in names.split()])
-        for caption, names in _TREE.findall(text)
+        for caption, names in _TREE.findall(_text(INDEX))
     ]
 
 
+@cache
+def _text(name: str) -> str:
+    """Return a page as Markdown; pages of reference are made from the program that runs."""
+    if name in REFERENCE:
+        return REFERENCE[name]()
+    return (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+
+
 def _title(name: str) -> str:
-    found = _TITLE.search((FOLDER / f"{name}.md").read_text(encoding="utf-8"))
+    found = _TITLE.search(_text(name))
     return found[1] if found else name
 
 
 @cache
 def read_page(name: str) -> Page:
     """Return a page."""
-    text = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
-    text = _TREE.sub("", text)
+    text = _TREE.sub("", _text(name))
     markdown = _markdown()
     tokens = markdown.parse(text)
     parts = _with_anchors(tokens)
@@ -151,6 +158,9 @@ def _code(tokens: Sequence[Token], index: int, *_: Any) -> str:
     token = tokens[index]
     if token.info.strip() == "{eval-rst}":
         return "".join(map(_described, _AUTO.findall(token.content)))
+    if included := re.fullmatch(r"\{literalinclude\} notebooks/(\w+)\.py", token.info.strip()):
+        notebook = FOLDER / "notebooks" / f"{included[1]}.py"
+        return f'<pre tabindex="0"><code>{escape(notebook.read_text("utf-8"))}</code></pre>\n'
     return f'<pre tabindex="0"><code>{escape(token.content)}</code></pre>\n'
 
 
