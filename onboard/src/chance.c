@@ -15,6 +15,7 @@
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
 #define LEAST_EXTENT R(1e-6)                    /* of stars on the detector, square pixels */
+#define LOG_SHAPE_CHANCE R(-5.8091429903140281) /* of 3e-3 */
 #define LEAST_BREADTH R(1e-4) /* of stars that tell a shape: of the determinant of xx, xy, yy */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
@@ -233,8 +234,8 @@ static void add_moments(moments *of, real x, real y, real dx, real dy) {
 }
 
 /* Whether offsets are those of another shape: of pixels that are not square, or of axes that are
- * not at right angles. A linear map has to move the corners, beside its turn and its scale, and
- * has to leave less than noise would leave with a probability of 1e-3. */
+ * not at right angles. A linear map has to move the corners by two tolerances, beside its turn and its
+ * scale, and has to leave less than noise would leave with a probability of 3e-3. */
 static int has_other_shape(const moments *of, real n, real corner_px, real tolerance_px) {
   const real extent = of->xx + of->yy;
   const real determinant = of->xx * of->yy - of->xy * of->xy;
@@ -246,14 +247,14 @@ static int has_other_shape(const moments *of, real n, real corner_px, real toler
   const real c = (of->yy * of->x_dy - of->xy * of->y_dy) / determinant;
   const real d = (of->xx * of->y_dy - of->xy * of->x_dy) / determinant;
   const real bent = corner_px * corner_px * ((a - d) * (a - d) + (b + c) * (b + c));
-  if (!(bent > R(4.0) * tolerance_px * tolerance_px)) {
+  if (!(bent > R(16.0) * tolerance_px * tolerance_px)) {
     return 0;
   }
   const real scale = of->x_dx + of->y_dy, turn = of->x_dy - of->y_dx;
   const real of_similar = of->left - (scale * scale + turn * turn) / extent;
   const real of_linear = of->left - (a * of->x_dx + b * of->y_dx + c * of->x_dy + d * of->y_dy);
   const real ratio = starcat_larger(of_linear / of_similar, STARCAT_LEAST_WEIGHT);
-  return (n - R(3.0)) * STARCAT_LOG(ratio) < STARCAT_LOG_LIKELY;
+  return (n - R(3.0)) * STARCAT_LOG(ratio) < LOG_SHAPE_CHANCE;
 }
 
 /* Whether the frame differs from the stars that it matches in scale, which means a wrong focal

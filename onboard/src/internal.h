@@ -31,7 +31,7 @@
 #define STARCAT_MIN_SHARE (R(1.0) / R(3.0))
 #define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
 #define STARCAT_REACH R(1.5) /* largest distance of a match, in tolerances */
-#define STARCAT_LOG_FIRM_CHANCE R(-27.631021115928547) /* of 1e-12 */
+#define STARCAT_LOG_FIRM_CHANCE R(-32.236191301916641) /* of 1e-14 */
 #define STARCAT_SURE_CORNER R(0.5)   /* largest error of a corner of firm stars, in tolerances */
 #define STARCAT_OTHER_SCALES R(0.05) /* errors of the focal length that are looked for */
 #define STARCAT_FOCAL_MARGIN R(0.02) /* of the field's radius, where the focal length is fitted */

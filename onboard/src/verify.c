@@ -21,6 +21,7 @@
 
 #define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
 #define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
+#define MISSES R(0.45)     /* near misses of a shape, over matched stars */
 #define MISS_REACH R(8.0)  /* how near a star a centroid misses it, in reaches */
 #define PI R(3.14159265358979324)
 
@@ -256,7 +257,7 @@ static int has_centroid(const starcat_call *call, uint32_t star) {
   return found;
 }
 
-/* Whether centroids without a star are close to stars without a centroid: more of them than half of
+/* Whether centroids without a star are close to stars without a centroid: more of them than 0.45 of
  * the matched ones, and twice what chance brings there. Then the frame has another shape than the
  * camera: stars match in a part of it, and beside that part they miss. */
 static int has_near_misses(const starcat_call *call, uint32_t matched, real reach_px) {
@@ -286,7 +287,7 @@ static int has_near_misses(const starcat_call *call, uint32_t matched, real reac
   const real by_chance =
       (real)pairs * PI * reach / (R(4.0) * call->camera.half_width * call->camera.half_height);
   return (real)(stars < centroids ? stars : centroids) >
-         R(0.5) * (real)matched + R(2.0) * by_chance;
+         MISSES * (real)matched + R(2.0) * by_chance;
 }
 
 /* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */

@@ -28,8 +28,11 @@ _SCALINGS = 2
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
-SHAPE_CHANCE = 1e-3
+SHAPE_CHANCE = 3e-3
 """Probability that noise looks as much like another shape of the frame, below which it is one."""
+
+SHAPE_TOLERANCES = 2.0
+"""How far another shape moves the corners at least, in tolerances."""
 
 MIN_BREADTH = 1e-4
 """Least breadth of matched stars that tell the shape of a frame: the determinant of their second
@@ -288,7 +291,7 @@ def is_deformed(
     # The linear map of the offsets: [[a, b], [c, d]].
     a, b = (yy * x_dx - xy * y_dx) / determinant, (xx * y_dx - xy * x_dx) / determinant
     c, d = (yy * x_dy - xy * y_dy) / determinant, (xx * y_dy - xy * x_dy) / determinant
-    if 0.5 * math.hypot(a - d, b + c) * corner_px <= tolerance_px:
+    if 0.5 * math.hypot(a - d, b + c) * corner_px <= SHAPE_TOLERANCES * tolerance_px:
         return False
     # Of a turn and a scale, and of any linear map: what they leave of the offsets. Of noise, the
     # ratio is below r with the probability r**(N - 3) (Fisher's F with 2 and 2N - 6 degrees).

@@ -133,7 +133,7 @@ class Settings:
         it can serve.
     min_share : float
         Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
-        Where it is not larger than that, agreements that chance gives less often than 1e-12 and
+        Where it is not larger than that, agreements that chance gives less often than 1e-14 and
         whose stars determine the whole frame need none.
     max_steps : float
         Candidates that numpy may compare for a frame (`Budget`), 2 to 20 microseconds each; then

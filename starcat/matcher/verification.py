@@ -37,7 +37,7 @@ Withheld = Literal["share_of_frame", "scale"] | None
 SURE_SHARE = 2.0 / 3.0
 """An attitude that explains a smaller share is refined again, with the reaches of `WIDER`."""
 
-FIRM_CHANCE = 1e-12
+FIRM_CHANCE = 1e-14
 """Largest chance of an agreement that need not explain any share of the frame, because its stars
 determine all of it."""
 
@@ -54,6 +54,9 @@ NARROWER = (0.5, 0.25, 0.125)
 OVER_CHANCE = 2.0
 """Centroids within a smaller reach, over the number that its area would have by chance, from which
 it is tried."""
+
+MISSES = 0.45
+"""Largest number of near misses beside those of chance, over the number of matched stars."""
 
 MISS_REACH = 8.0
 """How near a star a centroid misses it; in units of the final reach."""
@@ -388,7 +391,7 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
 def _has_near_misses(refined: _Fit, within: Rows, observation: Observation) -> bool:
     """Return whether centroids without a star are close to stars without a centroid.
 
-    They are if they are more than half of the matched ones, and twice what chance brings there.
+    They are if they are more than `MISSES` of the matched ones, and twice what chance brings there.
     Then the frame has another shape than the camera: stars match in a part of the frame, and
     beside that part they miss.
     """
@@ -406,7 +409,7 @@ def _has_near_misses(refined: _Fit, within: Rows, observation: Observation) -> b
     camera = observation.camera
     by_chance = pairs * math.pi * reach / (camera.width_px * camera.height_px)
     misses = min(int(near.any(axis=0).sum()), int(near.any(axis=1).sum()))
-    return misses > 0.5 * len(refined.matched) + 2.0 * by_chance
+    return misses > MISSES * len(refined.matched) + 2.0 * by_chance
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
