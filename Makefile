@@ -52,7 +52,7 @@ lock: $(READY) ## renew lock.txt: the newest versions within the bounds, with th
 	$(BUILT_WITH) | $(LOCK) --upgrade --all-extras -o $(VENV)/all.txt
 	$(BUILT_WITH) | $(LOCK) --extra images -c $(VENV)/all.txt -o $(VENV)/run.txt
 	{ $(BUILT_WITH); $(SERVICE_NEEDS); } | $(LOCK) --extra images -c $(VENV)/all.txt -o $(VENV)/service.txt
-	$(BIN)/python tests/builders/lock.py $(VENV)/all.txt $(VENV)/run.txt $(VENV)/service.txt > lock.txt
+	$(BIN)/python tools/lock.py $(VENV)/all.txt $(VENV)/run.txt $(VENV)/service.txt > lock.txt
 
 newest: ## test with the newest versions that the bounds allow, in an environment of its own
 	$(PYTHON) -m venv --clear .venv-newest
@@ -104,12 +104,12 @@ serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded s
 BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql votable
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
 	@failed=; for name in $(BENCHMARKS); do \
-		$(BIN)/python tests/benchmarks/$$name.py || failed="$$failed $$name"; done; \
+		$(BIN)/python benchmarks/$$name.py || failed="$$failed $$name"; done; \
 	if [ "$$failed" ]; then echo "benchmarks that failed:$$failed"; exit 1; fi
 
 reports: $(READY) ## measure the files of a release in dist/reports: five papers, ECSS (an hour)
 	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)
-	$(BIN)/python tests/builders/reproduction.py
+	$(BIN)/python tools/reproduction.py
 	$(BIN)/starcat evaluate --ecss-example > dist/reports/sensor.toml
 	for preset in gaia-12deg sao-12deg; do \
 		$(BIN)/starcat build --preset $$preset --output dist && \
@@ -119,14 +119,14 @@ docs: $(READY) ## build the site in dist/docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
 
 pictures: $(READY) ## draw the pictures of the documentation again
-	$(BIN)/python tests/builders/figures.py
+	$(BIN)/python tools/figures.py
 
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
-	$(BIN)/python tests/builders/golden.py
+	$(BIN)/python tools/golden.py
 	@git --no-pager diff --stat tests/golden
 
 release: $(READY) ## list new schemas in schemas/RELEASED.sha256; a listed one never changes
-	$(BIN)/python tests/builders/release_schemas.py
+	$(BIN)/python tools/release_schemas.py
 
 clean: ## remove what the targets made
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis

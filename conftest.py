@@ -33,8 +33,10 @@ settings.register_profile(
 settings.load_profile("starcat")
 
 
-# Builders and tests share modules, which are found by path.
-sys.path.insert(0, str(Path(__file__).parent / "tests" / "builders"))
+# Tests, benchmarks and tools share modules, which are found by path.
+ROOT = Path(__file__).parent
+sys.path.insert(0, str(ROOT / "tests" / "builders"))
+sys.path.extend(str(ROOT / name) for name in ("benchmarks", "tools"))
 
 
 def real_folder(variable: str, name: str) -> Path:

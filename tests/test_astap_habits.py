@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,6 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-
 from rendered import picture_of
 
 from starcat.cli.astap import run_astap

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import gzip
-import sys
 from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
-
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
-
 from twomass_parts import PARTS, part_bytes
 
 from starcat.catalog.ingest import Ingested, ingest_catalog

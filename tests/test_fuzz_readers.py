@@ -7,7 +7,6 @@ kept star is somewhere on the sky. The records are synthetic, so that no excerpt
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from archives import archive_records, file_header
+from catalog_folder import bright_sky
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -26,10 +27,6 @@ from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTabl
 from starcat.errors import StarcatError
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import product_schema
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-from archives import archive_records, file_header
-from catalog_folder import bright_sky
 
 TARGETS = [
     (name, layout.name)

@@ -1,13 +1,8 @@
 """Golden builds: what two presets make changes only on purpose, through ``make golden``."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-
 from golden import GOLDEN, MADE, golden_build, golden_figures
 
 # Sums of up to a million numbers, each right to its last bit or two.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +9,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from archives import archive_records, file_header, record
+from catalog_folder import bright_sky
 
 from starcat.catalog.ingest import Ingested, ingest_catalog, write_star_tables
 from starcat.catalog.parts import RANGES, check_ranges
 from starcat.catalog.source import SourceColumn, data_source
 from starcat.stars.verdict import Verdicts
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-from archives import archive_records, file_header, record
-from catalog_folder import bright_sky
 
 SKY = bright_sky().where(np.arange(40))
 BRIGHT_SKY = replace(SKY, v_mag=SKY.v_mag - 6.0)

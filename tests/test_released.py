@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-
 from release_schemas import LIST_NAME, SCHEMAS, broken, digests, release, released
 
 from starcat.artifact.reader import open_artifact

@@ -6,7 +6,6 @@ import csv
 import json
 import shutil
 import subprocess
-import sys
 from itertools import combinations, count
 from pathlib import Path
 
@@ -14,9 +13,6 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
-
-sys.path.insert(0, str(Path(__file__).parent / "builders"))
-
 from rendered import picture_of
 
 from starcat.artifact.reader import open_artifact

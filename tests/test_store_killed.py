@@ -15,9 +15,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
-
 from folder_bytes import bytes_of
 from twomass_parts import write_part
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import gzip
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parent / "benchmarks"))
-
 from folder_bytes import bytes_of
 from twomass_parts import write_part
 

@@ -1,7 +1,7 @@
 """How large errors of predicted magnitudes are on stars that were measured in both bands.
 
 The tables ``relation_errors.csv`` and ``star_errors.csv`` of the data folder are made by
-``tests/builders/band_errors.py`` from genuine records. Only errors are taken from them: no
+``tools/band_errors.py`` from genuine records. Only errors are taken from them: no
 magnitude is fitted to measured stars.
 """
 

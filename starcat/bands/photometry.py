@@ -26,7 +26,7 @@ _TWOMASS_J = ((NONE_BRIGHTER, 0.20), (4.5, 0.15), (5.4, 0.03), (14.0, 0.1))
 ERRORS_MAG = {
     # Riello et al. 2021, A&A 649, A3, appendix C: saturation shifts G brighter than 6 mag by about
     # 0.01, and BP and RP brighter than 4; below 3 mag nothing is certain. The steps of G from 3 to
-    # 6 mag are the scatter of Hp about what G, BP and RP predict (tests/builders/band_errors.py).
+    # 6 mag are the scatter of Hp about what G, BP and RP predict (tools/band_errors.py).
     "G": _GAIA, "BP": _GAIA_COLOUR, "RP": _GAIA_COLOUR,
     # ESA SP-1200, volume 1, section 1.3 and Hog et al. 2000, A&A 355, L27, table 1
     "Hp": ((NONE_BRIGHTER, 0.002),), "BT": _TYCHO, "VT": _TYCHO,

@@ -1,0 +1,227 @@
+"""Hard acquisition: many stars missing, as many false ones, and noise of 1 or 5 px.
+
+    python benchmarks/acquisition.py [--frames 2000] [--peers]
+
+Frames are of ``sao15``, the preset ``sao-12deg`` with a field of 15 deg. Magnitudes have a noise of
+0.3. Each star is missing with a probability, and there are as many false spots as stars are missing
+on average, with magnitudes that are drawn from the sky. Fu, Lin and Li 2025 (Sensors 25, 4201) use
+such frames.
+
+An answer is right as in ``judging.py``: no place of the frame is off by more than the tolerance and
+five times the error that the noise of the named spots makes. A frame that has no answer is compared
+with its true attitude: if an agreement with it is accepted, the search has missed the frame;
+otherwise the bound on false matches, or the share of the frame, permits no answer. Times are
+processor time of a call from Python, with the attitude and the star numbers read.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from false_frames import Scene, Trial
+from judging import judge_answer
+from matcher import answers_of, count_answers, write_frames
+from rows import Options, Rows, database, ended
+
+from starcat.geometry.attitude import random_attitudes
+from starcat.matcher.c_engine import _neighbours, _onboard, c_engine
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import as_frame, observe
+from starcat.matcher.pose import pose_at
+from starcat.matcher.settings import CERTAIN, Settings
+from starcat.matcher.verification import agree
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+
+NOISE_MAG = 0.3
+SEED = 37
+FIELD_DEG = "15"
+MAX_MS = 50.0
+PART_ALONE = 5
+"""One of so many frames is asked about without votes, which takes long."""
+
+PEERS = ("tetra3rs", "cedar-solve", "ruststartracker")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Frames of one row, and what is asked of it."""
+
+    noise_px: float
+    share: float  # of the stars that are missing, and of false spots
+    rate: float  # least share of the frames with an answer, or with one that is permitted
+    mean_ms: float
+
+    @property
+    def name(self) -> str:
+        """What the row is called."""
+        part = f"{100.0 * self.share:.0f}"
+        return f"{self.noise_px:g} px, {part} % / {part} %"
+
+
+KINDS = (
+    Kind(1.0, 0.25, 0.999, 0.35), Kind(1.0, 0.5, 0.99, 1.0),
+    Kind(5.0, 0.25, 0.99, 2.0), Kind(5.0, 0.5, 0.971, 5.0),
+)  # fmt: skip
+
+
+@dataclass
+class Found:
+    """What became of the frames of a row."""
+
+    verdicts: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)  # why frames have no answer
+    milliseconds: list[float] = field(default_factory=list)
+
+
+def made_frames(stars: Database, kind: Kind, count: int) -> list[SimulatedFrame]:
+    """Return the frames of a row."""
+    generator = np.random.default_rng([SEED, KINDS.index(kind)])
+    camera, mag = stars.camera, np.asarray(stars.mag, dtype=np.float64)
+    sky = Sky(stars.directions, mag, np.arange(len(mag), dtype=np.int32))
+    frames = []
+    for matrix in random_attitudes(count, generator):
+        near = sky.zones.near(matrix[2], camera.radius_rad)
+        inside = camera.contains(camera.pixels_from_directions(sky.directions[near] @ matrix.T))
+        false = round(kind.share * int(inside.sum()))
+        noise = Noise(kind.noise_px, kind.share, false, noise_mag=NOISE_MAG)
+        frames.append(simulate_frame(sky, camera, matrix, noise, generator))
+    return frames
+
+
+def why_refused(stars: Database, settings: Settings, frame: SimulatedFrame) -> str:
+    """Return what an agreement with the true attitude lacks; "missed" where it lacks nothing."""
+    given = as_frame(frame.centroids_px, stars.camera, frame.mag)
+    observation = observe(given, settings)
+    found = agree(pose_at(frame.matrix, 1.0, observation), observation, stars)
+    if found.false_match_probability <= CERTAIN:
+        return "missed"
+    return found.withheld or "chance"
+
+
+def solve(
+    artifact: Path,
+    kind: Kind,
+    frames: list[SimulatedFrame],
+    stated: dict[str, float],
+    *,
+    votes: bool = True,
+) -> Found:
+    """Identify the frames of a row."""
+    matcher, found = Matcher.open(artifact, engine="c", **stated), Found()
+    if not votes:
+        matcher._c_engine.image.neighbours = _onboard.ffi.NULL
+    matcher.identify(np.zeros((0, 2)))
+    scene = Scene(matcher.database, matcher.database, kind.noise_px)
+    for frame in frames:
+        start = time.process_time()
+        answer = matcher.identify(frame.centroids_px, mag=frame.mag)
+        if answer.ok:
+            _ = answer.q_body_from_icrs, answer.star_ids
+        found.milliseconds.append(1e3 * (time.process_time() - start))
+        trial = Trial(frame.centroids_px, frame.mag, (frame.matrix,), noise_px=kind.noise_px)
+        verdict = judge_answer(answer, trial, scene, matcher.tolerance_px)
+        found.verdicts[verdict or "none"] += 1
+        if verdict is None:
+            settings = Settings(**stated)  # type: ignore[arg-type]
+            found.refused[why_refused(matcher.database, settings, frame)] += 1
+    return found
+
+
+def print_table_of_neighbours(artifact: Path) -> None:
+    """Print the size of the table that votes need, and the time that making it takes."""
+    stars = Matcher.open(artifact, engine="c").database
+    engine = c_engine(stars, "triangle")
+    seconds = []
+    for _ in range(5):
+        start = time.process_time()
+        made = _neighbours(engine.image, stars)
+        seconds.append(time.process_time() - start)
+    size = 4 * made[0].capacity
+    print(f"neighbours of {len(stars.mag):,} stars: {size:,} bytes, {1e3 * min(seconds):.1f} ms")
+
+
+def print_row(who: str, kind: Kind, found: Found, count: int) -> None:
+    """Print what became of the frames of a row."""
+    ms = np.array(found.milliseconds)
+    right = found.verdicts["right"]
+    wrong = sum(found.verdicts.values()) - right - found.verdicts["none"]
+    missed, refused = found.refused["missed"], found.refused.total() - found.refused["missed"]
+    part = f"{100.0 * right / count:6.2f} %"
+    told = "" if not found.refused else f"{missed:7}{refused:9}"
+    print(
+        f"{who:16} {kind.name:17} {part}{wrong:6}{np.mean(ms):9.3f}{np.median(ms):9.3f}"
+        f"{ms.max():8.1f}  {told}",
+        flush=True,
+    )
+
+
+def ask_peers(stars: Database, made: dict[str, list[SimulatedFrame]], rows: Rows) -> None:
+    """Print the rows of the peers, which see the same frames."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "frames.npz")
+        write_frames(stars, made, path)
+        for peer in PEERS:
+            with rows.row(peer):
+                answers = answers_of(peer, path)
+                for kind in KINDS:
+                    matrices = answers[f"{kind.name}_matrices"]
+                    truth = np.array([frame.matrix for frame in made[kind.name]][: len(matrices)])
+                    right, wrong, none = count_answers(matrices, truth)
+                    found = Found(Counter(right=right, wrong=wrong, none=none))
+                    found.milliseconds = (1e3 * answers[f"{kind.name}_seconds"]).tolist()
+                    print_row(peer, kind, found, len(matrices))
+
+
+def main(rows: Rows) -> None:
+    """Print the table."""
+    options = Options(__doc__)
+    options.size("--frames", 2000, 20, "frames of each row")
+    options.add_argument("--peers", action="store_true", help="ask other identifiers, too")
+    asked = options.asked()
+    with tempfile.TemporaryDirectory() as folder:
+        changes = {"name": '"sao15"', "camera.fov_x_deg": FIELD_DEG}
+        artifact = database("sao-12deg", Path(folder), changes).folder
+        stars = Matcher.open(artifact).database
+        made = {kind.name: made_frames(stars, kind, asked.frames) for kind in KINDS}
+        print_table_of_neighbours(artifact)
+        print(f"{'':34}  right  wrong  mean ms   median     most   missed  refused")
+        for kind in KINDS:
+            few = made[kind.name][: max(20, asked.frames // PART_ALONE)]
+            stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
+            print_row(
+                "without votes", kind, solve(artifact, kind, few, stated, votes=False), len(few)
+            )
+        for who in ("noise stated", "magnitudes", "nothing stated"):
+            for kind in KINDS:
+                stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
+                if who != "noise stated":
+                    stated = {"tolerance_px": 3.0 * kind.noise_px} if who == "magnitudes" else {}
+                found = solve(artifact, kind, made[kind.name], stated)
+                print_row(who, kind, found, asked.frames)
+                wrong = found.verdicts.keys() - {"right", "none"}
+                rows.expect(not wrong, f"{who}, {kind.name}: wrong answers")
+                if who == "noise stated" and not asked.quick:
+                    judge_row(kind, found, asked.frames, rows)
+        if asked.peers:
+            ask_peers(stars, made, rows)
+
+
+def judge_row(kind: Kind, found: Found, count: int, rows: Rows) -> None:
+    """Compare a row with what is asked of it."""
+    permitted = count - found.refused.total() + found.refused["missed"]
+    least = min(kind.rate * count, permitted)
+    ms = found.milliseconds
+    rows.expect(found.verdicts["right"] >= least, f"{kind.name}: fewer than {least:.0f}")
+    rows.expect(float(np.mean(ms)) <= kind.mean_ms, f"{kind.name}: mean above {kind.mean_ms} ms")
+    rows.expect(max(ms) <= MAX_MS, f"{kind.name}: a frame above {MAX_MS} ms")
+
+
+if __name__ == "__main__":
+    sys.exit(ended(main))
