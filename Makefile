@@ -9,6 +9,9 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 
+# Tests and builds start many processes; each compiles all modules again where none may be kept.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
 .PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reports docs pictures golden release clean

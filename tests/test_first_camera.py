@@ -24,14 +24,15 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.fixture
-def blind(cache, monkeypatch):
+@pytest.fixture(scope="module")
+def blind(cache):
     """The database of all fields, built by the first test."""
-    monkeypatch.setenv("STARCAT_CACHE", str(cache))
-    return Matcher.open(blind_database())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STARCAT_CACHE", str(cache))
+        return Matcher.open(blind_database())
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def frames(blind):
     sky, noise = blind.database, Noise(0.2, noise_mag=0.1, limit_mag=4.8)
     return list(simulate_frames(sky.directions, TRUE, 3, noise, 11, mag=sky.mag))

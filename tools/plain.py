@@ -67,37 +67,28 @@ def markdown(path):
         lines.append(re.sub(r"^\s*([-*]|\d+\.)\s", "", line).strip())
 
 
+def is_text(node):
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
 def python(path):
     text = path.read_text()
-    tree = ast.parse(text)
     seen = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(text)):  # a node comes before its parts
         body = getattr(node, "body", None)
         for one in body if isinstance(body, list) else []:
-            if (
-                isinstance(one, ast.Expr)
-                and isinstance(one.value, ast.Constant)
-                and isinstance(one.value.value, str)
-            ):
+            if isinstance(one, ast.Expr) and is_text(one.value):
                 seen.add(id(one.value))
                 yield from (("docstrings", one.lineno, s) for s in sentences(one.value.value))
-    for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             seen.update(map(id, node.values))
             parts = [v.value if isinstance(v, ast.Constant) else "..." for v in node.values]
-            yield from (
-                ("strings", node.lineno, s)
-                for s in sentences("".join(parts))
-                if len(s.split()) >= 5
-            )
-    for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Constant)
-            and isinstance(node.value, str)
-            and id(node) not in seen
-            and len(node.value.split()) >= 5
-        ):
-            yield from (("strings", node.lineno, s) for s in sentences(node.value))
+            said = "".join(parts)
+        elif is_text(node) and id(node) not in seen and len(node.value.split()) >= 5:
+            said = node.value
+        else:
+            continue
+        yield from (("strings", node.lineno, s) for s in sentences(said) if len(s.split()) >= 5)
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.COMMENT and len(token.string.split()) >= 4:
             yield "comments", token.start[0], token.string.lstrip("# ").strip()
