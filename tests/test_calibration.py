@@ -403,6 +403,7 @@ def test_python_calibrates_with_strings(small_artifact, small_frames):
     assert calibrated_toml(found).startswith("# Calibrated from 12 frames")
 
 
+@pytest.mark.slow
 def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
     small_artifact, small_frames, tmp_path
 ):

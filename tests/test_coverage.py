@@ -319,6 +319,7 @@ def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     assert warning.split(":")[0] in (made.folder / "report" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
     narrow = {"camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 20.0}}
     with pytest.raises(

@@ -87,6 +87,7 @@ def test_one_file_of_centroids_is_enough(blind, frames, tmp_path):
     assert not found.has_distortion
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_distortion_is_found_where_the_stars_support_it(blind, frames, tmp_path):
     paths = []

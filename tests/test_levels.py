@@ -288,6 +288,7 @@ def built(starcat, sao_lines, tmp_path):
     return tmp_path / "dist" / "range-1.0.0"
 
 
+@pytest.mark.slow
 def test_an_artifact_of_a_range_is_asked_from_the_command_line(
     starcat, built, small_artifact, tmp_path
 ):

@@ -331,6 +331,7 @@ def answers_to_random_points(artifact: Path, seed: int, count: int) -> int:
     return answers
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_random_points_are_never_identified_where_noises_are_stated(ground):
     # One frame in a thousand million may be, whatever is stated.

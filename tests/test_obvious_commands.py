@@ -285,6 +285,7 @@ def test_folders_and_patterns_are_taken_where_frames_are(starcat, small_artifact
     assert [one["frames"] for one in facts] == [5, 5, 5]
 
 
+@pytest.mark.slow
 def test_init_takes_a_response_of_a_file(starcat, tmp_path):
     response = tmp_path / "sensor.csv"
     response.write_text("400,0.1\n500,0.5\n600,0.6\n700,0.4\n800,0.1\n")

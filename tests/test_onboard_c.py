@@ -155,6 +155,7 @@ int main(int argc, char **argv) {
 """
 
 
+@pytest.mark.slow
 def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
     example, *others = re.findall(r"```c\n(.*?)```", PAGE, re.DOTALL)
     strict = [compiler(), "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{tmp_path}"]
@@ -200,6 +201,7 @@ def test_the_library_calls_nothing_but_five_functions_of_libm(folder):
     assert undefined(folder, "-DSTARCAT_SINGLE") == {f"{name}f" for name in LIBM}
 
 
+@pytest.mark.slow
 def test_the_functions_of_libm_can_be_replaced(folder, tmp_path):
     if shutil.which("nm") is None:
         pytest.skip("nm is missing")

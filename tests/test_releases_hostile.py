@@ -244,6 +244,7 @@ print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcom
 """
 
 
+@pytest.mark.slow
 def test_publish_and_pull_without_what_posix_has(small_artifact, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_POSIX, str(small_artifact)],

@@ -39,6 +39,7 @@ def make(parts, folder: Path, **options):
     return ingest_to_store("2mass", parts, folder, options=StoreOptions(**{**SMALL, **options}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"workers": 1, "memory_bytes": 1 << 30}, {"workers": 3}])
 def test_any_workers_and_memory_write_the_same_bytes(options, parts, whole, tmp_path):
     made = make(parts, tmp_path / "store", **options)

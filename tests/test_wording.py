@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,7 @@ def literals(tree: ast.Module) -> list[str]:
     ]
 
 
+@cache
 def modules() -> dict[str, ast.Module]:
     """Return the modules that other interfaces than the command line use, by name."""
     paths = {
@@ -139,7 +141,7 @@ def starcat_open(folder: Path):
 def client(tmp_path_factory, small_artifact):
     root = tmp_path_factory.mktemp("wording")
     add_database(root, small_artifact)
-    with client_of(root, anonymous="publisher", query_time_s=10.0) as client:
+    with client_of(root, anonymous="publisher", query_time_s=3.0) as client:
         yield client
 
 

@@ -735,6 +735,7 @@ def test_an_artifact_is_evaluated_end_to_end(small_artifact, tmp_path):
     assert "At a glance" not in done.page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path):
     """As the how-to's recipe makes them: two commands, one folder."""
 

@@ -179,7 +179,7 @@ def both(small_artifact, wide_artifact, tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("first", [None, "wide-1.0.0"])
+@pytest.mark.parametrize("first", [None, pytest.param("wide-1.0.0", marks=pytest.mark.slow)])
 def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
     """Of a picture without a scale the newest database makes nothing, and the other one solves it;
     a scale says which one to try. The setting names the first one, and not the only one."""
@@ -200,6 +200,7 @@ def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_
             assert ("wide-1.0.0: " in log) == (not scale or first is not None)
 
 
+@pytest.mark.slow
 def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact):
     camera = open_database(small_artifact).camera
     image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
@@ -213,6 +214,7 @@ def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact)
             assert "wide-1.0.0: " in reason
 
 
+@pytest.mark.slow
 def test_the_page_chooses_a_database_too(both, frame, small_artifact):
     camera = open_database(small_artifact).camera
     name, content = "a.fits", picture_of(frame, camera)
@@ -230,6 +232,7 @@ def test_the_page_chooses_a_database_too(both, frame, small_artifact):
         assert "more steps" not in page
 
 
+@pytest.mark.slow
 def test_the_size_of_a_picture_is_taken_from_the_file(both, small_artifact):
     """A picture of another size than the database's camera, of which only the field is stated."""
     known = open_database(small_artifact)

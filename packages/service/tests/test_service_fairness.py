@@ -269,6 +269,7 @@ def test_requests_at_the_same_time_are_counted_by_user():
         pass
 
 
+@pytest.mark.slow
 def test_connections_are_shared_by_address(tmp_path, small_artifact):
     add_database(tmp_path / "root", small_artifact)
     with serve(tmp_path / "root", tmp_path / "log") as served:

@@ -122,6 +122,7 @@ def endless() -> None:
     sys.stdout.buffer.write(b"x" * (1 << 21))
 
 
+@pytest.mark.slow
 def test_a_worker_that_sends_a_message_without_end_is_not_read(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
     worker = WorkerProcess(f"{Path(__file__).stem}:endless", max_bytes=1 << 20)
@@ -283,6 +284,7 @@ def test_buckets_count_what_many_threads_take():
     assert waits.count(0.0) == 6000
 
 
+@pytest.mark.slow
 def test_estimates_of_the_child_process_are_the_same():
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     catalogs, remote = Catalogs(), ChildCatalogs()
@@ -307,6 +309,7 @@ def test_estimates_of_the_child_process_are_the_same():
         remote.close()
 
 
+@pytest.mark.slow
 def test_who_waits_for_a_process_that_ends_is_told(monkeypatch):
     remote = ChildCatalogs()
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})

@@ -123,6 +123,7 @@ def test_damaged_records_are_named_with_the_backup_at_the_start(tmp_path):
     assert str(tmp_path / "records.sqlite") in str(told.value)
 
 
+@pytest.mark.slow
 def test_damaged_records_are_told_while_the_service_runs(own):
     with client_of(own) as client:
         assert client.get("/readyz").status_code == 200

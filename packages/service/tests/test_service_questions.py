@@ -266,7 +266,10 @@ DAMAGED = {
 }
 
 
-@pytest.mark.parametrize("name", DAMAGED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name == "large.png")) for name in DAMAGED],
+)
 def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, root, name):
     answer = client.post(IDENTIFY, files={"file": (name, DAMAGED[name]())})
     assert answer.status_code in (413, 422), answer.text
