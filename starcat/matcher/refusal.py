@@ -19,8 +19,8 @@ Known = Literal["magnitudes", "noise_mag", "noise_px", "dropped", "explained"]
 
 MESSAGES: dict[Reason, str] = {
     "too_few_stars": f"fewer than {MIN_STARS} centroids of the frame are usable",
-    "no_candidate": "no pattern of the frame is one of the database",
-    "prior": "no attitude as near to the prior as its error says explains the frame",
+    "no_candidate": "no pattern of the frame is in the database",
+    "prior": "no attitude within the stated error of the prior explains the frame",
     "chance": "no attitude fits better than chance",
     "share_of_frame": "the best agreement explains too little of the frame",
     "scale": "the frame has another scale or shape than the camera",
@@ -55,7 +55,7 @@ def known_of(
 
 
 _MAGNITUDES = Clause("give magnitudes", unless="magnitudes")
-_FALSE_STARS = Clause("leave out centroids that are no stars")
+_FALSE_STARS = Clause("leave out centroids that are not stars")
 _EXPLAIN = Clause(
     "have other fields and the mirrored frame tried: explain=True", unless="explained"
 )
@@ -63,7 +63,7 @@ _EXPLAIN = Clause(
 CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     "too_few_stars": (
         Clause("find more stars, with a longer exposure or a lower threshold"),
-        Clause("look at 'dropped' for those that were not used", only_if="dropped"),
+        Clause("see 'dropped' for the centroids that were not used", only_if="dropped"),
     ),
     "no_candidate": (
         Clause("allow a wider tolerance of centroids (tolerance_px)"),
@@ -145,13 +145,13 @@ class Refusal:
         ``mirrored`` (it would be found upside down), or ``time`` and ``steps`` (the limit that
         ended the search).
     n_matched : int
-        Centroids with a star in the best agreement; 0 where there was none.
+        Centroids with a star in the best agreement; 0 without an agreement.
     false_match_probability : float
-        Bound on the probability that chance agrees as well as it; 1 where there was none.
+        Bound on the probability that chance agrees as well; 1 without an agreement.
     share : float
-        Share of the frame that it explains, by weight; 0 where there was none.
+        Share of the frame that the best agreement explains, by weight; 0 without an agreement.
     n_centroids : int
-        Usable centroids of the frame; 0 where that is not known.
+        Usable centroids of the frame; 0 if not known.
     camera : Camera or None
         The camera that explains the frame in another field of view or mirrored, if one does.
     focal_error : float or None
@@ -160,13 +160,13 @@ class Refusal:
         Whether the caller stated that the frame is turned over (``flip``); None without a
         statement. It changes the words about a mirrored frame.
     stated_fov_deg : float or None
-        Field across the width that was stated, where ``focal_error`` is known.
+        Field across the width that was stated, if ``focal_error`` is known.
     is_of_database : bool
         Whether that is the field of the database's own camera.
     tried_fov_deg : (float, float) or None
         Narrowest and widest field that was searched, if other fields were.
     known : frozenset of str
-        What the caller has given, and what was tried: advice of which the hint has none.
+        Inputs that the caller gave, and attempts that were made: the hint does not advise them.
     """
 
     reason: Reason

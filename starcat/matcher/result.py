@@ -46,8 +46,8 @@ Origin = Literal["lost_in_space", "tracking"]
 
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
-"""Bytes of ``starcat_answer`` (``many.h``) where its arrays begin, and where those of the star
-numbers and star rows of the centroids follow."""
+"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
+star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class MatchResult:
     status : {"identified", "no_match", "too_few_stars"}
         Only ``identified`` comes with stars and an attitude.
     star_index : ndarray of int32, shape (N,)
-        Row of the database, -1 where none.
+        Row of the database for each centroid, -1 without a star.
     matrix : ndarray of float64, shape (3, 3)
         Attitude, body from ICRS: ``v_body = matrix @ v_icrs``, with x right, y down and z along
         the boresight. NaN unless identified.
@@ -71,16 +71,16 @@ class MatchResult:
         Row and reason of every centroid that was not used: ``not_finite``, ``out_of_frame``
         or ``duplicate``.
     camera : Camera or None
-        The camera that the answer holds for: the one that was given, with the focal length that
-        was found where it was looked for. None unless identified.
+        The camera that the answer holds for: the camera that was given, with the fitted focal
+        length if it was fitted. None unless identified.
     focal_length_error_px : float or None
-        Standard error of that focal length; None where it was not looked for.
+        Standard error of a fitted focal length; None if it was not fitted.
     origin : {"lost_in_space", "tracking"}
-        Whether the whole sky was searched, or what is near a prior attitude.
+        Whether the whole sky was searched, or the surroundings of a prior attitude.
     refusal : Refusal or None
         Why there is no answer; None for an answer.
     time_s : float
-        Time that the answer took; NaN where nobody measured. It is no part of the answer.
+        Time that the answer took; NaN if not measured. Answers are compared without it.
     n_not_searched : int
         Usable centroids that the search left out, because the frame has more than the 512
         brightest; their stars are not known. 0 in nearly all frames.
@@ -101,8 +101,8 @@ class MatchResult:
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     n_not_searched: int = 0
-    # The frame as it was given, the stars, and the noise of a centroid where it was stated: what
-    # the properties are made of when they are asked for.
+    # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
+    # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
@@ -144,7 +144,7 @@ class MatchResult:
 
     @cached_property
     def star_ids(self) -> NDArray[np.int64]:
-        """Permanent star number of each centroid, shape (N,), -1 where none."""
+        """Permanent star number of each centroid, shape (N,), -1 without a star."""
         if self._record is not None:
             return np.ndarray(len(self.star_index), np.int64, self._record, IDS_AT)
         if self.database is None or not self.ok:
@@ -198,10 +198,10 @@ class MatchResult:
     def covariance_arcsec2(self) -> NDArray[np.float64]:
         """Covariance of the attitude, shape (3, 3); NaN unless identified.
 
-        Of the small rotations about the axes of the camera frame (x right, y down, z along the
-        boresight), square arcseconds. With the stated noise of a centroid where there is one, else
-        with that of the residuals, widened so that three standard errors have the coverage of three
-        standard deviations (Student's t). The camera is taken as exact.
+        It is for small rotations about the axes of the camera frame (x right, y down, z along the
+        boresight), in square arcseconds. It uses the noise of a centroid if that is stated, else
+        the noise of the residuals, widened so that three standard errors have the coverage of
+        three standard deviations (Student's t). The camera is taken as exact.
         """
         if self._record is not None:
             return np.ndarray((3, 3), np.float64, self._record, COVARIANCE_AT)
@@ -212,10 +212,10 @@ class MatchResult:
 
     @cached_property
     def reduced_chi_square(self) -> float:
-        """Squared residuals in the stated noise, a degree of freedom; NaN if none is stated.
+        """Squared residuals over the stated noise, per degree of freedom; NaN without a noise.
 
-        It is 1 on average where ``noise_px`` or ``sigma_px`` is right, the square of how many
-        times too small where it is not. Errors of the camera raise it too.
+        It is 1 on average if ``noise_px`` or ``sigma_px`` is right, and k^2 if the stated noise is
+        k times too small. Errors of the camera raise it too.
         """
         return reduced_chi_square(self.stars, self._free)
 
@@ -312,8 +312,8 @@ class MatchResult:
         Returns
         -------
         dict
-            Numbers, texts, lists, dicts and None only, so that ``json.dumps`` writes it: what is
-            NaN is None. ``stars`` has one entry per centroid, in the order of the frame.
+            Only numbers, texts, lists, dicts and None, so that ``json.dumps`` writes it: None
+            stands for NaN. ``stars`` has one entry per centroid, in the order of the frame.
 
         Raises
         ------
@@ -483,7 +483,7 @@ class MatchResult:
 
 
 def _facts(result: MatchResult) -> dict[str, Any]:
-    """Return what an answer says of the whole frame, as JSON has it."""
+    """Return the values of an answer for the whole frame, as in its JSON."""
     found: dict[str, Any] = {"status": result.status, "origin": result.origin}
     found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
     if result.ok:
@@ -572,7 +572,7 @@ NO_MATRIX.flags.writeable = False
 def no_match(
     count: int, dropped: Dropped = (), refusal: Refusal | None = None, **facts: Any
 ) -> MatchResult:
-    """Return the answer to a frame of so many centroids that was not identified.
+    """Return the answer to a frame of ``count`` centroids that was not identified.
 
     ``facts`` are further fields of the answer.
     """

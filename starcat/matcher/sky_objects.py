@@ -36,7 +36,7 @@ SIP_ERROR_PX = 0.005
 """The first order that is as good as this, at every place that is looked at, is taken."""
 
 FIRST_CENTRE_PX = 0.5
-"""Where the centre of the first pixel is, which FITS calls 1."""
+"""Place of the centre of the first pixel; FITS calls it 1."""
 
 _log = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
 
 @lru_cache(maxsize=16)
 def _sip(camera: Camera, bottom_up: bool) -> tuple[Array, Array, Array, Array]:
-    """Return the polynomials that take the distortion away, and those that put it back."""
+    """Return the polynomials that remove the distortion, and the polynomials that add it."""
     # The ends of an interval want more places than its middle.
     along = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41))
     x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
@@ -132,10 +132,10 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
 
 
 def plot(result: Any, output: Any, image: Any, name: str) -> Figure:
-    """Return the picture of a result, drawn by the room of pictures where it is installed."""
+    """Return the picture of a result, drawn by `starcat.images` if that is installed."""
     try:
-        # That room stands below this one, and is as far from it as astropy is: whoever only
-        # matches has neither.
+        # `starcat.images` uses this package and is optional here, as astropy is: a small install
+        # that only matches has neither.
         pictures = import_module("starcat.images.picture")
         drawn: Figure = pictures.draw_result(result, output, image, name)
     except ModuleNotFoundError as error:

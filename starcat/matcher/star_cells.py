@@ -1,7 +1,7 @@
 """Stars of a database near directions: in a cap, and by cells of the sky.
 
-Most of the many candidates of a frame are wrong. The cells tell quickly how many centroids each
-candidate explains. They are made when a database first needs them.
+Most of the many candidates of a frame are wrong. With the cells it is quick to count the centroids
+that each candidate explains. They are made when a database first needs them.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Reference stars, and consensus: which names of single centroids agree with each other.
 
 Several methods compare the neighbourhood of one centroid, the reference star, with that of
-every star. The centroid nearest to the centre of the frame is tried first, because most of its
+each star. The centroid nearest to the centre of the frame is tried first, because most of its
 neighbours are in the frame.
 
-Some methods rank stars for every centroid on its own; a name is one such star for one centroid.
-Two names can both be right only if the two stars are as far apart as the two centroids. The
-names that agree with the most others in this way come first.
+Some methods rank stars for every centroid on its own; a name is a pair of a centroid and one of
+these stars. Two names can both be right only if the two stars are as far apart as the two
+centroids. The names that agree with the most other names come first.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
 
 MAX_NAMES = 2048
-"""Largest number of names that are compared; where there are more, low ranks are left out."""
+"""Largest number of names that are compared; if there are more, low ranks are left out."""
 
 
 def consistent_candidates(
@@ -38,13 +38,13 @@ def consistent_candidates(
     """Propose the names of centroids that agree with each other, at most ``most`` pairs.
 
     ``ranked`` has rows of the database's stars for every centroid, shape (N, K), the best first;
-    -1 where there is none. The first candidate is one correspondence: the pair with the highest
+    -1 if there are fewer. The first candidate is one correspondence: the pair with the highest
     support and all names that agree with both and with each other. Then every pair follows by
-    falling support, and among equal ones by falling separation.
+    falling support, and pairs of equal support by falling separation.
 
     The support of a name is the number of other centroids with a name that agrees with it. True
-    names agree with each other and false ones rarely do, however many there are. The support
-    of a pair is the sum of the support of both names.
+    names agree with each other; false names rarely do, even if there are many. The support of a
+    pair is the sum of the support of both names.
     """
     centroid, star = _names(ranked)
     fits = consistent(centroid, star, observation, database)
@@ -234,9 +234,9 @@ def by_reference(
     """Propose the best of every reference star, then the next ranks of all of them together.
 
     Each of ``proposals`` returns the candidates of a reference star, given its row, the best first;
-    the second is asked when all reference stars have been asked the first. The papers stop at the
-    best star of the reference star nearest to the centre. Here another reference star decides where
-    that one is a false star, or has lost its neighbours.
+    the second one is called after the first was called for all reference stars. The papers stop at
+    the best star of the reference star nearest to the centre. Here another reference star decides
+    if that one is a false star, or has lost its neighbours.
     """
     found: list[Candidates] = []
     for propose in proposals:

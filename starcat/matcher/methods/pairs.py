@@ -82,7 +82,7 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
 def _with_the_same_star(
     stars: Rows, ascending: Rows, observation: Observation
 ) -> tuple[Rows, Rows]:
-    """Return where each star is in others that ascend, which takes steps by how often it is."""
+    """Return the places of each star in ``ascending`` rows; every place found costs steps."""
     low = np.searchsorted(ascending, stars, side="left")
     high = np.searchsorted(ascending, stars, side="right")
     joined = len(stars) + len(ascending) + int((high - low).sum())

@@ -5,10 +5,10 @@ that touches the sphere at it, and turned so that the nearest one beyond a buffe
 neighbour, lies on the +x axis. Every occupied cell is a vote for the stars whose pattern has it.
 Needs the product ``grid``.
 
-Radial and cyclic (Zhang et al. 2008): the rings around a centroid that have a neighbour in are
-compared with those of every star, then the sectors, as a cycle without a beginning. That names
-single stars and tells no direction: which names agree with each other, consensus says. Needs the
-product ``radial``.
+Radial and cyclic (Zhang et al. 2008): the rings around a centroid that contain a neighbour are
+compared with the rings of every star, then the sectors, as a cycle without a beginning. The result
+is a name for a single centroid, without a direction; the module `consensus` finds which names agree
+with each other. Needs the product ``radial``.
 """
 
 from __future__ import annotations
@@ -117,10 +117,10 @@ ROUNDS = ((3, 16), (12, 32), (48, 64))
 """How many centroids are compared, from the centre, and how many names each of them gets."""
 
 MAX_PAIRS = 200
-"""Pairs of names proposed in a round at the most."""
+"""Largest number of pairs of names that are proposed in one round."""
 
 COMPARED = 2
-"""Sectors are compared for this many times as many stars as are wanted."""
+"""Number of stars whose sectors are compared, over the number of stars that are needed."""
 
 TOUCHED = 0.5
 """Weight of a ring without a centroid that a centroid's tolerance touches."""

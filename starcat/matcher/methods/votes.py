@@ -71,12 +71,12 @@ class NeighbourTable:
     """The stars around every star of a database, in small units."""
 
     radius_rad: float
-    # The neighbours of star s are those from offsets[s] to offsets[s + 1]; shape (N + 1,).
+    # The neighbours of star s are at offsets[s] to offsets[s + 1]; shape (N + 1,).
     offsets: NDArray[np.int64]
     star: NDArray[np.int32]  # row of the database; shape (M,)
     apart: NDArray[np.uint16]  # separation, the radius over `APART`; shape (M,)
     turn: NDArray[np.uint8]  # position angle, a turn over 256; shape (M,)
-    magnitude: NDArray[np.uint8]  # in units from `BRIGHTEST` on; `UNKNOWN` where it is not known
+    magnitude: NDArray[np.uint8]  # in units from `BRIGHTEST` on; `UNKNOWN` if not known
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def position_angle(centre: Directions, other: Directions) -> Array:
     x, y, z = centre.T
     none = np.zeros(len(centre))
     polar = z * z > 0.5
-    # The cross products of two axes with the centre; the second one where it is near the first.
+    # The cross product of an axis with the centre; a second axis if the centre is near the first.
     east = np.where(polar, [z, none, -x], [-y, x, none]).T
     east /= np.linalg.norm(east, axis=1)[:, None]
     north = np.cross(centre, east)
