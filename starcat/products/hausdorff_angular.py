@@ -1,6 +1,6 @@
 """The product ``hausdorff_angular``: every star's neighbours by separation.
 
-Separations do not change as the camera turns. A row is one neighbour of one star.
+Separations do not change as the camera turns. Each row holds a neighbour of a star.
 """
 
 from __future__ import annotations
