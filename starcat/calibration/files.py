@@ -1,7 +1,7 @@
 """Calibration of the camera of files: frames in; a camera file and a drawing of residuals out.
 
-The camera file says in comments what is known about the camera's errors; the drawing shows the
-residuals over the detector and with the radius.
+Comments in the camera file give the errors of the camera; the drawing shows the residuals over
+the detector and with the radius.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Share by which the focal length of the camera to start from may be wrong, where no range of
-# fields is given.
+# Share by which the focal length of the first camera can be wrong, if no range of fields is
+# given.
 USUAL_ERROR = 0.1
 
 
@@ -256,7 +256,7 @@ def _draw_arrows(axes: Axes, calibration: Calibration) -> None:
     dx, dy = (fit.residual_px * enlarged).T
     stray = np.hypot(*fit.residual_px.T) > 4.5 * fit.noise_px
     for which, colour in ((~stray, _BLUE), (stray, _RED)):
-        # Strays point where they were seen, but no farther than the eye can use.
+        # Arrows of stray centroids point to the measured place, but have a largest length.
         longest = 2.0 * _LONG_ARROW * camera.width_px
         size = np.minimum(1.0, longest / np.maximum(np.hypot(dx, dy), 1e-9))[which]
         axes.quiver(

@@ -14,14 +14,12 @@ from scipy.stats import binom
 from starcat.arrays import Array, Mask, Rows
 
 HUBER = 1.345  # deviations, in their noise, from which on a measurement counts less
-OF_A_BIN = 100  # measurements of a bin of magnitude at the least
+OF_A_BIN = 100  # smallest number of measurements in a bin of magnitude
 MAX_BINS = 48
-COMPLETE = 0.85  # share of what the best bins see, from which on stars are expected
-COVERED = (
-    1e-3  # a frame that misses so many as one in a thousand does says nothing of what it lacks
-)
+COMPLETE = 0.85  # stars are expected in a bin that sees this share of the best bins
+COVERED = 1e-3  # frames that miss more stars than 99.9 % of all frames are ignored
 MIN_COLOURS = 10  # stars of known colour that a colour term needs
-MIN_STEPS, MAX_STEPS = 10, 50  # of the fit; each has new weights
+MIN_STEPS, MAX_STEPS = 10, 50  # steps of the fit; each has new weights
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Terms:
     zero_point_error_mag: float
     colour_term: float | None  # None where too few stars have a colour
     colour_term_error: float | None
-    frame_offset_mag: Array  # of each frame, beside the zero point; 0 unless they were fitted
+    frame_offset_mag: Array  # offset of each frame from the zero point; 0 unless fitted
 
     def predicted(self, mag: Array, colour: Array, frame: Rows | None) -> Array:
         """Return the magnitudes that the sensor should measure, in frames or in a usual one."""
@@ -109,8 +107,8 @@ def _error(pull: Array, star: Rows) -> float:
 class Depth:
     """How deep the frames see."""
 
-    limit_mag: float  # measured magnitude from which stars are missed; inf where none are
-    chance: Array  # that each sighting is seen; NaN where nothing is expected
+    limit_mag: float  # measured magnitude from which stars are missed; inf if none are
+    chance: Array  # probability that each sighting is seen; NaN if it is not expected
 
 
 def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) -> Depth:
