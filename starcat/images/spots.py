@@ -67,10 +67,10 @@ def electrons_per_step(levels: SkyLevels) -> float:
 
 
 def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
-    """Return the answer to an image, weighted by the noise of its spots where that is their error.
+    """Return the answer to an image, weighted by the noise of its spots if that is their error.
 
-    In a lens that is not calibrated it is not all of it, and in a picture whose sky was clipped it
-    is not known: there all spots weigh the same.
+    An uncalibrated lens adds further errors, and in a picture with a clipped sky the noise is not
+    known: then all spots have the same weight.
     """
     if not result.ok:
         return result
@@ -81,7 +81,7 @@ def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
 
 SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
 _STEP = 1.15
-_HALF_PX = 16  # a star is looked at this far to each side
+_HALF_PX = 16  # pixels on each side of a star that are used
 _REACH_SIGMA = 4.0
 _MAX_SPOTS = 150
 _SPOTS_AT_ONCE = 2000  # noise can have tens of thousands, each of which takes 9 kB or more

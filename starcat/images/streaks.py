@@ -38,7 +38,7 @@ _OF_LONGEST = 0.5  # bars shorter than this part of the longest ones are pieces 
 class Streak:
     """The bar that a star draws."""
 
-    dx_px: float  # from one end to the other, to the right; which end is first is not known
+    dx_px: float  # one end minus the other, to the right; which end is first is not known
     dy_px: float
     psf_sigma_px: float  # standard deviation of the spot that was drawn along the bar
 
@@ -71,7 +71,7 @@ class Streak:
     def sigma_px(self, flux: Array, noise: Array, gain_e_per_adu: float) -> Array:
         """Return the standard error of middles, the same along and across: the mean of both.
 
-        That of the best fit of a bar much longer than wide: along it only the ends tell.
+        It holds for the best fit of a bar much longer than wide: along it only the ends count.
         """
         length, spot = max(self.length_px, self.psf_sigma_px), self.psf_sigma_px
         bright = np.where(flux > 0.0, flux, np.nan)
