@@ -1,7 +1,7 @@
 """The process that runs the queries of a session, as the session sees it.
 
-It is started once and asked many times. One that takes too long is killed, and so is one whose
-question was dropped halfway; the next question starts another.
+It is started once and runs many queries. It is killed if a query takes too long, or if the caller
+drops a query halfway; the next query starts a new process.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from starcat.workers.messages import (
 from starcat.workers.process import WorkerProcess
 
 MAX_MESSAGE_BYTES = 1 << 30  # size of a message of the process
-OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
-ENDING_S = 1.0  # how long a process whose pipe is closed may take to end
+OPENING_S = 60.0  # seconds that a process may take to open the targets
+ENDING_S = 1.0  # seconds that a process may take to end after its pipe is closed
 _FUNCTION = "starcat.query.worker:serve_queries"
 
 
@@ -77,7 +77,7 @@ def _end_waiting() -> None:
 
 
 class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
-    """A process that ended by itself while it was asked, with what is known of why."""
+    """A process ended by itself during a query; the message has the reason if it is known."""
 
 
 class Engine:
@@ -97,9 +97,9 @@ class Engine:
         self._process = self._started()
 
     def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
-        """Make views and macros by SQL; from here on the process reads nothing but some files.
+        """Make views and macros by SQL; from then on the process reads only ``files``.
 
-        The SQL names them from a folder on; ``macros`` are those that stand after FROM.
+        The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM.
         """
         opened = sql, folder, files, sorted(macros)
         self.ask("open", *opened)
@@ -145,7 +145,7 @@ class Engine:
             process = _spawned()
         self.is_patient = False
         process.max_bytes = self._opening.message_bytes
-        with suppress(OSError):  # that it ended is found out when it is asked
+        with suppress(OSError):  # the next query finds out that it ended
             process.send(asdict(self._opening))
         return process
 
@@ -159,7 +159,7 @@ class Engine:
     ) -> list[Any]:
         try:
             given = [encoded(argument) for argument in arguments]
-        except Exception as error:  # whatever somebody's own class does
+        except Exception as error:  # a user's own class can raise anything
             raise QueryError(f"a value of the query cannot be passed on: {error}") from error
         parts: list[Any] = []
         is_over = False

@@ -56,7 +56,7 @@ def short_names(many: int) -> list[str]:
 
 
 def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
-    """Return names that differ from each other and from those that are taken.
+    """Return names that differ from each other and from the names that are taken.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Where on the sky the partitions of a store are, as the macros of SQL compare it with places.
+"""The areas of the sky that the partitions of a store cover, for the macros of SQL.
 
-From pixels to circles and boxes around them. No package for HEALPix is loaded: four corners and a
-centre are what is wanted, and loading one takes longer than a query.
+Pixels become circles and boxes around them. No package for HEALPix is loaded: only four corners and
+a centre are needed, and loading a package takes longer than a query.
 
 References
 ----------
@@ -40,7 +40,7 @@ def extents(pixels: Sequence[Pixel]) -> Array:
     centre, middle, _ = _place(order, number, 0.5, 0.5)
     corners = [_place(order, number, *corner) for corner in _CORNERS]
     reach = np.max([separation(centre, corner) for corner, _, _ in corners], axis=0)
-    # The pole has no right ascension; the corners beside it have those of the sides.
+    # The pole has no right ascension; the neighbouring corners have the range of the sides.
     east = np.array([np.where(is_pole, 0.0, _turned(ra - middle)) for _, ra, is_pole in corners])
     dec = np.degrees([np.arcsin(corner[:, 2]) for corner, _, _ in corners])
     first = middle + east.min(axis=0) - MARGIN_DEG
