@@ -43,8 +43,8 @@ class Contents:
     mag: Array  # magnitudes; NaN where unknown; shape (N,)
     method: str
     features: Rows  # rows of the stars of each triangle or pair, in any order
-    manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros where there is no manifest
-    stars_per_cell: int = 1  # of the grid, on average
+    manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros without a manifest
+    stars_per_cell: int = 1  # average of the grid
 
     @property
     def grid(self) -> CellGrid:
@@ -54,7 +54,7 @@ class Contents:
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image and where its stars are from."""
+    """An image and the origin of its stars."""
 
     data: bytes
     star_rows: NDArray[np.int64]  # the row in the contents of each star of the image; shape (N,)
