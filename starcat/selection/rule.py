@@ -15,8 +15,8 @@ from starcat.stars.verdict import Verdicts
 class RuleReason:
     """Why a rule rejects a star."""
 
-    name: str  # as the column ``reason`` of the product ``rejected`` has it
-    value: str  # the same in words, for pages and reports
+    name: str  # the value of the column ``reason`` of the product ``rejected``
+    value: str  # the reason in words, for pages and reports
 
 
 @dataclass(frozen=True)
