@@ -132,7 +132,7 @@ def synthetic_magnitudes(response: Response) -> Array:
 
 
 def zero_mag(response: Response, weights: Array) -> float:
-    """Return the magnitude, from a signal alone, of what has 0 mag in the band."""
+    """Return the magnitude, computed from the signal alone, of a star of 0 mag in the band."""
     kind, _, said = response.zero_point.partition(" ")
     if kind == "vega":
         return float(-2.5 * np.log10(library().vega @ weights)) - float(said)
