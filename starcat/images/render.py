@@ -116,7 +116,7 @@ def write_simulated(path: Path, frame: SimulatedFrame, camera: Camera, seed: int
         return
     if suffix not in WRITTEN_KINDS:
         raise ConfigError(
-            f"{path}: the suffix is not of a kind that starcat writes; end the name with one of "
+            f"{path}: the name has no suffix of a frame that starcat writes; end it with one of "
             f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
         )
     size = camera.width_px, camera.height_px

@@ -1,4 +1,4 @@
-"""Frames of a camera of which only a range of fields of view is known.
+"""Frames of a camera whose field of view is only known as a range.
 
 Each level of the database serves a part of the range: it is a database of its own, with the stars
 and the triangles of that level alone, for frames of about one field of view; within that part the
@@ -46,10 +46,10 @@ BRIGHTEST = TriangleOrder(most_centroids=10)
 """Triangles if magnitudes are known: of the same bright stars as the triangles of a level."""
 
 BY_CHANCE = 1.0
-"""Candidates of a batch that are worked out although they agree by chance, on average."""
+"""Mean number of candidates of a batch that are worked out although they agree by chance."""
 
 _OWN = 3
-"""Centroids of a candidate, which its attitude was computed from."""
+"""Number of centroids of a candidate, from which its attitude was computed."""
 
 BEYOND = 1.25
 """Factor by which the outer levels are used beyond the focal lengths that they are made for: a
@@ -117,7 +117,7 @@ def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
 
 
 def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> ProductArrays:
-    """Return the columns that triangles of an unknown scale are looked up by."""
+    """Return the columns by which triangles of an unknown scale are looked up."""
     u, v, w = (directions[rows] for rows in corners)
     a, b, c = (
         2.0 * np.arcsin(0.5 * np.linalg.norm(one - other, axis=1))
@@ -151,7 +151,7 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class _Search:
-    """One part's frame, its candidates, and the best that came of them."""
+    """The frame of one part, its candidates, and the best agreement so far."""
 
     part: ImagePart
     whole: Observation

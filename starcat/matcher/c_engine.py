@@ -45,12 +45,12 @@ MAX_STEPS = 300_000_000
 """Steps of the library for one frame: about a second. They are smaller than the numpy steps."""
 
 CHUNK = 256
-"""Frames that one thread takes at a time."""
+"""Number of frames that one thread takes at a time."""
 
 STATUSES: dict[int, Status] = {
     0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match",
 }  # fmt: skip
-"""What a frame came to, by the number that the library returns: -14 where the steps are used up."""
+"""Result of a frame, by the number that the library returns: -14 if the steps are used up."""
 
 REASONS: tuple[Reason, ...] = (
     "chance", "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "steps",
@@ -112,7 +112,7 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class _Batch:
-    """What the library has written for many frames of one camera."""
+    """The output of the library for many frames of one camera."""
 
     # One ``starcat_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
     # identified.
@@ -125,12 +125,12 @@ class _Batch:
 
     @cached_property
     def codes(self) -> list[int]:
-        """Return the number that each frame came to."""
+        """Return the result number of each frame."""
         codes: list[int] = self.records["status"].tolist()
         return codes
 
     def result(self) -> BatchResult:
-        """Return it as Python has it; a frame that the library did not take is a no_match."""
+        """Return the batch as Python objects; a frame that the library refused is a no_match."""
         found = self.records
         has_attitude = found["status"][:, None] == _onboard.lib.STARCAT_IDENTIFIED
         attitudes = np.where(has_attitude, found["q_body_from_icrs"], np.nan)
@@ -221,9 +221,9 @@ class Search:
         prior: Prior | None = None,
         sigma_px: Array | None = None,
     ) -> MatchResult | None:
-        """Identify the stars of a frame; None where the library does not take it.
+        """Identify the stars of a frame; None if the library does not take it.
 
-        This is what a call costs beside the library: arrays go there and back as bytes.
+        The overhead of a call is the copying of arrays to the library and back, as bytes.
         """
         count = len(centroids_px)
         if count > self._most:
@@ -352,7 +352,7 @@ def _refusal(
 
 
 class _Memory:
-    """The memory that a call works in, half a megabyte, and views of what it leaves there."""
+    """The memory that a call works in, half a megabyte, and views of the results in it."""
 
     def __init__(self) -> None:
         ffi, most = _onboard.ffi, int(_onboard.lib.STARCAT_MAX_CENTROIDS)
@@ -361,8 +361,8 @@ class _Memory:
 
 
 _FREE: list[_Memory] = []
-"""Memory that no call works in at present. A call takes one from here or makes one, so that there
-are as many as there ever were calls at once; taking and putting back are atomic."""
+"""Memory that no call uses at present. A call takes one from here or makes a new one, so there are
+as many as there were calls at the same time; taking and putting back are atomic."""
 
 
 def _double_pointer(array: Array | None) -> Any:
@@ -397,11 +397,11 @@ def _options(settings: Settings, fov_error: float) -> Any:
 
 
 MAX_FEATURES = 4_000_000
-"""Triangles or pairs of a database that are made an image unasked: that takes a second."""
+"""Largest number of triangles or pairs that ``auto`` makes an image of, which takes a second."""
 
 
 def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
-    """Return the engine of a database, made once; None where the library does not serve it.
+    """Return the engine of a database, made once; None if the library does not support it.
 
     Unless ``always`` is set, no image is made of more than `MAX_FEATURES`.
     """

@@ -42,11 +42,11 @@ MAX_CENTROIDS = 512
 
 @dataclass(frozen=True)
 class Brightest:
-    """The centroids of a frame that are searched, and the frame that they are of."""
+    """The centroids of a frame that are searched, and their whole frame."""
 
     whole: Frame
     rows: Rows  # rows of the whole frame that are searched, ascending
-    dropped: Dropped  # of the whole frame
+    dropped: Dropped  # centroids of the whole frame that are not used
 
     @property
     def frame(self) -> Frame:
@@ -119,7 +119,7 @@ def brightest_of_frames(frames: Frames) -> tuple[Frames, dict[int, Brightest]]:
 
 
 def _first(mag: Array, hashes: NDArray[np.uint64], count: int) -> Rows:
-    """Return the brightest, in order; all that are as bright as the last one are sorted too."""
+    """Return the brightest rows, in order, including all that are as bright as the last one."""
     near = np.arange(len(mag))
     for key in (mag, hashes):
         if len(near) > count:
@@ -148,7 +148,7 @@ SIGMA = "sigma_px"
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """The centroids of one frame, as a file has them."""
+    """The centroids of one frame, as in its file."""
 
     name: str  # name of the frame; the name of the file if the frame has no name
     centroids_px: Array  # pixels, in the order of the file; shape (N, 2)
@@ -161,7 +161,7 @@ class MeasuredFrame:
 
 
 MAX_BYTES = 1 << 30
-"""Of a file of centroids: ten million of them as text."""
+"""Largest size of a file of centroids: ten million centroids as text."""
 
 HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a CSV file whose first line is numbers."""
@@ -171,7 +171,7 @@ def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
     path = Path(path)
     try:
-        # Spreadsheets put a mark of the byte order before the header.
+        # Spreadsheets write a byte order mark before the header.
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing as error:
         text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
@@ -305,7 +305,7 @@ def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
 
 
 def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
-    """Return what a user should know about columns that were not used."""
+    """Return a note for the user about columns that were not used."""
     names = sorted({name for frame in frames for name in frame.ignored})
     if not names:
         return None
@@ -327,7 +327,7 @@ def _number(value: Any, name: str, where: str) -> float:
 
 
 def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
-    """Read the frames of a stream, each as soon as it is there."""
+    """Read the frames of a stream, each as soon as it is complete."""
     rest = enumerate(lines, start=1)
     filled = ((number, line.removeprefix("\ufeff")) for number, line in rest if line.strip())
     begin, first = next(filled, (1, ""))
@@ -344,7 +344,7 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
 
 
 def read_stdin() -> Iterator[MeasuredFrame]:
-    """Read the frames of stdin, each as soon as it is there."""
+    """Read the frames of stdin, each as soon as it is complete."""
     try:
         yield from read_stream(sys.stdin)
     except UnicodeDecodeError as error:

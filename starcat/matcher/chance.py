@@ -111,7 +111,7 @@ def largest_squares_px(
 ) -> Array:
     """Return the largest sums of squared residuals of n stars that are answers, pixels squared.
 
-    It is what `false_match_probability` returns ``limit`` for, where ``noise_px`` is stated.
+    For these sums `false_match_probability` returns ``limit``, if ``noise_px`` is stated.
     ``information`` are determinants of sums of the squared derivatives (`place_information`).
     """
     most = min(n_centroids, stars_in_frame)
@@ -124,9 +124,9 @@ def largest_squares_px(
 
 
 def place_information(body: Array) -> dict[tuple[int, int], Array]:
-    """Return what each direction adds to the sums of products of derivatives by the three angles.
+    """Return the terms of each direction in the sums of products of derivatives by three angles.
 
-    Arrays of shape (N,) by row and column, those above the diagonal once; directions have the
+    Arrays of shape (N,) by row and column, on and above the diagonal; directions have the
     shape (N, 3). In units of the focal length, as `false_match_probability` has them.
     """
     x, y = (body[:, :2] / body[:, 2:]).T
@@ -137,7 +137,7 @@ def place_information(body: Array) -> dict[tuple[int, int], Array]:
 def _sums(body: Array) -> list[list[float]]:
     """Return the sums of the products of 1, x, y, x x, x y and y y, over places (x, y).
 
-    They hold all that the derivatives of the places are made of.
+    All sums of the derivatives of the places follow from them.
     """
     powers = np.empty((6, len(body)))
     powers[0] = 1.0

@@ -1,4 +1,4 @@
-"""The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
+"""The products of an artifact in the matcher: arrays mapped from its HDF5 file.
 
 Only what a method needs is opened. Datasets are not read but mapped; every one is checked against
 its layout when the database is opened, because an index that leads out of its table would
@@ -56,7 +56,7 @@ NEWEST_SCHEMAS = {"stars": 2}
 
 @dataclass(frozen=True)
 class ProductArrays:
-    """One product: its columns and indices by dataset, and the numbers beside them."""
+    """One product: its columns and indices by dataset, and its attributes."""
 
     arrays: Mapping[str, NDArray[Any]]
     numbers: Numbers = field(default_factory=dict)
@@ -72,7 +72,7 @@ class ProductArrays:
 
 @dataclass(frozen=True)
 class Database:
-    """What a matcher needs of an artifact."""
+    """The parts of an artifact that a matcher needs."""
 
     name: str  # ``<name>-<version>``
     camera: Camera  # camera that the database was built for
@@ -298,7 +298,7 @@ def _check_version(found: str, newest: int, product: str, path: Path) -> None:
 def check_product(
     name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, star_count: int
 ) -> None:
-    """Check that a product is as its layout says; `ProductError` names what is not."""
+    """Check that a product has its layout; `ProductError` names the first difference."""
     layout = LAYOUTS[name]
     checks = _Checks(name, arrays, star_count)
     rows = len(arrays[layout.columns[0]])
@@ -393,7 +393,7 @@ class _Checks:
 
 
 def damaged(product: str, what: str, found: str) -> ProductError:
-    """Return the error of a database that no build wrote as it is."""
+    """Return the error for a database that was changed after its build."""
     return ProductError(
         f"{product}/{what} {found}; the database is damaged. Build the database again, or fetch "
         "it again",

@@ -133,7 +133,7 @@ class Matcher(Settings, _WithDatabase):
         verify : bool, default True
             Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
             any change since the build: about 2 ms for each MB of the file. The manifest itself
-            is believed, and a ``database.h5`` without one is not compared; `starcat.verify`
+            is trusted, and a ``database.h5`` without one is not compared; `starcat.verify`
             checks everything. With False only types, lengths, ranges and references are checked.
             An onboard image has checksums of its own, which are always checked.
 

@@ -20,10 +20,10 @@ from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
 STEPS_BEFORE_VOTES = 2000
-"""Steps of comparing patterns before votes are counted."""
+"""Number of steps that compare patterns before votes are counted."""
 
 STEPS_AFTER_VOTES = 5000
-"""Steps of comparing patterns after that, in a frame whose centroids all have a vote."""
+"""Number of steps that compare patterns after the votes, if all centroids of a frame can vote."""
 
 
 def solve(

@@ -1,4 +1,4 @@
-"""One frame as it was given, as the methods see it, and the candidates that they make of it."""
+"""A frame as it was given and as the methods see it, and the candidates that they propose."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ class HasCentroids(Protocol):
 
 
 FrameLike = ArrayLike | HasCentroids | Mapping[str, ArrayLike]
-"""What a caller can give for the centroids of a frame: numbers, a frame, or a table by column."""
+"""Types that a caller can give for the centroids of a frame: numbers, a frame, or a table."""
 
 
 @dataclass(eq=False)  # a frozen one would take three times as long to make
 class Frame:
-    """The centroids of a frame as they were given, and the camera that they were given with."""
+    """The centroids of a frame and the camera, as the caller gave them."""
 
     centroids_px: Pixels
     mag: Array | None  # NaN for a centroid without one
@@ -216,7 +216,7 @@ def as_frames(
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
-    """Return an argument that has to have an entry for each frame; an iterator is run through."""
+    """Return an argument that needs one entry per frame; an iterator becomes a list."""
     if not isinstance(values, str | bytes) and columns_of(values) is None:
         with suppress(TypeError):
             return values if hasattr(values, "__len__") else list(values)
@@ -237,8 +237,8 @@ def _joined(
 ) -> tuple[list[int], Pixels, Array | None, Array | None] | None:
     """Return the sizes of frames and their arrays joined in one go.
 
-    None if they do not fit, or are not all plain arrays of numbers: what a list, a table, a masked
-    array or a quantity holds is found by `as_arrays`.
+    None if they do not fit, or are not all plain arrays of numbers: `as_arrays` reads lists,
+    tables, masked arrays and quantities.
     """
     arrays: list[Array | None] = []
     for given in (centroids_px, *beside):
@@ -274,7 +274,7 @@ def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigE
 class Observation:
     """The usable centroids of a frame.
 
-    They are in order of brightness where magnitudes are known, else the nearest to the centre
+    They are in order of brightness if magnitudes are known, else the nearest to the centre is
     first, so that nothing depends on the order in which they were given.
     """
 
@@ -402,7 +402,7 @@ def _own_order(centroids_px: Pixels, mag: Array | None, camera: Camera) -> Rows:
 
 
 def without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
-    """Return rows without those at exactly the place of an earlier one, and the latter."""
+    """Return rows without repeats of exactly the same place, and the repeats."""
     x = np.sort(given[rows, 0])
     if not (x[1:] == x[:-1]).any():
         return rows, []
@@ -426,7 +426,7 @@ def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Correspondences of m >= 2 centroids and stars, one a row, the most promising first."""
+    """Correspondences of m >= 2 centroids and stars, one per row, the most promising first."""
 
     centroids: NDArray[np.integer[Any]]  # rows of the observation, shape (K, m)
     stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order

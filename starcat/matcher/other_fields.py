@@ -27,7 +27,7 @@ WIDE_FOV_ERROR = 0.15
 """Error of the focal length that is tried first, with the distortion of the stated camera."""
 
 FACTOR = 2.0
-"""Fields from the stated one over this factor to that times it are tried."""
+"""Fields from the stated field divided by this to the stated field times this are tried."""
 
 WIDEST_DEG = 120.0
 """Widest field that is tried; a spec takes no wider one."""
@@ -40,11 +40,11 @@ PARTS = 2
 the smaller the part, the fewer triangles are similar by chance."""
 
 TIME_S = 2.0
-"""Seconds of the processor that all this takes at most, however busy the machine is. No search
-begins that would exceed them if it took as long as the longest before."""
+"""Largest processor time of all these attempts, seconds. No search begins that would exceed it if
+it took as long as the longest search before."""
 
 SEARCHES = 2
-"""Searches for the answer, where the caller does not count them: as stated, and with an error."""
+"""Number of searches before, if the caller does not count them: as stated, and with an error."""
 
 
 Search = Callable[[MeasuredFrame, float, Camera | None, float], MatchResult]

@@ -32,7 +32,7 @@ SHAPE_CHANCE = 3e-3
 """A frame has another shape if noise gives as large a difference less often than this."""
 
 SHAPE_TOLERANCES = 2.0
-"""How far another shape moves the corners at least, in tolerances."""
+"""Smallest shift of the corners by another shape, in tolerances."""
 
 MIN_BREADTH = 1e-4
 """Least breadth of matched stars from which the shape of a frame is measured: the determinant of
@@ -293,7 +293,7 @@ def is_deformed(
     c, d = (yy * x_dy - xy * y_dy) / determinant, (xx * y_dy - xy * x_dy) / determinant
     if 0.5 * math.hypot(a - d, b + c) * corner_px <= SHAPE_TOLERANCES * tolerance_px:
         return False
-    # Of a turn and a scale, and of any linear map: what they leave of the offsets. Of noise, the
+    # The offsets that remain after a turn and a scale, and after any linear map. For noise, their
     # ratio is below r with the probability r**(N - 3) (Fisher's F with 2 and 2N - 6 degrees).
     of_similar = left - ((x_dx + y_dy) ** 2 + (x_dy - y_dx) ** 2) / extent
     of_linear = left - (a * x_dx + b * y_dx + c * x_dy + d * y_dy)

@@ -52,7 +52,7 @@ class Prior:
     error_rad: float
 
     def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
-        """Return an answer if its attitude is as near as the error says."""
+        """Return an answer if its attitude is within the error of the prior."""
         if not answer.ok:
             return answer
         q_found = answer.q_body_from_icrs.tolist()
@@ -70,7 +70,7 @@ class BoresightPrior:
     error_rad: float
 
     def checked(self, answer: MatchResult) -> MatchResult:
-        """Return an answer if its boresight is as near as the error says."""
+        """Return an answer if its boresight is within the error of the prior."""
         if not answer.ok or separation(answer.matrix[2], self.direction) <= self.error_rad:
             return answer
         return _withheld(answer)
@@ -101,11 +101,11 @@ class HasIcrs(Protocol):
 
 
 PriorLike = ArrayLike | HasQuaternion | HasIcrs
-"""What a caller can give as a prior: an attitude, or the direction of the boresight."""
+"""Types that a caller can give as a prior: an attitude, or the direction of the boresight."""
 
 
 def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | BoresightPrior | None:
-    """Return a prior from what a caller states."""
+    """Return a prior from the caller's arguments."""
     if prior is None and error_deg is None:
         return None
     if prior is None or error_deg is None:
@@ -234,5 +234,5 @@ def anchored_pairs(
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:
-    """Return the angle that the errors of centroids may turn a frame by."""
+    """Return the largest angle by which the errors of centroids turn a frame."""
     return 2.0 * tolerance_px / min(camera.width_px, camera.height_px)

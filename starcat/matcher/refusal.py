@@ -1,4 +1,4 @@
-"""Why a frame was not identified, and what to try: only what would be new to the caller."""
+"""Why a frame was not identified, and what to try that the caller has not tried yet."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Reason = Literal[
 ]  # fmt: skip
 
 Known = Literal["magnitudes", "noise_mag", "noise_px", "dropped", "explained"]
-"""What a hint need not say, or can refer to: the caller has stated it, or it was tried."""
+"""Facts that decide which advice a hint gives: inputs that the caller gave, attempts made."""
 
 MESSAGES: dict[Reason, str] = {
     "too_few_stars": f"fewer than {MIN_STARS} centroids of the frame are usable",
@@ -34,7 +34,7 @@ MESSAGES: dict[Reason, str] = {
 
 @dataclass(frozen=True)
 class Clause:
-    """One thing to try, and when it is of use."""
+    """One piece of advice, and its conditions."""
 
     text: str
     unless: Known | None = None
@@ -44,7 +44,7 @@ class Clause:
 def known_of(
     has_magnitudes: bool, noise_px: float | None, noise_mag: float | None, has_dropped: bool
 ) -> frozenset[Known]:
-    """Return what the caller of a search has given."""
+    """Return the inputs that the caller of a search has given."""
     stated: dict[Known, bool] = {
         "magnitudes": has_magnitudes,
         "noise_px": noise_px is not None,
@@ -103,7 +103,7 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
     "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
 }
-"""What to try, by reason. Parameters of Python and of the service stand in brackets."""
+"""Advice by reason. Parameters of Python and of the service stand in brackets."""
 
 
 def _joined(clauses: list[str]) -> str:
@@ -114,7 +114,7 @@ def _joined(clauses: list[str]) -> str:
 HINTS: dict[Reason, str] = {
     reason: _joined([clause.text for clause in clauses]) for reason, clauses in CLAUSES.items()
 }
-"""All that there is to try, by reason."""
+"""All advice of a hint, by reason."""
 
 _NAME = r"[a-z_]+(?:=[\d.]+)?"
 _BRACKETS = re.compile(rf"\(({_NAME}(?:, {_NAME})*)\)")
@@ -191,7 +191,7 @@ class Refusal:
 
     @property
     def message(self) -> str:
-        """The reason as a sentence begins, with the numbers of the best agreement."""
+        """The reason as the start of a sentence, with the numbers of the best agreement."""
         text = MESSAGES[self.reason]
         if self.reason == "mirrored" and self.flip:
             text = "the frame matches only mirrored: it was turned over, and was upright before"

@@ -107,7 +107,7 @@ class MatchResult:
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
-    # What the C library has written: the derived properties, which are views of it.
+    # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
 
     @classmethod
@@ -130,7 +130,7 @@ class MatchResult:
 
     @property
     def fits_fov_deg(self) -> float | None:
-        """Field across the width that explains a frame which the stated field does not, degrees.
+        """Another field across the width that explains the frame if the stated one does not, deg.
 
         None if the frame was identified, if no other field was searched (``explain``), or if none
         explains it.
@@ -229,7 +229,7 @@ class MatchResult:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of the answer should know beside it, in sentences."""
+        """Remarks on the answer, in sentences."""
         told, count = [], len(self.star_index)
         if self.n_not_searched:
             searched = count - len(self.dropped) - self.n_not_searched
@@ -282,7 +282,7 @@ class MatchResult:
         )
 
     def rotation(self) -> Rotation:
-        """Return the attitude as scipy has it: ``rotation().apply(v_icrs)`` is ``v_body``.
+        """Return the attitude as a scipy rotation: ``rotation().apply(v_icrs)`` is ``v_body``.
 
         Returns
         -------
@@ -385,7 +385,7 @@ class MatchResult:
 
     @property
     def skycoord(self) -> SkyCoord:
-        """The boresight, as astropy has it: a ``SkyCoord`` in ICRS.
+        """The boresight as a ``SkyCoord`` of astropy in ICRS.
 
         `NotIdentifiedError` unless identified, `ConfigError` where astropy is not installed.
         """
@@ -430,7 +430,7 @@ class MatchResult:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what goes to another process: the stars, not the database they are of."""
+        """Return the state for another process: the stars without their database."""
         content = {**vars(self), "frame": None, "database": None, "_record": None}
         content["q_body_from_icrs"] = self.q_body_from_icrs
         if self.database is not None:

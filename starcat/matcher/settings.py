@@ -41,7 +41,7 @@ LARGEST = {"tolerance_px": 200.0, "noise_px": 50.0, "noise_mag": 10.0}
 """Largest values that can be stated; beyond them any spot is any star."""
 
 MAX_TRIANGLES = 5000
-"""Triangles of centroids that are looked up, in the order of their selection."""
+"""Number of triangles of centroids that are looked up, in the order of their selection."""
 
 MAX_STEPS = 100_000
 """Default of the steps that a frame may take; about a second with numpy."""
@@ -59,10 +59,10 @@ SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
 
 LOOKUP = 10
-"""Steps of looking up one pattern of a frame."""
+"""Number of steps that count for looking up one pattern of a frame."""
 
 AGREEMENT = 50
-"""Steps of refining an attitude once, for each full `PAIRS` of centroids and stars."""
+"""Steps that count for refining an attitude once, for each full `PAIRS` of centroids and stars."""
 
 PAIRS = 4000
 """Pairs of a centroid and a star near the frame, up to which a refinement costs `AGREEMENT`."""
@@ -224,7 +224,7 @@ def check_scale_free(settings: Settings) -> None:
 
 
 class BudgetSpentError(Exception):
-    """A search is over before it has come to its end."""
+    """A search ended because its budget was spent."""
 
     def __init__(self, limit: Limit) -> None:
         super().__init__(f"the {limit} of a search are used up")

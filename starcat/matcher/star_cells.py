@@ -25,7 +25,7 @@ SMALLEST_REACH = 0.25 * MIN_SIDE
 """Cells of the smallest side serve all reaches up to this."""
 
 MANY_STARS = 15_000
-"""So many stars are searched by zones; a product of all is faster for fewer."""
+"""Number of stars from which zones are searched; a product with all stars is faster for fewer."""
 
 
 def stars_in_cap(database: Database, axis: Array, radius_rad: float) -> Rows:

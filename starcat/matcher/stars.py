@@ -20,7 +20,7 @@ ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
 
 STEP_PX = 0.01
-"""Step of the differences that say how a direction moves with its pixel, to 1e-9 of that."""
+"""Step of the differences that give the derivative of a direction by its pixel, to 1e-9."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(11 
 
 
 def name_of_number(star_id: int) -> str:
-    """Return what to call a star of an onboard image, which has numbers only.
+    """Return the name of a star of an onboard image, which has only numbers.
 
     The embedded sky has the stars that Gaia lacks under their negative numbers of Hipparcos.
     """
@@ -137,7 +137,7 @@ def matched_stars(
 
 
 def degrees_of_freedom(stars: MatchedStars, unknowns: int) -> int:
-    """Return two a star whose noise is known, less the ``unknowns`` that were fitted."""
+    """Return two per star whose noise is known, minus the ``unknowns`` that were fitted."""
     return 2 * int(np.isfinite(stars.sigma_px).sum()) - unknowns
 
 

@@ -1,8 +1,8 @@
-"""Tracking: a sequence of frames, each looked for near where the ones before it lead to.
+"""Tracking: a sequence of frames; each is searched near the attitude predicted from the last ones.
 
-The camera is taken to go on turning as it did, about the same axes of its own frame. How far that
-may be wrong follows from how far it last was. A frame that is not there is searched for in the
-whole sky at once, so that a jump costs one slow frame and no answer.
+The camera is assumed to keep turning as it did, about the same axes of its own frame. The allowed
+error of the prediction follows from the errors of the last predictions. A frame that is not there
+is searched for in the whole sky at once, so a jump costs one slow frame but no answer.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MARGIN = 2.0
 """Error that is allowed for a prediction, over the error of the last predictions."""
 
 FADING = 0.5
-"""What the error of an earlier prediction counts, for every frame since."""
+"""Weight of the error of an earlier prediction, for every frame since."""
 
 MAX_STEPS = 5.0
 """Longest time of a prediction after the last answer, over the time between the last two."""
@@ -40,7 +40,7 @@ MAX_STEPS = 5.0
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the last answers say of the next one."""
+    """The motion that the last answers predict."""
 
     q_body_from_icrs: Quaternion
     time: float

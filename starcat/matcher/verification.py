@@ -52,8 +52,8 @@ NARROWER = (0.5, 0.25, 0.125)
 """Smaller reaches that are tried if an agreement is not certain, in units of the final reach."""
 
 OVER_CHANCE = 2.0
-"""Centroids within a smaller reach, over the number that its area would have by chance, from which
-it is tried."""
+"""A smaller reach is tried if it holds this many times the centroids that its area would have by
+chance."""
 
 MISSES = 0.45
 """Largest number of near misses beyond those due to chance, over the number of matched stars."""
@@ -62,18 +62,18 @@ MISS_REACH = 8.0
 """Largest distance of a near miss from its star, in units of the final reach."""
 
 RIVAL_REACH = 4.0
-"""A centroid without a star that is this near to one that another centroid has may have more right
-to it; in units of the final reach."""
+"""A centroid without a star competes for a star of another centroid if it is this near to it; in
+units of the final reach."""
 
 ROUNDING = 1e-4
 """Largest relative difference of probabilities that differ only by rounding."""
 
 ROUGH = (2.0,)
-"""Reach of a first refinement where the focal length is fitted too, in units of the final reach:
-three stars leave more of an error in it than in the attitude."""
+"""Reach of a first refinement if the focal length is fitted too, in units of the final reach:
+three stars determine it less accurately than the attitude."""
 
 FOCAL_MARGIN = 0.02
-"""Margin around a frame whose focal length is fitted, where stars are looked for."""
+"""Margin around a frame whose focal length is fitted, in which stars are searched too."""
 
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
@@ -96,7 +96,7 @@ class Agreement:
     # Root mean square separation of the matched centroids from their stars; NaN if fewer than
     # `MIN_STARS` match.
     residual_rad: float
-    # Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS` match.
+    # Bound on the probability that chance agrees as well; 1 if fewer than `MIN_STARS` match.
     chance: float
     # Share of the frame that it explains; 1 if chance explains it, as the share is not used then.
     share: float = 1.0
@@ -128,7 +128,7 @@ class Agreement:
 
 @dataclass
 class BestOf:
-    """The best of the agreements that a search has come to."""
+    """The best agreement that a search has found so far."""
 
     certain: float  # a false-match probability as low as this ends the search
     found: Agreement | None = None  # the agreement that chance explains least
@@ -159,8 +159,8 @@ def verify_candidates(
 ) -> None:
     """Work out the agreements of a batch of candidates until one is certain.
 
-    With ``in_order`` the first one is the likeliest, and is tried before the others are counted;
-    where the focal length is not known, there are too many for that.
+    With ``in_order`` the first candidate is the likeliest, and is tried before the others are
+    counted. If the focal length is not known, there are too many candidates for that.
     """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
@@ -228,7 +228,7 @@ def agree(
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
         wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
-        # Of an agreement of hundreds of stars the probability may be too small for a number.
+        # The probability of an agreement of hundreds of stars can be too small for a number.
         if (wider.false_match_probability, -wider.n_matched) < (
             found.false_match_probability, -found.n_matched,
         ):  # fmt: skip
@@ -301,7 +301,7 @@ def _with_rival(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A pose, the stars around its field and which of them the centroids are."""
+    """A pose, the stars around its field, and the star of each centroid."""
 
     pose: Pose
     near: Rows  # the stars around the field

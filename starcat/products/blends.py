@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 
 PIXEL_VARIANCE = 1.0 / 12.0
-"""What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise."""
+"""Variance that a square pixel adds to a spot, and that rounding to whole numbers adds to noise."""
 
 NARROWEST_WINDOW_PX = 1.0
 """A narrower window follows the pixel grid (docs/decisions.md)."""
@@ -216,7 +216,7 @@ def _in_pixels(away: Array, middle: Array, widths: Widths) -> tuple[Array, Array
 def _starts(
     count: int, star: Rows, offset: Array, light: Array, is_brighter: Mask, widths: Widths
 ) -> tuple[Array, Mask]:
-    """Return where the centroiding of each star begins, and whether that is at another star."""
+    """Return the start of the centroiding of each star, and whether that is another star."""
     start, is_lost = np.zeros((count, 2)), np.zeros(count, dtype=bool)
     equal, for_each_mag = _PARTED
     rows = np.flatnonzero(is_brighter)
@@ -239,7 +239,7 @@ def _with_the_stars(
 
 
 def _settled(start: Array, star: Rows, offset: Array, light: Array, width: float) -> Array:
-    """Return where steps uphill end."""
+    """Return the places where steps uphill end."""
     count, centroid = len(start), start.copy()
     moving = np.bincount(star, minlength=count) > 1
     rows = np.arange(len(star))

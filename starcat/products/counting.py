@@ -1,4 +1,4 @@
-"""Counting what a product will have, around some of the stars, without making it.
+"""Estimates of the size of a product, counted around some of the stars, without making it.
 
 Neighbours are counted, not found, and the triangles that several fields share are known from some
 of the triangles; so this takes a moment where making the products takes minutes.
@@ -14,7 +14,7 @@ from starcat.geometry.sphere import chord_from_separation
 from starcat.products.tiling import FieldStars
 
 SAMPLE = 2000
-"""Stars around which neighbours are counted, and triangles whose fields are."""
+"""Number of stars around which neighbours are counted, and of triangles whose fields are."""
 
 MAX_IN_TREE, MAX_MET = 500_000, 20_000_000
 """Largest numbers of stars in the tree and of neighbours that are visited; if there are more, only

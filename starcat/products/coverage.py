@@ -19,12 +19,12 @@ from starcat.products.tiling import FieldStars
 Counts = NDArray[np.int64]
 
 MIN_GUIDE_STARS = 4
-"""Fewer than these cannot be identified by anything."""
+"""Smallest number of stars from which any method can identify a frame."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the field of each boresight holds."""
+    """The contents of the field of each boresight."""
 
     boresights: Directions
     stars: Counts  # shape (F,): guide stars in the field

@@ -33,7 +33,7 @@ HALF_FIELD = "default: half of the camera's narrower field"
 
 @dataclass(frozen=True)
 class SpecFacts:
-    """What the rest of a spec says that a section of a product has to agree with."""
+    """Facts of the rest of a spec with which the section of a product has to agree."""
 
     catalog: str  # name of the catalog of the stars
     camera: Camera
@@ -131,7 +131,7 @@ def one_row_a_star(inputs: ProductInputs, _: Any) -> Extent:
 
 @dataclass(frozen=True)
 class RowCost:
-    """What a row of a product costs."""
+    """The cost of a row of a product."""
 
     held_bytes: float  # while the other products are made and written
     working_bytes: float  # beside that, while it is made itself
@@ -139,7 +139,7 @@ class RowCost:
 
 
 USUAL_COST = RowCost(24.0, 60.0, 1.2)
-"""What a row costs of which nothing else was measured."""
+"""Cost of a row if it was not measured for the product."""
 
 STAR_ROW_IN_ORDER = 2.3
 """Bytes of a row of the star table in a Parquet file, ascending and each once."""
@@ -166,7 +166,7 @@ def rows_by_star_bytes(extent: Extent, stars: int, each: float) -> float:
 
 @dataclass(frozen=True)
 class ProductKind:
-    """Everything that is known of a product.
+    """The description of a product.
 
     The functions take the product's own section of the spec as their last argument. Sizes of
     Parquet files were measured on skies of 200 to 170,000 stars, costs with numpy 2 on products of
@@ -224,7 +224,7 @@ class ProductKind:
         )
 
     def index_bytes(self, extent: Extent, stars: int) -> float:
-        """Return how many bytes stand beside the columns in the database."""
+        """Return the bytes of the indices in the database, without the columns."""
         layout = self.layout
         total = 8.0 * stars * (layout.by_star + len(layout.per_star))
         total += 4.0 * extent.rows * layout.kvector

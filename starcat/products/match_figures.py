@@ -1,4 +1,4 @@
-"""What the odds of a cross-identification need to know of two whole catalogs.
+"""Statistics of two whole catalogs that the odds of a cross-identification need.
 
 The density on the sky, the distribution of magnitudes, the errors, and how complete a catalog is,
 from counts and medians: the same bits whether a catalog is in one piece or read in parts, whose
@@ -35,8 +35,8 @@ MIN_MEASURED = 20
 """Least number of sure pairs from which anything is measured."""
 
 MIN_ERROR_RAD = 0.01 * ARCSEC
-"""Least error of a position that is believed, radians: where measured errors are smaller, one
-catalog has copied the positions of the other."""
+"""Smallest credible error of a position, radians: if measured errors are smaller, one catalog has
+copied the positions of the other."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class CandidatePairs:
 
 @dataclass(frozen=True)
 class MagnitudeCounts:
-    """How many stars have which magnitude."""
+    """Numbers of stars by magnitude."""
 
     lowest: int  # number of the first bin; bin k begins at ``k * MAG_BIN``
     counts: Rows  # shape (K,): stars of each bin; empty if no magnitude is known

@@ -35,7 +35,7 @@ ROUNDS = 60
 """Number of rounds of messages; pairs that are in no ring need far fewer."""
 
 MAX_WRITTEN_OUT = 12
-"""Most pairs of a cluster whose matchings are all listed; messages do for larger clusters."""
+"""Largest number of pairs of a cluster whose matchings are all listed; larger ones use messages."""
 
 MAX_WEIGHT = 50.0
 """Largest natural logarithm of the weight of a pair. It is as good as certain, and the product

@@ -1,9 +1,9 @@
 """Counterparts: which entry of one catalog is which star of another, and how sure that is.
 
-Two sets of moving stars in; every pair of star and candidate counterpart within a radius out,
+Input: two sets of moving stars. Output: all pairs of a star and a candidate within a radius,
 with separation, magnitude difference, odds and a verdict in words. Separations are measured at
 one epoch of the pair: a star with proper motion is moved to its candidate's epoch, a candidate
-with proper motion to the epoch of a star without. Knows neither catalogs nor files.
+with proper motion to the epoch of a star without. This module does not depend on catalogs or files.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from starcat.products.match_odds import Odds, match_odds, runs
 Rows = NDArray[np.int64]
 
 VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
-"""What a candidate is to its star, in words; the numbers of `Matches.verdict` are places here."""
+"""Verdicts on a candidate, in words; the numbers of `Matches.verdict` are places here."""
 
 UNIQUE, BEST, AMBIGUOUS, TAKEN, DOUBTFUL, OTHER = range(len(VERDICTS))
 

@@ -34,7 +34,7 @@ from starcat.sections import SmallDeg
 POSITION = 60
 
 MAX_BINS = 10_000_000
-"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
+"""Largest number of bins of a look-up table; each takes 8 bytes, and more are of no use."""
 
 
 class Neighbours(ProductSection):

@@ -1,4 +1,4 @@
-"""Thinning: which stars of a number of them to keep so that the sky is even.
+"""Thinning: which stars to keep so that they cover the sky evenly.
 
 Rows are in order of preference, the brightest star first: of two stars that are worth the same, the
 later one goes. A star's worth grows with its light, because a faint star that makes the sky even is
@@ -22,7 +22,7 @@ BATCH = 0.1
 """Share of the stars, by the smallest cells, from which a round can drop stars."""
 
 PRIOR = 1e-2
-"""Information on each axis before any star, that of a star being 1, so that a field without stars
+"""Information on each axis before any star, in units of a star's, so that a field without stars
 has an error too: ten times the noise of a star."""
 
 POWER = 4

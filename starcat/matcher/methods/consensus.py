@@ -100,7 +100,7 @@ def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
 
 
 def _all_agreeing(pair: Rows, fits: Mask, count: NDArray[np.int64]) -> Rows:
-    """Return a pair and what agrees with it and each other, the best supported first."""
+    """Return a pair and the names that agree with it and each other, the best supported first."""
     chosen = list(pair)
     left = fits[pair[0]] & fits[pair[1]]
     while left.any():
@@ -119,7 +119,7 @@ def neighbour_candidates(
 ) -> Candidates:
     """Return the stars that a reference star may be, with two neighbours that agree.
 
-    ``stars`` are what the reference star may be, none twice, and ``product`` lists the neighbours
+    ``stars`` are the stars that it can be, without repeats, and ``product`` lists the neighbours
     of every star in ``star_offsets`` and ``neighbour``. There is at most one candidate for each
     star, the best supported first. It names three centroids: the reference star, and two whose
     stars are neighbours of the star at the same separations from it and from each other.
@@ -171,7 +171,7 @@ def _named_by_neighbours(
     observation: Observation,
     database: Database,
 ) -> tuple[Rows, Rows, Rows]:
-    """Return whose neighbours are as far from it as which centroids from the reference star."""
+    """Return the stars with neighbours as far away as centroids are from the reference star."""
     offsets = product["star_offsets"]
     owner, row = rows_between(offsets[stars], offsets[stars + 1])
     star = product["neighbour"][row].astype(np.intp)

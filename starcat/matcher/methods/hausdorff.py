@@ -46,17 +46,17 @@ FIRST_ROUND = (16, 5)
 """Number of the first centroids that take part, and number of names that each of them gets."""
 
 SECOND_ROUND = (64, 100)
-"""The same two numbers of a second round, where the names of the first one do not agree."""
+"""The same two numbers for a second round, if the names of the first round do not agree."""
 
 DIVISOR_ROUNDS = ((1, 30), (2, 30), (3, 400))
-"""How many of the nearest, of the frame and of a star, are tried as divisors, and how many of
-the best stars of each pair of divisors become candidates, one round after the other."""
+"""Rounds: number of nearest distances, of the frame and of a star, that are tried as divisors,
+and number of best stars of each pair of divisors that become candidates."""
 
 STARS_BY_POINTS = 30
 """Number of the best stars of a reference star that become candidates."""
 
 _AT_ONCE = 1 << 22
-"""Numbers held at the same time while observed separations are compared with all stars."""
+"""Largest number of values in memory while observed separations are compared with all stars."""
 
 _UP = np.array([0.0, -1.0, 0.0])
 
@@ -211,7 +211,7 @@ def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
 def point_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are, if the roll is 0.
 
-    Wang et al. 2020 (S1), whose baseline it is.
+    This is the baseline of Wang et al. 2020 (S1).
     """
     product = database.products["hausdorff_l2"]
 
@@ -327,9 +327,9 @@ def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) ->
 def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Rows, Rows, Array]:
     """Return the stars whose sets come nearer to observed numbers than the reach of each.
 
-    Of each find the row of the number, ascending, of the star, and its gain: the reach less the
-    smallest difference from a member; 0 where the entry's member is not its star's nearest, so
-    that gains may be summed.
+    Each result has the row of the number, ascending, the row of the star, and a gain: the reach
+    minus the smallest difference from a member, or 0 if the entry's member is not the nearest of
+    its star, so that gains can be summed.
     """
     start = np.searchsorted(sets.value, numbers - reach, side="left")
     stop = np.searchsorted(sets.value, numbers + reach, side="right")

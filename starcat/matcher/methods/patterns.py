@@ -35,13 +35,13 @@ from starcat.matcher.settings import LOOKUP
 from starcat.matcher.star_cells import rows_between
 
 ALIGNMENTS = 2
-"""How many neighbours are tried as the alignment neighbour: the nearest may be a false star."""
+"""Number of neighbours that are tried as the alignment neighbour: the nearest can be false."""
 
 MAX_STARS = 64
-"""Stars of most votes whose alignment star is looked at."""
+"""Number of stars, by most votes, whose alignment star is checked."""
 
 _TOUCHES = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]])
-"""A centroid may be anywhere in a square: its middle and corners, along and across."""
+"""A centroid can be anywhere in a square: offsets of its middle and corners, along and across."""
 
 
 def grid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -106,15 +106,15 @@ def _occupied(
     across = np.broadcast_to(_TOUCHES[:, 1:] * tolerance_rad, along.shape)
     x = along * np.cos(turn) - across * np.sin(turn)
     y = along * np.sin(turn) + across * np.cos(turn)
-    # The alignment star is on the axis by definition, which may be an edge between cells: what
-    # the tolerance touches beyond it is not meant.
+    # The alignment star is on the axis by definition. The axis can be an edge between cells: the
+    # cells that the tolerance touches beyond it do not count.
     y[:, alignment] = 0.0
     side = int(product.numbers["cells_per_side"])
     return np.unique(cell_of(x, y, product.numbers["radius_rad"], side))
 
 
 ROUNDS = ((3, 16), (12, 32), (48, 64))
-"""How many centroids are compared, from the centre, and how many names each of them gets."""
+"""Number of centroids that are compared, from the centre, and of names that each of them gets."""
 
 MAX_PAIRS = 200
 """Largest number of pairs of names that are proposed in one round."""
@@ -126,14 +126,14 @@ TOUCHED = 0.5
 """Weight of a ring without a centroid that a centroid's tolerance touches."""
 
 SECTORS = 0.2
-"""Weight of the sectors beside the rings."""
+"""Weight of the sectors relative to the rings."""
 
 
 def radial_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose names of centroids that agree with each other.
 
-    First of the few centroids nearest to the centre of the frame and their best names, then of more
-    centroids and names.
+    The first round uses a few centroids nearest to the centre of the frame and their best names,
+    the next more centroids and names.
 
     Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
     cyclic features of star pattern", Image and Vision Computing 26, 891.
@@ -195,7 +195,7 @@ def _rings_in_common(around: Surroundings, tolerance_rad: float, product: Produc
 
 
 def sector_pattern(position_angle_rad: Array, sectors: int) -> int:
-    """Return the sectors around a star that have a neighbour in: bit s for sector s.
+    """Return the sectors around a star that contain a neighbour: bit s for sector s.
 
     Angles run counter-clockwise, the nearest neighbour first; sectors are counted from it.
 

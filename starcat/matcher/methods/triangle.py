@@ -36,7 +36,7 @@ NEIGHBOURS = 20
 """Number of the nearest centroids that a centroid makes triangles with in the order ``spread``."""
 
 SPREAD_CENTROIDS = 400
-"""Largest number of centroids of that order; more would take seconds to put in order."""
+"""Largest number of centroids of that order; sorting more would take seconds."""
 
 
 def select_triangles(observation: Observation) -> NDArray[np.intp]:
@@ -70,8 +70,8 @@ def select_triangles(observation: Observation) -> NDArray[np.intp]:
 def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.intp]:
     """Return triangles of near centroids from all over a frame.
 
-    Every centroid's two nearest neighbours come first, then of every centroid the first and third
-    nearest, the second and third, and so on; a triangle of several centroids once.
+    Every centroid's two nearest neighbours come first, then its first and third nearest, its
+    second and third, and so on; each triangle occurs once.
 
     A database holds the triangles of the brightest stars of its fields. In a crowded frame most
     stars are fainter, and the compact triangles of one place are often of the same few stars: if
@@ -142,7 +142,7 @@ CURVATURE = 2.0 / 3.0
 ``theta = atan(r / f)`` shrinks by ``sin(theta) cos(theta)`` of a relative change of f."""
 
 AT_ONCE = 2**16
-"""Triangles whose sides are worked out together."""
+"""Number of triangles whose sides are computed together."""
 
 ANY_ORDER = 1.1
 """Tolerance of sides in order of their length, in units of the tolerance in their true order: the

@@ -189,8 +189,8 @@ def check(selection: Any) -> None:
     if selection.neighbours.is_on and doubles.action == "merge":
         raise ValueError(
             'doubles.action = "merge" and [selection.neighbours] both handle close stars; '
-            'leave out the first, and set neighbours.action = "merge" to merge close stars as '
-            "the sensor does"
+            'leave out the first, and set neighbours.action = "merge" to merge them as the '
+            "sensor does"
         )
     if selection.neighbours.is_on and doubles.companion_limit_mag is not None:
         raise ValueError(
