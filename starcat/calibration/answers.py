@@ -1,6 +1,6 @@
-"""Answers of ``starcat identify`` as arrays: which star was seen where and how bright, or not seen.
+"""Answers of ``starcat identify`` as arrays: place and brightness of each star, seen or not.
 
-A file holds a line of JSON a frame, as ``--ndjson`` prints them, or one JSON value of all frames.
+A file holds one line of JSON per frame, as ``--ndjson`` prints them, or a JSON value of all frames.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class SkyStars:
 
 @dataclass(frozen=True)
 class Sightings:
-    """The stars that should be in identified frames, a row for each star of each frame."""
+    """The stars that should be in identified frames, one row per star and frame."""
 
     frame: NDArray[np.int64]  # number of the frame, ascending
     star: NDArray[np.int64]  # row of the database

@@ -76,7 +76,7 @@ class EarthRotation:
 
     @property
     def within(self) -> int:
-        """Frames that are within three expected errors, whatever their times are wrong by."""
+        """Frames that are within three expected errors, whatever the errors of their times."""
         return sum(2.0 * one.chi2 <= _THREE_SIGMA for one in self.frames)
 
 

@@ -48,8 +48,8 @@ USUAL_ERROR = 0.1
 def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
     """Return the files and frames that a caller gives to calibrate a camera from.
 
-    Files are given as paths, folders and patterns, frames as what `Matcher.identify` takes or as
-    results of it; both alone or in a sequence.
+    Files are given as paths, folders and patterns, frames in any form that `Matcher.identify`
+    takes or as its results; both alone or in a sequence.
     """
     if _is_file(frames) or _is_one_frame(frames):
         frames = [frames]
@@ -142,7 +142,7 @@ def measured_frames(
 
 
 def names_of_files(paths: Sequence[Path]) -> list[str]:
-    """Return the name of each file's frame, which no other file has.
+    """Return a unique name for the frame of each file.
 
     The name is the file's name without its suffix; if several files share it, the path without
     the suffix; if they share that too, the path.
@@ -160,7 +160,7 @@ def starting_camera(
     image_size_px: tuple[int, int] | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> tuple[Camera, tuple[float, float]]:
-    """Return what is known of a camera before its calibration."""
+    """Return the known values of a camera before its calibration."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
     known = camera or own

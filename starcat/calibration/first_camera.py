@@ -27,7 +27,7 @@ from starcat.progress import Progress, no_progress
 from starcat.specs.camera_file import camera_toml
 
 ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
-"""Distances within which a centroid is a star, in the rounds of fitting the lens."""
+"""Largest distances of a centroid from its star, in the rounds of fitting the lens."""
 
 ERROR_OF_LENS = 0.005
 """Relative error of the field of one picture that its distortion makes: it depends on where on the
@@ -61,11 +61,11 @@ class FirstCamera:
 
     @property
     def has_distortion(self) -> bool:
-        """Whether they support any."""
+        """Whether the stars support any distortion."""
         return len(self.fit.free) > 1
 
     def remarks(self, limit_mag: float, band: str, *, is_stated: bool) -> list[str]:
-        """Return where the values of a spec come from and how well they are known, in lines."""
+        """Return comments for a spec: the origin of its values and their errors, in lines."""
         count, stars = len(self.names), len(self.fit.seen)
         named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
         seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
@@ -97,7 +97,7 @@ class FirstCamera:
 
     @property
     def noise_px(self) -> float:
-        """Noise of a centroid as a spec states it."""
+        """Noise of a centroid, for a spec."""
         return min(50.0, round(self.fit.noise_px, 3))
 
     @property

@@ -27,8 +27,8 @@ AXES = ("aspect", "skew")
 PARAMETERS = (*FOCAL, *CENTRE, *RADIAL, *TANGENTIAL, *AXES)
 """Names of the numbers, in the order of the vector.
 
-``aspect`` is the focal length along y over that along x, less 1; ``skew`` is how far x moves with
-y, the tangent of the angle by which the axes are not perpendicular.
+``aspect`` is the focal length along y over the one along x, minus 1. ``skew`` is how far x moves
+with y: the tangent of the angle by which the axes are not perpendicular.
 """
 
 
@@ -310,9 +310,9 @@ def _noise_px(residual_px: Array, unknowns: int) -> float:
 
 
 FOLDS = 5  # groups of frames that are left out in turn; with fewer frames each is its own group
-FAR_PX = 1e6  # a bend of Huber's loss that nothing is beyond: least squares of all stars
+FAR_PX = 1e6  # a bend of Huber's loss beyond all residuals: least squares of all stars
 NEAR = 1e-5  # accuracy of the fits that are compared
-MIN_STARS = 4  # stars that a frame keeps at least
+MIN_STARS = 4  # smallest number of stars that a frame keeps
 
 # A model loses to a better one if the difference is larger than this many standard errors: of many
 # frames. Of five it is 1.9, of three 2.5.
@@ -364,7 +364,7 @@ def choose_model(
     noise_px: float,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> list[Trial]:
-    """Compare models by the residuals of frames that they have not seen, and choose one."""
+    """Compare models by the residuals of frames that they were not fitted to, and choose one."""
     kept = _without_strays(seen, values, noise_px)
     squares = np.array([_held_out(kept, values, free, size_px) for free in models])
     numbers, frames = 2 * len(kept), squares.shape[1]
@@ -404,7 +404,7 @@ def is_enough(seen: Seen) -> bool:
 
 
 def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Array:
-    """Return the numbers that a model starts from."""
+    """Return the initial numbers of a model."""
     start = np.zeros_like(values)
     start[0] = values[0]
     start[1:3] = values[1:3] if CENTRE[0] in free else 0.5 * np.array(size_px)

@@ -1,4 +1,4 @@
-"""What frames teach about stars and the sensor: which stars to distrust, and the response."""
+"""Learning from frames about stars and the sensor: which stars to distrust, and the response."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from starcat.specs.reading import content_of_toml, read_spec, what_is_wrong
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
 
-CLIP = 4.0  # deviations farther away, in their noise, are not counted in the noise
+CLIP = 4.0  # larger deviations, in units of their noise, are not counted in the noise
 FAR = 4.0  # largest deviation in the scatter of a star, in noises: one outlier proves nothing
 OF_A_BIN = 100  # smallest number of deviations in a bin of magnitude
 MAX_BINS = 12
@@ -41,10 +41,10 @@ _LOG10 = np.log(10.0)
 
 @dataclass(frozen=True)
 class StarNoise:
-    """The noise of one measurement by the magnitude measured, and what stars differ by beside it.
+    """The noise of one measurement by the measured magnitude, and the further scatter of stars.
 
-    The latter are errors of the catalog and of the model of the sensor, which more sightings of a
-    star do not average out.
+    The further scatter is due to errors of the catalog and of the model of the sensor, which more
+    sightings of a star do not average out.
     """
 
     mag: Array
@@ -99,7 +99,7 @@ class Measurements:
         return np.column_stack([self.total(column) / count for column in self.left.T])
 
     def noise(self, least: float, min_count: int) -> StarNoise:
-        """Return the noise, from how the measurements of each star differ."""
+        """Return the noise, from the differences of the measurements of each star."""
         of_star = self.count[self.star]
         factor = np.sqrt(of_star / np.maximum(of_star - 1.0, 1.0))
         within, where = (self.left - self.mean[self.star]) * factor[:, None], self.mag
@@ -116,7 +116,7 @@ class Measurements:
         return StarNoise(noise.mag, noise.sigma, _beyond(self.mean[often], variance))
 
     def by_star(self, noise: StarNoise, further: Array, min_count: int) -> StarMeans:
-        """Return what the measurements say of each star; ``further`` is an error of each mean."""
+        """Return the statistics of each star; ``further`` is a further error of each mean."""
         axes, count, sigma = self.left.shape[1], self.count, noise.at(self.mag)
         some = np.maximum(count, 1)
         mean, is_tested = self.mean, count >= min_count
@@ -174,19 +174,19 @@ FAMILY = 1e-3
 """Probability that chance alone makes any star of a database distrusted."""
 
 MIN_FRAMES = 3
-"""Fewest frames that a star is judged from."""
+"""Smallest number of frames from which a star is judged."""
 
 MIN_STARS = 20
-"""Fewest stars with a magnitude that anything is learnt from."""
+"""Smallest number of stars with a magnitude from which anything is learnt."""
 
 TESTS = ("brightness", "variable", "moved", "double", "missing")
 
 CLEAR = 3.0
-"""Noises that a star is brighter than the limit of the frames, for its mean to be fair."""
+"""The mean of a star is unbiased if it is brighter than the limit of the frames by these noises."""
 
 MIN_ROUNDS, MAX_ROUNDS = 3, 8
-FIRST_NOISE_MAG = 0.3  # until it is known
-MIN_MAG, MIN_ARCSEC = 1e-3, 1e-2  # noise is not taken to be smaller
+FIRST_NOISE_MAG = 0.3  # noise until it is measured
+MIN_MAG, MIN_ARCSEC = 1e-3, 1e-2  # smallest noise that is assumed
 MIN_LOG = -300.0  # logarithm of a probability; smaller ones underflow
 
 
@@ -221,7 +221,7 @@ class Distrusted:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What identified frames say about their sensor and their stars."""
+    """The results of learning: the response of the sensor and the records of its stars."""
 
     terms: Terms
     mag_noise: StarNoise
@@ -245,9 +245,9 @@ def learn_from_frames(
 ) -> Lesson:
     """Fit the terms of the sensor and judge the stars.
 
-    With ``by_frame`` every frame has an offset of its own, as where exposures differ.
-    ``colour_term`` is what the magnitudes of the database have already; it bears on stars of
-    unknown colour.
+    With ``by_frame`` every frame has its own offset, for example if exposures differ.
+    ``colour_term`` is the term that the magnitudes of the database already include; it affects
+    stars of unknown colour.
     """
     found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
     if found < MIN_STARS:
@@ -348,7 +348,7 @@ class _Round:
         return np.where(np.isnan(colour), np.median(known) if len(known) else 0.0, colour)
 
     def _unsure_mag(self, terms: Terms) -> Array:
-        """Return how far an unknown colour may put the magnitude of each star."""
+        """Return the magnitude error of each star from an unknown colour."""
         spread = abs(self.applied + (terms.colour_term or 0.0)) * float(np.std(self._colour))
         return np.where(np.isnan(self.stars.colour), spread, 0.0)
 
@@ -600,7 +600,7 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
 
 
 def star_table(learnt: Learnt) -> pa.Table:
-    """Return what was seen of each star that the frames should show, a row each."""
+    """Return the records of the stars that the frames should show, one row per star."""
     records, stars = learnt.lesson.records, learnt.stars
     verdict = {one.row: one.verdict for one in learnt.lesson.distrusted}
     rows = np.flatnonzero((records.n_seen > 0) | (records.n_expected > 0))
@@ -635,7 +635,7 @@ def _colour_stars(learnt: Learnt) -> int:
 
 
 def content_of(learnt: Learnt) -> dict[str, Any]:
-    """Return all of it as JSON has it."""
+    """Return all of it as values for JSON."""
     lesson, terms = learnt.lesson, learnt.lesson.terms
     limit = lesson.limit_mag
     return {

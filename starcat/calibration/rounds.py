@@ -1,4 +1,4 @@
-"""Frames of a camera that is hardly known to stars that are identified in them.
+"""Identification of the stars in frames of a camera that is hardly known.
 
 The first step finds any frame at any focal length of a range. From there on the camera is fitted
 to the stars of all frames that were identified, the frames are identified with that camera, within
@@ -41,7 +41,7 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import NOISE_DEVIATIONS
 from starcat.progress import Progress
 
-WIDE_PX = 6.0  # tolerance as long as the camera is hardly known
+WIDE_PX = 6.0  # tolerance while the camera is hardly known
 NARROW_PX = 0.5  # smallest tolerance, however good the centroids are
 
 # Ratio of neighbouring focal lengths of the first step, for a method that needs the focal length.
@@ -87,13 +87,13 @@ class IdentifiedFrame:
 
     @property
     def focal_length_px(self) -> float:
-        """The focal length that the first frame that was identified has found."""
+        """The focal length that was found with the first identified frame."""
         found = self.results[self.found[0]].camera
         return (found or self.camera).focal_length_px
 
     @property
     def stars(self) -> list[bytes]:
-        """Which centroid is which star, to be compared."""
+        """The star of each centroid, to compare two rounds."""
         return [result.star_index.tobytes() for result in self.results]
 
     def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
@@ -218,7 +218,7 @@ def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
 
 
 def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
-    """Return the answer about some centroids as one about all of them."""
+    """Return the answer for some centroids as an answer for all of them."""
     index = np.full(count, -1, dtype=np.int32)
     index[rows] = result.star_index
     dropped = tuple((int(rows[row]), reason) for row, reason in result.dropped)

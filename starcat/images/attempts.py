@@ -1,8 +1,8 @@
 """Further attempts at an image that was not identified: with other spots of the same image.
 
-Each attempt measures the image in another way and searches for its spots. By chance alone an
-answer is the more likely the more often a frame is searched for, so that the bound of an answer
-of a further attempt is multiplied by all searches that a frame can have (`counted`).
+Each attempt measures the image in another way and searches for its spots. Every search makes an
+answer by chance more likely, so the bound of an answer of a further attempt is multiplied by the
+number of all searches that a frame can have (`counted`).
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 
 DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
-"""Factor of the threshold of the second attempt, and the most spots of all that measure again."""
+"""Factor of the threshold of the second attempt, and most spots of attempts that measure again."""
 
 HIGHER_THRESHOLDS = (8.0, 15.0)
 BRIGHTEST = 40
-"""Brightest spots of the first measurement that the last attempt is made with."""
+"""Number of brightest spots of the first measurement that the last attempt uses."""
 
 SAME_SPOT_PX = 0.5
 """Centroids of one spot in two measurements are nearer to each other than this."""
 
 MAX_SEARCHES = 7
-"""Searches whose answer can be given: two of the first attempt, which also tries the focal length
-as it is stated, and one of each further attempt."""
+"""Number of searches whose answer can be returned: two of the first attempt, which also tries the
+focal length as stated, and one of each further attempt."""
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def load_sep() -> Any:
 
 
 def subtract_background(image: ArrayLike) -> SkyLevels:
-    """Take the background off an image."""
+    """Subtract the background of an image."""
     values = np.asarray(image)
     if values.ndim != 2 or min(values.shape) < SMALLEST_PX or values.dtype.kind not in "buif":
         raise ConfigError(
@@ -94,8 +94,8 @@ def subtract_background(image: ArrayLike) -> SkyLevels:
 def unmasked(values: Grey, mask: Mask) -> Grey:
     """Return the values of the pixels that are not left out; the array itself if it has no other.
 
-    An image of a large camera fills a good part of the memory that a request may take, so it is
-    copied only if it has to be.
+    An image of a large camera fills a large part of the memory of a request, so it is copied only
+    if necessary.
     """
     return values[~mask] if mask.any() else values.reshape(-1)
 
@@ -241,8 +241,8 @@ def repair_hot_pixels(levels: SkyLevels, psf_sigma_px: float) -> SkyLevels:
 def mask_hot_pixels(levels: SkyLevels) -> SkyLevels:
     """Replace bright pixels among dark ones by the median of those, clusters of them included.
 
-    Many of them seem to be noise, so that the background is measured once more without them. It
-    costs stars whose light falls on one pixel, so it is for images that have no answer else.
+    Many hot pixels look like noise, so the background is measured again without them. Stars whose
+    light falls on one pixel are lost: use this only for images that have no answer otherwise.
     """
     for _ in range(_HOT_ROUNDS):
         y, x = _bright_pixels(levels)

@@ -50,7 +50,7 @@ Small = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class BatchItem:
-    """One file of many: its answers, or why there are none."""
+    """One file of many: its answers, or the reason why there are none."""
 
     path: Path
     answers: tuple[FrameAnswer, ...] = ()
@@ -73,7 +73,7 @@ def is_batch(inputs: Sequence[str]) -> bool:
 def files_of(inputs: Sequence[str]) -> list[Path]:
     """Return the files of folders, patterns and names, each once, numbers in names in order.
 
-    Of a folder these are its pictures, or its files of centroids if it has no pictures.
+    For a folder they are its pictures, or its files of centroids if it has no pictures.
     """
     found: dict[Path, None] = {}
     for given in inputs:
@@ -96,7 +96,7 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
 
 
 def frame_files(inputs: Sequence[str]) -> list[Path]:
-    """Return the files that folders, patterns and names stand for, or stdin (``-``) alone."""
+    """Return the files of folders, patterns and names, or stdin (``-``) alone."""
     return files_of(inputs) if not inputs or is_batch(inputs) else [Path(inputs[0])]
 
 

@@ -20,7 +20,7 @@ MIN_STEP_RATIO = 1.5
 
 
 def without_block_edges(image: Grey | Array) -> Grey | None:
-    """Return an image less the median of each of its JPEG blocks; None if it has no blocks.
+    """Return an image minus the median of each of its JPEG blocks; None if it has no blocks.
 
     Without their medians neighbouring blocks have no step between them. Stars that fill less than
     half of a block stand out as before. Leaving out the pixels at the edges would take nearly half

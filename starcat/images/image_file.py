@@ -78,7 +78,7 @@ _OF_A_WCS = re.compile(
 def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None) -> Grey:
     """Read the grey values of an image.
 
-    The FITS standard does not say which row is the top one. Programs that write arrays put the
+    The FITS standard does not define which row is the top one. Programs that write arrays put the
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
     """
@@ -137,7 +137,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any], bool]:
-    """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
+    """Return the plane of a FITS file, and whether its header puts the first row at the bottom."""
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyWarning
 
@@ -206,7 +206,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         if is_grey:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
-        # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
+        # Whole numbers, so that the step of the digits can be found: grey as colour stays as it is.
         # Pillow has the weights of `_LUMINANCE`, and takes a byte a pixel for the result.
         return np.asarray(picture.convert("RGB").convert("L"))
 

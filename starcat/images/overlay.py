@@ -139,7 +139,7 @@ def draw_sky(frame: FrameAxes, image: NDArray[Any] | None) -> None:
 
 
 def draw_marks(frame: FrameAxes) -> None:
-    """Draw a ring around what is identified, and a diamond around what is not."""
+    """Draw a ring around identified spots, and a diamond around other spots."""
     is_star = np.array([name is not None for name in frame.names], dtype=bool)
     for chosen, marker, colour in ((is_star, "o", STAR), (~is_star, "D", LOST)):
         x, y = frame.centroids[chosen].T
@@ -290,7 +290,7 @@ class Overlay:
 def overlay_from_attitude(
     matrix: Matrix, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
 ) -> Overlay:
-    """Return what lies behind the stars of a frame."""
+    """Return the lines and planets of a frame, which are drawn behind its stars."""
     return Overlay(_grid(matrix, camera), _figures(matrix, camera, epoch_jyear), bodies)
 
 

@@ -1,4 +1,4 @@
-"""A picture of one frame: the image or its centroids, which are which stars, where north is.
+"""A picture of one frame: the image or its centroids, with the names of stars and the compass.
 
 The same input gives the same bytes. Nothing is identified here.
 """

@@ -175,7 +175,7 @@ class FileAnswers:
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
     ) -> MatchResult:
-        """Return a refused answer with what a second look has found."""
+        """Return a refused answer with the findings of a second look."""
         if self.local.track or self.options.prior_q is not None:
             return refused
         return explained(
@@ -319,7 +319,7 @@ class FileAnswers:
         return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
-        """Return what a user should know beside the answers."""
+        """Return notes for the user in addition to the answers."""
         unknown = said_of_columns([first.frame]) if first else None
         notes = [unknown] if unknown else []
         if first and first.spots is not None and first.spots.streak is not None:
