@@ -38,7 +38,7 @@ PASSBAND_SHARE = 0.002
 set by white stars, so that this matters more the further a star's colour is from theirs."""
 
 OUTSIDE_MAG = 0.5
-"""What the error grows by for each magnitude that a colour is outside of the library's."""
+"""Growth of the error per magnitude that a colour is outside of the library's colours."""
 
 TYPE_WIDTH, CLASS_WIDTH = 1.5, 0.7
 """Subclasses and luminosity classes that a spectral type spreads over."""
@@ -56,7 +56,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Relation:
-    """What to add to a magnitude in a base band, by colour."""
+    """The offset to add to a magnitude in a base band, by colour."""
 
     base: str  # a shipped response, such as "G"
     colour: tuple[str, str]  # such as ("BP", "RP")
@@ -238,7 +238,7 @@ def predict_by_type(
 def combined(predictions: list[Prediction]) -> Prediction:
     """Return the mean of predictions from several catalogs, weighted by their errors.
 
-    Those of a star that are unknown, or outside of a relation where another is not, do not count.
+    Predictions are left out if they are unknown, or outside of their relation and another is not.
     """
     mags = np.stack([one.mag for one in predictions])
     errors = np.stack([one.error_mag for one in predictions])

@@ -21,14 +21,14 @@ from starcat.resources import resource_folder
 from starcat.storage.regular_files import read_regular_file
 
 Counts = Literal["photon", "energy"]
-"""What a response is relative to."""
+"""Quantity that a response is relative to."""
 
 LIMITS_NM = (300.0, 2500.0)
 """Wavelengths that the spectra cover."""
 
 MAX_ROWS = 20_000
 MAX_BYTES = 4_000_000
-"""Of the CSV file of a response."""
+"""Largest size of the CSV file of a response."""
 
 WIDEST_GAP_NM = 100.0
 """Rows further apart than this leave a curve to guesswork."""
@@ -103,7 +103,7 @@ def checked_response(
 
 
 def _fault(wavelength: Array, value: Array) -> str | None:
-    """Return what is wrong with a table of a response."""
+    """Return the fault of a table of a response, or None."""
     if len(wavelength) != len(value):
         return (
             f"{len(wavelength)} wavelengths and {len(value)} values; every wavelength needs one "

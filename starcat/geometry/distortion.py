@@ -33,7 +33,7 @@ NEWTON_STEPS = 50
 
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a value that has to be a finite number in an open interval; a bool is none."""
+    """Return a value that has to be a finite number, not a bool, in an open interval."""
     value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number may be too large for a float

@@ -1,6 +1,6 @@
-"""Checks of an onboard image: what its numbers say of each other, and what its database says.
+"""Checks of an onboard image: its numbers against each other, and against its database.
 
-Everything is computed again from directions and rows. Functions yield what is wrong, in words.
+Everything is computed again from directions and rows. Functions yield the faults in words.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from starcat.onboard.reading import OnboardImage
 from starcat.products.tiling import FieldStars
 
 MIN_STARS = 4
-"""Fewer stars in a field identify nothing."""
+"""Smallest number of stars in a field with which it can be identified."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def shrink(
     max_bytes: int | None,
     profile: Profile = FULL,
 ) -> Shrunk:
-    """Leave out what a profile leaves out, and as little more as makes an image fit."""
+    """Leave out what a profile leaves out, and only as much more as needed for the image to fit."""
     limit = math.inf if max_bytes is None else max_bytes
     least = profile.least[contents.method]
     whole, weight = _by_use(contents, times_seen)

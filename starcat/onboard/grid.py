@@ -30,11 +30,11 @@ MAX_PRODUCTS = 300_000
 """With more cells times stars than this, cells are processed one by one, each with its stars."""
 
 SLACK_RAD = 1e-5
-"""The radius is so much larger, for who compares in single precision."""
+"""Margin of the radius, for readers that compare in single precision."""
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=2)))
 _FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(range(3), (1.0, -1.0))]
-"""Of each face of the cube the normal and the two axes in it, by rows."""
+"""The normal of each face of the cube, and the two axes in the face, by rows."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ def most_near(u: Array, radius_rad: float) -> int:
     """Return an upper bound of the stars within a radius of any direction.
 
     The sphere is divided into cells, squares on the faces of a cube. No circle about a direction
-    of a cell holds more stars than the circle about its centre that is wider by what the cell
-    reaches from there. Cells that may hold more than is known of others are divided further.
+    of a cell holds more stars than the circle about its centre that is wider by the reach of the
+    cell. Cells that can hold more than the largest number found so far are divided further.
     """
     unit = u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
     half = 1.0 / FACE_CELLS

@@ -1,7 +1,7 @@
 """Guide stars and their features to the bytes of an onboard image.
 
-Everything that is computed is computed from the directions as the image holds them, so that a
-reader that computes the same finds the same. The same contents give the same bytes.
+All values are computed from the directions as the image stores them, so that a reader that
+computes them again finds the same values. The same contents give the same bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SMALLEST_MARGIN = 1e-12
 
 @dataclass(frozen=True)
 class Contents:
-    """What an image is made of."""
+    """The contents of an image."""
 
     name: str  # ``<name>-<version>`` of the database
     epoch_jyear: float  # epoch of the directions, Julian year

@@ -31,7 +31,7 @@ NAME_BYTES = 96
 MAX_BYTES = 2**32 - 1
 
 DIRECTION_SCALE = 2147483647
-"""What a component of 1 is stored as."""
+"""The stored value of a component of 1."""
 MAG_SCALE = 1000
 MAG_UNKNOWN = -32768
 RADIUS_UNKNOWN = 65535
@@ -88,7 +88,7 @@ SECTION = np.dtype([("kind", "u4"), ("offset", "u4"), ("bytes", "u4"), ("element
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the size of an image depends on."""
+    """The numbers that determine the size of an image."""
 
     method: str
     n_stars: int

@@ -29,7 +29,7 @@ IMAGE_KIND = 9
 """Kind of the section."""
 
 IMAGE_PREFIX = b"starcat-image-1\0"
-"""What a signed message begins with, so that no signature can be taken for another."""
+"""Beginning of a signed message, so that no signature can be used for another purpose."""
 
 RECORD_BYTES = 96
 """A public key of 32 bytes and a signature of 64."""
@@ -37,7 +37,7 @@ RECORD_BYTES = 96
 MAX_SIGNATURES = 16
 
 MAX_ADDED_BYTES = 2 * layout.BLOCK_BYTES
-"""What signatures add to an image at most: a block of data, and one that checks it."""
+"""Largest number of bytes that signatures add to an image: a data block and its check block."""
 
 _MINOR_VERSION = 1
 

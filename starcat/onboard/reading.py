@@ -107,7 +107,7 @@ def is_image(path: Path) -> bool:
         check_regular_file(path)
         with path.open("rb") as file:
             return file.read(len(layout.MAGIC)) == layout.MAGIC
-    except (OSError, SourceError):  # a folder, or no such file: others say so
+    except (OSError, SourceError):  # a folder, or no such file: the reader reports it
         return False
 
 

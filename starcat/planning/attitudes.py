@@ -28,7 +28,7 @@ MAX_ATTITUDES = 100_000
 """Rows of a table of attitudes or of an orbit."""
 
 MAX_BYTES = 64 << 20
-"""Of a file of attitudes or of an orbit."""
+"""Largest size of a file of attitudes or of an orbit."""
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANGLES = ("ra_deg", "dec_deg", "roll_deg")

@@ -31,7 +31,7 @@ from starcat.sky.observer import Observer, aberrated
 from starcat.stars.star_table import floats_of
 
 BLOCK = 2000
-"""Attitudes that are planned at once."""
+"""Number of attitudes that are planned at once."""
 
 MIN_DETECTION = 0.001
 """Stars that are less likely to be detected are not listed."""
@@ -215,7 +215,7 @@ class Plan:
         return [dict(zip(columns, cells, strict=True)) for cells in rows_of_cells]
 
     def attitude(self, row: int) -> dict[str, Any]:
-        """Return what is known of an attitude but its stars, as plain values."""
+        """Return all values of an attitude except its stars, as plain values."""
         matrix = self.attitudes.matrices[row]
         ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
         return {

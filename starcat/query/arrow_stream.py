@@ -23,7 +23,7 @@ BATCH_BYTES = 8 << 20
 """About how large a batch is sent at most; a single row may be larger."""
 
 MAX_DICTIONARY_BYTES = 1 << 30
-"""What the values of a dictionary may take when they are written out for every row."""
+"""Largest size of the values of a dictionary when they are written out for every row."""
 
 _PLAIN_TYPES = {
     pa.lib.Type_NA, pa.lib.Type_BOOL, pa.lib.Type_INT8, pa.lib.Type_UINT8, pa.lib.Type_INT16,

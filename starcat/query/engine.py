@@ -46,7 +46,7 @@ _FUNCTION = "starcat.query.worker:serve_queries"
 class Allowance:
     """The time that all queries together may take; only waiting for the answer counts.
 
-    Its process leaves the processors to others when it has taken ``patient_after_s`` of them.
+    After ``patient_after_s`` of processor time the process gets a low priority.
     """
 
     total_s: float
@@ -57,7 +57,7 @@ class Allowance:
 
 
 _waiting: list[WorkerProcess] = []
-"""A process that was started before it is known what for."""
+"""Processes that were started in advance."""
 
 
 def warm_up(count: int = 1) -> None:
@@ -113,10 +113,10 @@ class Engine:
         progress: Progress = no_progress,
         max_bytes: int | None = None,
     ) -> list[Any]:
-        """Ask the process for something, and wait for the answer.
+        """Send a request to the process, and wait for the answer.
 
-        The last item is the answer: plain values as JSON has them, or the bytes of an Arrow stream.
-        Those before it are rows, in parts. `AnswerTooLarge` if there are more than ``max_bytes``.
+        The last item is the answer: plain values for JSON, or the bytes of an Arrow stream. The
+        items before are rows, in parts. `AnswerTooLarge` if they exceed ``max_bytes``.
         """
         with self._asking:
             if not self.is_running:
@@ -185,7 +185,7 @@ class Engine:
         finally:
             allowance.left_s -= time.monotonic() - begun_s
             allowance.used_s += max(0.0, self._process.used_s() - used_s)
-            # A question that was dropped halfway, as by Ctrl-C, would be answered to the next.
+            # If a request is dropped halfway, as by Ctrl-C, the next would get its answer.
             if not is_over:
                 self.close()
         return parts
@@ -193,7 +193,7 @@ class Engine:
     def _replies(
         self, allowance: Allowance, begun_s: float, used_s: float, max_bytes: int | None
     ) -> Iterator[tuple[str, bytes | bytearray]]:
-        """Give what the process sends until it is at an end; TimeoutError if it takes too long."""
+        """Yield the messages of the process up to the last; TimeoutError if it takes too long."""
         until_s, kind, size = begun_s + allowance.left_s, "", 0
         while kind not in ENDINGS:
             left_s = until_s - time.monotonic()
@@ -217,7 +217,7 @@ class Engine:
             yield kind, content
 
     def _error(self, error: Exception) -> QueryError:
-        """Return what to say of an error that the process has sent."""
+        """Return the exception for an error that the process has sent."""
         if isinstance(error, MemoryError):
             return QueryLimitError(
                 f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
@@ -228,7 +228,7 @@ class Engine:
         return error if isinstance(error, QueryError) else QueryError(str(error))
 
     def _ended(self, allowance: Allowance) -> QueryError:
-        """Return what to say of a process that ended before it answered."""
+        """Return the exception for a process that ended before it answered."""
         # The pipe is closed a moment before the process is gone.
         self._process.wait(ENDING_S)
         self._process.kill()

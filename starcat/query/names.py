@@ -28,8 +28,8 @@ xmlroot xmlserialize xmltable
 """
 
 SQL_WORDS = frozenset(_WORDS.split())
-"""Words that DuckDB takes for no name of a table. Listed here, so that a name does not depend on
-the version of DuckDB."""
+"""Words that DuckDB does not accept as the name of a table. They are listed here, so that a name
+does not depend on the version of DuckDB."""
 
 CATALOGS = frozenset({"main", "memory", "temp", "system", "information_schema", "pg_catalog"})
 """Schemas and catalogs that every DuckDB has."""

@@ -20,7 +20,7 @@ from starcat.geometry.sphere import separation
 from starcat.store.layout import Pixel
 
 MARGIN_DEG = 1e-6
-"""By how much circles and boxes are wider than the corners need, for what rounding takes."""
+"""Margin by which circles and boxes are wider than their corners, for rounding errors."""
 
 _RING_OF_FACE = np.array([2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4])
 _EIGHTH_OF_FACE = np.array([1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7])
@@ -29,8 +29,8 @@ _CORNERS = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))
 
 EXTENT = ("x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to")
 """The direction of the middle of a circle, cosine and sine of its radius and the radius, the sides
-of a box. Angles are in degrees; ``ra_from`` is from 0 to 360, ``ra_to`` is larger, also than 360
-where the box goes through 0."""
+of a box. Angles are in degrees; ``ra_from`` is from 0 to 360, ``ra_to`` is larger, and above 360
+if the box goes through 0."""
 
 
 def extents(pixels: Sequence[Pixel]) -> Array:

@@ -46,7 +46,7 @@ MAX_CHECKED = 200
 
 @dataclass(frozen=True)
 class Limits:
-    """What a query may take."""
+    """The limits of a query."""
 
     time_s: float = 60.0  # seconds until it is stopped
     memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
@@ -123,7 +123,7 @@ class Session:
     def _described(
         self, statement: Statement, values: dict[str, Any] | None, allowance: Allowance
     ) -> str:
-        """Return a query for what DESCRIBE gives, and what the columns mean."""
+        """Return a query for the result of DESCRIBE, with the meanings of the columns."""
         asked = f"SELECT column_name, column_type FROM ({statement.text})"
         found = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
         known = facts_by_name(self._view_of(statement) or self.views)

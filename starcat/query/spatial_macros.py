@@ -114,7 +114,7 @@ def _position(view: View) -> tuple[str, str]:
     ra, dec = (quoted_name(by_lower[name.lower()]) for name in view.position)
     if view.position == POSITION:
         return ra, dec
-    # Of a catalog of others it is not known whether right ascensions are from 0 or from -180 on.
+    # In other catalogs right ascensions can begin at 0 or at -180.
     return f"({ra}::DOUBLE - 360 * floor({ra}::DOUBLE / 360))", f"{dec}::DOUBLE"
 
 

@@ -1,4 +1,4 @@
-"""What a query is about: databases, star tables, stores, archive files, and the views on them."""
+"""Targets of a query: databases, star tables, stores, archive files, and the views on them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """Something that a query is about."""
+    """A target of a query."""
 
     # The schema of its views: ``name_1_2_3`` for a database, else the name of the source or the
     # file. It stays the same, whatever other targets there are.

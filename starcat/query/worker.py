@@ -42,7 +42,7 @@ SCHEMA_KEY = "starcat.schema"
 
 _ZONED = re.compile(r"TIMESTAMP\w* WITH TIME ZONE")
 _ODD = re.compile(rf"{_ZONED.pattern}|\bINTERVAL\b")
-"""Types of which the Python client of DuckDB makes other values, or none."""
+"""Types that the Python client of DuckDB converts to other values, or cannot convert."""
 
 
 def serve_queries() -> None:
@@ -133,7 +133,7 @@ class QueryWorker:
             return [text]
 
     def check(self, text: str) -> dict[str, Any]:
-        """Return what may run of a text, for `Statement.from_json`."""
+        """Return the checked statement of a text, for `Statement.from_json`."""
         return asdict(check_statement(text, self._connection, self._macros))
 
     def columns(self, text: str, values: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -200,7 +200,7 @@ class QueryWorker:
         return None
 
     def _let_go(self) -> None:
-        """Drop what is left of an answer, which DuckDB keeps open otherwise."""
+        """Drop the rest of an answer, which DuckDB keeps open otherwise."""
         if self._reader is not None:
             self._reader.close()
             self._reader, self._streams = None, iter(())

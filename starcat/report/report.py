@@ -118,7 +118,7 @@ BLIND_SHARE = 0.001
 
 
 def coverage_warnings(summary: CoverageSummary, gap: TilingGap | None) -> tuple[str, ...]:
-    """Return what to say about holes of a tiling and about fields with too few stars."""
+    """Return warnings about holes of a tiling and about fields with too few stars."""
     told = [] if gap is None or not gap.has_holes else [_holes(gap)]
     blind = int(summary.histogram[:MIN_GUIDE_STARS].sum())
     if blind > BLIND_SHARE * summary.fields:

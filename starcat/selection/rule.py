@@ -1,4 +1,4 @@
-"""What rules of selection are made of: reasons, rejections, the context, fields of a form."""
+"""Parts of the rules of selection: reasons, rejections, the context, fields of a form."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Rejection:
 
 @dataclass
 class Context:
-    """What rules see and change while they are run one after another."""
+    """The data that rules read and change while they run in turn."""
 
     catalog: pa.Table  # the star table as it was read
     stars: pa.Table  # the same rows, as the rules that combine stars have changed them

@@ -1,4 +1,4 @@
-"""What an onboard image identifies in flight: the C library with its default options and limits.
+"""Identification rates of an onboard image in flight: the C library with its default limits.
 
 The simulated frames show all stars of the database that the image was made from, so they also show
 stars that the image does not have.
@@ -35,7 +35,7 @@ KINDS: Mapping[str, Noise] = MappingProxyType(
 )
 
 FRAMES = 200
-"""Frames of each kind that an image is tried with when it is written."""
+"""Number of frames of each kind with which an image is tested when it is written."""
 
 SEED = 86_028_121
 

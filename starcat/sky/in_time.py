@@ -169,7 +169,7 @@ def _unset(frame: Array, rows: tuple[int, ...]) -> Array:
 def _without(
     identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
 ) -> MatchResult:
-    """Identify a frame without the spots of planets, and say what they were."""
+    """Identify a frame without the spots of planets, and name the planets in the answer."""
     found = identify(_unset(frame, tuple(names)), mag=mag)
     dropped = tuple((row, names.get(row, reason)) for row, reason in found.dropped)
     return replace(found, dropped=dropped)
@@ -244,7 +244,7 @@ class SkyInTime:
     earth_limb_angle_deg: float | None
 
     def content(self) -> dict[str, Any]:
-        """Return it as JSON has it, under the key ``in_time`` of an answer."""
+        """Return the values for JSON, under the key ``in_time`` of an answer."""
         return {**asdict(self), "q_body_from_icrs": self.q_body_from_icrs.tolist()}
 
 
@@ -257,7 +257,7 @@ def sky_in_time(
     *,
     parallax_mas: ArrayLike | None = None,
 ) -> SkyInTime | None:
-    """Return what the time adds to the answer to a frame.
+    """Return the results for a frame that need its time.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     cos_end = np.divide(x, ground, out=cos_ra, where=off_pole)
     sin_end = np.divide(y, ground, out=sin_ra, where=off_pole)
     # The derivative of p / |p| along east and north at the end: as the star moves away on its
-    # straight line, the same speed is a smaller angle a year.
+    # straight line, the same speed is a smaller angle per year.
     pm_ra_end = (vy * cos_end - vx * sin_end) / (length * MAS)
     pm_dec_end = (vz * ground - (vx * cos_end + vy * sin_end) * z) / (length * MAS)
     end = Motion(

@@ -31,8 +31,8 @@ Columns: TypeAlias = dict[str, Values]
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
     """Return the columns with positions at an epoch, and their directions.
 
-    A star without proper motion stays where and when its archive has it, and its quality flags
-    say so; where the epoch is None, every star stays.
+    A star without proper motion stays at the place and epoch of its archive, and its quality flags
+    show this. If the epoch is None, every star stays.
     """
     ra = np.asarray(columns["ra_deg"], dtype=np.float64)
     dec = np.asarray(columns["dec_deg"], dtype=np.float64)

@@ -46,7 +46,7 @@ class NamedReason(Protocol):
 
     @property
     def name(self) -> str:
-        """What the product ``rejected`` calls it."""
+        """The name of the reason in the product ``rejected``."""
 
 
 class Verdicts:

@@ -176,7 +176,7 @@ TABLE, KEYS = "neighbours", NeighbourRule
 
 @dataclass(frozen=True)
 class NeighbourTally:
-    """What [selection.neighbours] decided otherwise than the separation rule of the same spec."""
+    """Differences between [selection.neighbours] and the separation rule of the same spec."""
 
     regained: int  # stars that it keeps, and the separation rule would leave out
     lost: int  # the other way round
@@ -268,7 +268,7 @@ class SeenStars:
 def seen_by_sensor(
     stars: pa.Table, rows: Rows, rule: NeighbourRule, pixel_arcsec: float
 ) -> SeenStars:
-    """Return what neighbours do to stars of a table, which has x, y, z, mag and star_id."""
+    """Return the effect of neighbours on stars of a table, which has x, y, z, mag and star_id."""
     widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px, rule.box_px)
     mag, number = floats_of(stars, "mag"), stars["star_id"].to_numpy()
     sky = _Sky(directions_of(stars), mag, number, widths.times(pixel_arcsec * ARCSEC))
