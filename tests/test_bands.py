@@ -127,7 +127,7 @@ BAD = {
     "angstroms": ("4000,0\n5000,1\n11000,0\n", "look like angstroms"),
     "angstroms in the header": ("wavelength [Angstrom],r\n4000,0\n", "wavelengths are in nm"),
     "micrometres": ("0.4,0\n0.5,1\n0.6,0\n", "look like micrometres"),
-    "one wavelength": ("550,1\n", "1 wavelengths; a curve needs 3"),
+    "one wavelength": ("550,1\n", "1 wavelengths; a curve needs at least 3"),
     "no overlap": ("2600,0\n2650,1\n2700,0\n", "look like angstroms"),
     "ultraviolet": ("120,0\n180,1\n250,0\n", "outside of 300 to 2500 nm"),
     "unsorted": ("500,1\n400,1\n600,1\n", "500 nm is followed by 400 nm"),

@@ -430,7 +430,7 @@ def judged_wide(stars: pa.Table) -> Selected:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"neighbours.max_offset_px": "0.2"}, "psf_sigma_px is missing: without the width of a"),
+        ({"neighbours.max_offset_px": "0.2"}, "psf_sigma_px is missing: blends cannot"),
         (
             {"neighbours.psf_sigma_px": "1.0", "neighbours.centroid": "box"},
             'state both centroid = "box" and the size of the box',

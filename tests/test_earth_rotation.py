@@ -93,7 +93,7 @@ def test_times_are_of_a_table_with_a_line_a_frame(tmp_path):
     table.write_text("frame,time\nphoto 0,yesterday\n")
     with pytest.raises(ConfigError, match="line 2: time is 'yesterday'"):
         times_of_frames([], table)
-    with pytest.raises(ConfigError, match="no frame says when it was taken"):
+    with pytest.raises(ConfigError, match="no frame has its time in it"):
         times_of_frames([], None)
 
 

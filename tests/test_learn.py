@@ -234,7 +234,7 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
 
 def test_a_database_of_other_stars_is_refused(flown):
     stars, _, path = flown
-    with pytest.raises(ConfigError, match=r"line 1: .* is no star of sky-1\.0\.0"):
+    with pytest.raises(ConfigError, match=r"line 1: .* is not a star of sky-1\.0\.0"):
         read_answers([path], replace(stars, mag=stars.mag + 0.5))
     with pytest.raises(ConfigError, match=r"identified with the database sky-1\.0\.0, this is x"):
         read_answers([path], replace(stars, name="x-1.0.0"))

@@ -338,7 +338,7 @@ def test_an_image_of_another_artifact_is_found(real):
     moved = contents.directions + 1e-8
     moved /= np.linalg.norm(moved, axis=1)[:, None]
     assert "stars lie elsewhere than in the database, by up to 0.00" in said(directions=moved)
-    assert "magnitudes: 1285 stars have another one" in said(mag=contents.mag + 0.002)
+    assert "magnitudes: 1285 stars have other values" in said(mag=contents.mag + 0.002)
     fewer = contents.features[1:]
     assert "section triangles: not all of them are in the database" in said(features=fewer)
 

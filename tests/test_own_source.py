@@ -182,7 +182,7 @@ EDITS_OF_MAP = (
     ('"ra"', '"RAJ2000"', "columns.ra: 'RAJ2000' is no column of t.csv; it has id, ra, dec"),
     ('"v"', '"(SELECT max(v) FROM t)"', "subquery is not allowed in one"),
     ('"v"', '"random()"', "there is no function random; did you mean 'round'?"),
-    ('"v"', '"v); DROP TABLE x; SELECT (1"', "no expression: it is more than one"),
+    ('"v"', '"v); DROP TABLE x; SELECT (1"', "an expression: it is more than one"),
     ('"v"', '"flag + 1"', "magnitudes.V: 'flag + 1' cannot be computed: Binder Error"),
     ('"v"', '"upper(flag)"', "magnitudes.V: 'upper(flag)' gives string; expected numbers"),
     (

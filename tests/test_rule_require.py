@@ -60,7 +60,7 @@ def test_unknown_values_can_be_let_through(stars, small_spec):
         ("rue < 1.4", "did you mean 'ruwe'"),
         ("ruwe < (SELECT 1)", "not allowed"),
         ("read_text('/etc/passwd') = ''", "there is no function read_text"),
-        ("ruwe <", "no expression"),
+        ("ruwe <", "nor an expression"),
         ("- " * 400 + "ruwe < 1", "nested too deep"),
         ("designation < 3", "cannot be computed"),
     ],

@@ -117,7 +117,7 @@ def test_archives_are_read_with_their_rejected_rows(archive, tmp_path):
 def test_archives_of_another_name_need_their_source(archive, tmp_path):
     copied = tmp_path / "mine.txt"
     shutil.copy(archive, copied)
-    refused = pytest.raises(QueryError, match=r"cannot tell what it is.*SOURCE=PATH")
+    refused = pytest.raises(QueryError, match=r"its kind is unknown.*SOURCE=PATH")
     with refused, open_session([str(copied)]):
         pass
     with open_session([f"sao={copied}"]) as session:

@@ -285,7 +285,7 @@ def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_sp
 def test_a_thinning_without_a_limit_is_refused(small_spec):
     content = tomllib.loads(small_spec)
     content["selection"]["thinning"] = "voronoi"
-    with pytest.raises(ConfigError, match="nothing says how many stars stay; give max_stars"):
+    with pytest.raises(ConfigError, match="no key sets how many stars stay; give max_stars"):
         spec_from_dict(content, "small.toml")
 
 

@@ -22,7 +22,7 @@ AS_EXACT = 1.25
 
 
 def colour_of(text: str) -> tuple[str, str] | None:
-    """Return the two bands of a colour such as BP-RP; None where one of them is unknown.
+    """Return the two bands of a colour such as BP-RP; None if one of them is unknown.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""From magnitudes to electrons: what an exposure makes of a star, and which stars it can measure.
+"""From magnitudes to electrons: the signal of a star in an exposure, and the measurable stars.
 
 The simulated star sensor of ``evaluate --ecss`` and the limits of a spec use the same formulas.
 """
@@ -45,7 +45,7 @@ def zero_point_e_s(
 
 @dataclass(frozen=True)
 class Exposure:
-    """What a frame makes of light."""
+    """The response of a frame to light."""
 
     zero_point_e: float  # electrons of a star of magnitude 0 in a frame
     background_e: float  # mean electrons of a pixel without stars: dark current and sky

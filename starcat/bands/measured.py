@@ -1,4 +1,4 @@
-"""How large errors of predicted magnitudes are on stars that were measured in both bands.
+"""Errors of predicted magnitudes, from stars that were measured in both bands.
 
 The tables ``relation_errors.csv`` and ``star_errors.csv`` of the data folder are made by
 ``tools/band_errors.py`` from genuine records. Only errors are taken from them: no

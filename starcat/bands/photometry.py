@@ -1,7 +1,7 @@
-"""How exact the magnitudes of catalogs are, by band and brightness.
+"""The accuracy of the magnitudes of catalogs, by band and brightness.
 
-The figures are those of the catalogs' own descriptions, rounded; a star that is brighter than a
-detector was made for is the worst known.
+The figures are from the catalogs' own descriptions, rounded. The magnitudes of stars that are too
+bright for a detector are the least accurate.
 """
 
 from __future__ import annotations
@@ -53,5 +53,5 @@ def band_error(band: str, mag: Array, source: str = "") -> Array:
 
 
 def variability_error(amplitude_mag: Array) -> Array:
-    """Return the standard deviation that a whole range makes; 0 where none is known."""
+    """Return the standard deviation for a whole range of variation; 0 if it is not known."""
     return np.asarray(AMPLITUDE_SHARE * np.nan_to_num(amplitude_mag, nan=0.0))

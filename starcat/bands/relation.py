@@ -1,10 +1,10 @@
-"""Relations from the bands of a catalog to a sensor's: what to add to a magnitude, and its error.
+"""Relations from the bands of a catalog to a sensor's band: magnitude offsets and their errors.
 
 A relation is a smooth line through the library's spectra: at each colour a straight line is fitted
-to those of about that colour, common ones with more weight. Nothing is fitted to stars of the sky.
-The error of a relation has three parts: how the spectra scatter about the line, what errors of the
-library's own flux calibration do to it, and how well the zero points of published bands are known.
-Their sum is multiplied by a factor that was measured on stars (`measured.py`).
+to the spectra of about that colour, with more weight on common types. Nothing is fitted to stars of
+the sky. The error of a relation has three parts: the scatter of the spectra about the line, the
+effect of errors of the library's own flux calibration, and the uncertainty of the zero points of
+published bands. Their sum is multiplied by a factor that was measured on stars (`measured.py`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from starcat.bands.response import Response, shipped
 from starcat.bands.synthetic import library, parsed_type, row_weights, synthetic_magnitudes
 
 GRID_MAG = 0.02
-"""Step of the colours that a relation is worked out at."""
+"""Step of the colours at which a relation is computed."""
 
 WIDTH_MAG, WIDEST_MAG = 0.06, 0.6
-"""Colours this far apart count as about the same (one standard deviation); where the library has
-few spectra the width grows, at the most to the second."""
+"""Colours this far apart count as about the same (one standard deviation); if the library has few
+spectra at a colour, the width grows up to the second value."""
 
 MIN_TYPES = 3.0
-"""So many types, at the least, make the line at a colour."""
+"""Smallest number of types from which the line at a colour is fitted."""
 
 ZERO_POINT_MAG = 0.007
-"""How well the passband and zero point of a published band are known (Bessell and Murphy 2012,
+"""Uncertainty of the passband and zero point of a published band (Bessell and Murphy 2012,
 section 4: 0.01 mag)."""
 
 PASSBAND_SHARE = 0.002
@@ -38,7 +38,7 @@ PASSBAND_SHARE = 0.002
 set by white stars, so that this matters more the further a star's colour is from theirs."""
 
 OUTSIDE_MAG = 0.5
-"""What the error grows by for each magnitude that a colour is outside of the library's."""
+"""Growth of the error per magnitude that a colour is outside of the library's colours."""
 
 TYPE_WIDTH, CLASS_WIDTH = 1.5, 0.7
 """Subclasses and luminosity classes that a spectral type spreads over."""
@@ -51,12 +51,12 @@ class Prediction:
     mag: Array  # shape (N,): NaN where the base magnitude is
     error_mag: Array  # shape (N,): standard deviation
     is_outside: Mask  # shape (N,): the colour is outside of the relation's
-    has_colour: Mask  # shape (N,): False where a mean over all stars had to do
+    has_colour: Mask  # shape (N,): False if a mean over all stars was used
 
 
 @dataclass(frozen=True)
 class Relation:
-    """What to add to a magnitude in a base band, by colour."""
+    """The offset to add to a magnitude in a base band, by colour."""
 
     base: str  # a shipped response, such as "G"
     colour: tuple[str, str]  # such as ("BP", "RP")
@@ -68,7 +68,7 @@ class Relation:
     calibration_mag: Array  # shape (G,): from errors of the library's fluxes
     band_mag: Array  # shape (G,): from errors of the passbands and their zero points
     measured: Array  # shape (G,): measured errors over the sum of these three
-    typical_offset_mag: float  # without a colour
+    typical_offset_mag: float  # the offset for stars without a colour
     typical_scatter_mag: float
     typical_error_mag: float  # the error of the relation at common colours
     typical_computed_mag: float  # the same without the measured factor
@@ -238,7 +238,7 @@ def predict_by_type(
 def combined(predictions: list[Prediction]) -> Prediction:
     """Return the mean of predictions from several catalogs, weighted by their errors.
 
-    Those of a star that are unknown, or outside of a relation where another is not, do not count.
+    Predictions are left out if they are unknown, or outside of their relation and another is not.
     """
     mags = np.stack([one.mag for one in predictions])
     errors = np.stack([one.error_mag for one in predictions])

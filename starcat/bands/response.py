@@ -21,20 +21,20 @@ from starcat.resources import resource_folder
 from starcat.storage.regular_files import read_regular_file
 
 Counts = Literal["photon", "energy"]
-"""What a response is relative to."""
+"""Quantity that a response is relative to."""
 
 LIMITS_NM = (300.0, 2500.0)
 """Wavelengths that the spectra cover."""
 
 MAX_ROWS = 20_000
 MAX_BYTES = 4_000_000
-"""Of the CSV file of a response."""
+"""Largest size of the CSV file of a response."""
 
 WIDEST_GAP_NM = 100.0
 """Rows further apart than this leave a curve to guesswork."""
 
 MAX_OUTSIDE = 0.01
-"""Share of a response that may lie where no spectrum reaches."""
+"""Largest share of a response outside of the wavelengths of the spectra."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def checked_response(
     name: str, wavelength_nm: Sequence[float] | Array, value: Sequence[float] | Array,
     counts: Counts, zero_point: str = "vega 0", *, title: str = "", source: str = "",
 ) -> Response:  # fmt: skip
-    """Return a response, or say what is wrong with the table that it was to be made of."""
+    """Return a response from a table; ConfigError for a table that is not valid."""
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     response = np.asarray(value, dtype=np.float64)
     found = _fault(wavelength, response)
@@ -103,16 +103,14 @@ def checked_response(
 
 
 def _fault(wavelength: Array, value: Array) -> str | None:
-    """Return what is wrong with a table of a response."""
+    """Return the fault of a table of a response, or None."""
     if len(wavelength) != len(value):
         return (
             f"{len(wavelength)} wavelengths and {len(value)} values; every wavelength needs one "
             "value"
         )
     if not 3 <= len(wavelength) <= MAX_ROWS:
-        return (
-            f"{len(wavelength)} wavelengths; a curve needs 3 at least and {MAX_ROWS:,} at the most"
-        )
+        return f"{len(wavelength)} wavelengths; a curve needs at least 3 and at most {MAX_ROWS:,}"
     missing = ~(np.isfinite(wavelength) & np.isfinite(value))
     if missing.any():
         row = int(np.argmax(missing)) + 1
@@ -164,16 +162,16 @@ def _fault_of_coverage(wavelength: Array, value: Array) -> str | None:
     if outside <= MAX_OUTSIDE:
         return None
     return (
-        f"{outside:.0%} of it is outside of {low:g} to {high:g} nm, which the spectra cover, so no "
-        "band of a catalog tells its magnitudes. Check the units, or cut it there"
+        f"{outside:.0%} of it is outside of {low:g} to {high:g} nm, which the spectra cover, so "
+        "catalog bands cannot predict its magnitudes. Check the units, or cut it there"
     )
 
 
 def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
-    """Return a response from the text of a CSV file: a wavelength in nm and a value a row.
+    """Return a response from the text of a CSV file: a wavelength in nm and a value per row.
 
-    Lines that begin with # are remarks, of which ``# counts:``, ``# title:``, ``# zero_point:`` and
-    ``# source:`` are read; one header line may precede the numbers.
+    Lines that begin with # are remarks; ``# counts:``, ``# title:``, ``# zero_point:`` and
+    ``# source:`` are read. A header line can precede the numbers.
     """
     remarks: dict[str, str] = {}
     rows: list[tuple[float, float]] = []
@@ -187,7 +185,7 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
     said = counts or remarks.get("counts", "")
     if said not in ("photon", "energy"):
         raise ConfigError(
-            f'response {name}: it does not say what it is relative to; set per = "photon" '
+            f'response {name}: it does not state what it is relative to; set per = "photon" '
             '(quantum efficiency) or per = "energy" (A/W)',
             key="per",
             fields=('per = "photon"', 'per = "energy"'),
@@ -205,7 +203,7 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
 
 
 def read_response(path: Path, per: str | None) -> Response:
-    """Return the response of a CSV file, which a spec says what it is relative to."""
+    """Return the response of a CSV file; ``per`` states what its values are relative to."""
     try:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8")
     except FileMissing:
@@ -222,7 +220,7 @@ def read_response(path: Path, per: str | None) -> Response:
 
 
 def _row(name: str, number: int, line: str, *, is_first: bool) -> tuple[float, float] | None:
-    """Return the two numbers of a line; None where it is the header."""
+    """Return the two numbers of a line; None for the header."""
     cells = [cell.strip() for cell in line.replace(";", ",").split(",")]
     try:
         if len(cells) == 2:
@@ -233,7 +231,7 @@ def _row(name: str, number: int, line: str, *, is_first: bool) -> tuple[float, f
         if is_first and any(unit in line.lower() for unit in ("angstrom", "micro", "um")):
             raise ConfigError(
                 f"response {name}: line {number}: found {quoted(line)}; wavelengths are in nm, and "
-                "the header says wavelength_nm,response",
+                "the header is wavelength_nm,response",
                 key="response",
             ) from None
         if is_first and not any(cell[:1].isdigit() for cell in cells):

@@ -83,7 +83,7 @@ _CLASSES = {"I": 1.0, "II": 2.0, "III": 3.0, "IV": 4.0, "V": 5.0}
 
 
 def parsed_type(text: str) -> tuple[float, float]:
-    """Return a spectral type as a number and a luminosity class; NaN for what it does not say.
+    """Return a spectral type as a number and a luminosity class; NaN for a part that is missing.
 
     Examples
     --------
@@ -132,7 +132,7 @@ def synthetic_magnitudes(response: Response) -> Array:
 
 
 def zero_mag(response: Response, weights: Array) -> float:
-    """Return the magnitude, from a signal alone, of what has 0 mag in the band."""
+    """Return the magnitude, computed from the signal alone, of a star of 0 mag in the band."""
     kind, _, said = response.zero_point.partition(" ")
     if kind == "vega":
         return float(-2.5 * np.log10(library().vega @ weights)) - float(said)
@@ -160,7 +160,7 @@ def type_row(text: str) -> int:
 
 
 def checked_zero_point(text: str) -> str:
-    """Return a zero point as a spec states it, as a response has it: 'vega' or a spectral type."""
+    """Return the zero point of a spec, 'vega' or a spectral type, in the form of a response."""
     if text.lower() == "vega":
         return "vega 0"
     if np.isnan(parsed_type(text)[0]):

@@ -1,6 +1,6 @@
-"""Answers of ``starcat identify`` as arrays: which star was seen where and how bright, or not seen.
+"""Answers of ``starcat identify`` as arrays: place and brightness of each star, seen or not.
 
-A file holds a line of JSON a frame, as ``--ndjson`` prints them, or one JSON value of all frames.
+A file holds one line of JSON per frame, as ``--ndjson`` prints them, or a JSON value of all frames.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _SAME_MAG = 1e-6
 class SkyStars:
     """The guide stars of a database, one row each."""
 
-    name: str  # of the database, ``<name>-<version>``
+    name: str  # name of the database, ``<name>-<version>``
     star_id: NDArray[np.int64]
     designation: tuple[str, ...]
     directions: Directions
     mag: Array
-    colour: Array  # of one pair of bands; NaN where a star has none
+    colour: Array  # colour in one pair of bands; NaN for a star without one
 
     def __len__(self) -> int:
         return len(self.mag)
@@ -51,11 +51,11 @@ class SkyStars:
 
 @dataclass(frozen=True)
 class Sightings:
-    """The stars that should be in identified frames, a row for each star of each frame."""
+    """The stars that should be in identified frames, one row per star and frame."""
 
     frame: NDArray[np.int64]  # number of the frame, ascending
     star: NDArray[np.int64]  # row of the database
-    is_seen: NDArray[np.bool_]  # whether a centroid was identified as the star
+    is_seen: NDArray[np.bool_]  # true if a centroid was identified as the star
     mag: Array  # measured magnitude; NaN unless seen and measured
     offset_arcsec: Array  # seen minus database, east and north; NaN unless seen; shape (N, 2)
 
@@ -65,10 +65,10 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Answers:
-    """What the files say."""
+    """The contents of the files."""
 
-    names: tuple[str, ...]  # of the identified frames
-    n_frames: int  # of all
+    names: tuple[str, ...]  # names of the identified frames
+    n_frames: int  # number of all frames
     sightings: Sightings
 
 
@@ -88,7 +88,7 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
     if not names:
         raise ConfigError(
             f"none of the {count} frames of {', '.join(str(path) for path in paths[:3])} is "
-            "identified, and nothing can be learnt of them; 'starcat identify' says why of each"
+            "identified, so nothing can be learnt; 'starcat identify' shows the reason for each"
         )
     frame, star, is_seen, mag, offset = (
         np.concatenate(column) for column in zip(*parts, strict=True)
@@ -102,7 +102,7 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
 
 
 def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Return each answer of a file, and where it stands."""
+    """Return each answer of a file, and its place in the file."""
     try:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing:
@@ -137,7 +137,8 @@ def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
             yield f"{path}: line {number}", json.loads(line)
         except (ValueError, RecursionError) as error:
             raise ConfigError(
-                f"{path}: line {number} is not JSON ({error}); expected a line a frame: {MAKE_THEM}"
+                f"{path}: line {number} is not JSON ({error}); expected one line per frame: "
+                f"{MAKE_THEM}"
             ) from error
 
 
@@ -153,7 +154,7 @@ class _Seen:
 def _seen_stars(
     answer: dict[str, Any], stars: SkyStars, row_of: dict[int, int], where: str
 ) -> _Seen:
-    """Return the stars of an answer; the database has to be the one that it was found with."""
+    """Return the stars of an answer, which must have been found with the same database."""
     made_with = answer.get("database")
     if made_with is not None and made_with != stars.name:
         raise ConfigError(
@@ -174,8 +175,8 @@ def _seen_stars(
     for row, one, brightness in zip(rows, centroids, told, strict=True):
         if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
             raise ConfigError(
-                f"{where}: {one['star']} with magnitude {brightness:g} is no star of {stars.name}; "
-                "give the database that the frames were identified with"
+                f"{where}: {one['star']} with magnitude {brightness:g} is not a star of "
+                f"{stars.name}; give the database that the frames were identified with"
             )
     return _Seen(
         np.array(rows, dtype=np.int64), np.array(px).reshape(-1, 2), np.array(mag, dtype=np.float64)

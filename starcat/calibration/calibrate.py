@@ -35,7 +35,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 
-# Fewest identified frames of a calibration: with fewer, leaving some out says nothing.
+# Fewest identified frames of a calibration: with fewer, leaving some out tests nothing.
 MIN_FRAMES = 3
 MAX_NAMED = 10  # frames that a message names at most
 SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
@@ -43,16 +43,16 @@ SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedFrame:
-    """What became of one frame.
+    """The result of one frame.
 
     Attributes
     ----------
     name : str
         Name of the frame.
     status : str
-        As of `MatchResult`.
+        The status as in `MatchResult`.
     n_centroids, n_matched : int
-        Centroids, and those with a star.
+        Numbers of all centroids, and of centroids with a star.
     residual_px : float
         Root mean square residual on each axis; NaN unless identified.
     q_body_from_icrs : ndarray of float64, shape (4,)
@@ -74,19 +74,19 @@ class Calibration:
     Attributes
     ----------
     camera : Camera
-        With the terms that the frames support; the others are 0, and the principal point in the
-        middle.
+        The camera with the terms that the frames support; the other terms are 0, and the principal
+        point is in the middle.
     fit : Fit
         These terms with covariance, noise and residuals.
     complete : Fit
-        The same with all usual terms free, whether they are supported or not.
+        The fit with all usual terms free, whether they are supported or not.
     axes : Fit
         The supported terms with aspect and skew free too, which no camera file has.
     trials : tuple of Trial
-        The comparison of models on frames that they have not seen; empty for so few stars that
-        there is nothing to compare, where only the focal length is fitted.
+        The comparison of models on frames that they were not fitted to. Empty if there are too few
+        stars to compare models; then only the focal length is fitted.
     frames : tuple of CalibratedFrame
-        One a frame, in the order that they were given in.
+        One result per frame, in the order of the input.
     """
 
     camera: Camera
@@ -147,7 +147,7 @@ def _finished(
         terms = chosen(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
     found = camera_of(fit.values, size_px)
-    # The camera of the last round may have had other terms: its stars are asked for once more.
+    # The camera of the last round can have had other terms: identify the frames once more.
     last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
     again = identify_part(last, frames, found)
     if len(again.found) >= len(identified.found):

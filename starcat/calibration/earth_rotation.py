@@ -1,12 +1,12 @@
-"""The turning Earth as the truth: how wrong attitudes of a camera are that stands still.
+"""Attitude errors of a camera that stands still, with the turning Earth as the truth.
 
-The sky turns over a camera that is fixed to the ground by 15.041 arcsec a second about the pole,
-and nothing else moves. Attitudes with that turn taken out are all the same, and what they differ by
-is their error: no other star tracker, no table and no mark on the ground is needed. Aberration is
-taken out too; refraction is the same in all frames, as they look at one place of the air. An error
-of the clock that all times share drops out.
+The sky turns over a camera that is fixed to the ground by 15.041 arcsec per second about the pole,
+and nothing else moves. With that turn removed all attitudes should agree, and their differences are
+their errors: no other star tracker, no table and no mark on the ground is needed. Aberration is
+removed too; refraction is the same in all frames, as they look through the same air. A clock error
+that all times share drops out.
 
-Where the camera was moved between frames, each place that it looked to is a set of its own.
+If the camera was moved between frames, the frames of each place form a set of their own.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from starcat.sky.observer import Observer
 from starcat.storage.regular_files import read_regular_file
 
 EARTH_RATE_ARCSEC_S = 15.041067  # turn of the Earth against the stars (IERS Conventions 2010)
-MAX_BYTES = 64 << 20  # of the table of times
-_MOVED_DEG = 0.5  # a camera that turned farther than that was moved
+MAX_BYTES = 64 << 20  # largest size of the table of times
+_MOVED_DEG = 0.5  # a camera that turned farther than this was moved
 _ARCSEC = np.degrees(1.0) * 3600.0
 # Two components are within this sum of squares as often as one is within three errors: 99.73 %.
 _THREE_SIGMA = 11.83
@@ -49,20 +49,20 @@ class TurnedFrame:
     time: str  # middle of the exposure, UTC
     set_number: int  # from 1
     error_arcsec: tuple[float, float, float]  # rotation about x, y and z of the camera
-    sigma_arcsec: tuple[float, float, float]  # that the centroids' noise leads to expect
-    clock_s: float  # what its time would have to be changed by to agree best
+    sigma_arcsec: tuple[float, float, float]  # expected from the noise of the centroids
+    clock_s: float  # change of its time with which it agrees best
     # Mean square, in expected errors, of the two components that no change of the time explains.
     chi2: float
 
 
 @dataclass(frozen=True)
 class EarthRotation:
-    """What attitudes of a fixed camera differ by, the turn of the Earth taken out.
+    """Differences between attitudes of a fixed camera, with the turn of the Earth removed.
 
-    Of sets of a single frame nothing is known, and they are left out. ``rms_arcsec`` is about x, y
-    and z of the camera. Errors of the times are in what is about the axis of the Earth, and
-    ``chi2``, the mean of those of the frames, is without that: about 1 where the errors are what
-    the centroids lead to expect. ``rate_arcsec_s`` is the turn that the frames themselves show.
+    Sets of a single frame have no differences and are left out. ``rms_arcsec`` is about x, y and z
+    of the camera. Errors of the times only affect the component about the axis of the Earth, which
+    ``chi2``, the mean of the frames' values, leaves out: it is about 1 if the errors are as large
+    as the noise of the centroids predicts. ``rate_arcsec_s`` is the turn measured from the frames.
     """
 
     frames: tuple[TurnedFrame, ...]
@@ -76,7 +76,7 @@ class EarthRotation:
 
     @property
     def within(self) -> int:
-        """Frames that are within three expected errors, whatever their times are wrong by."""
+        """Frames that are within three expected errors, whatever the errors of their times."""
         return sum(2.0 * one.chi2 <= _THREE_SIGMA for one in self.frames)
 
 
@@ -89,7 +89,7 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     found = {name: time for name, time in times.items() if time is not None}
     if not found:
         raise ConfigError(
-            "no frame says when it was taken (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
+            "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
             "with a CSV file of the columns frame and time",
             fields=("times",),
         )
@@ -107,7 +107,7 @@ def _times_of_table(path: Path) -> dict[str, datetime]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: cannot be read ({error})") from error
     if not rows or not {"frame", "time"} <= rows[0].keys():
-        raise ConfigError(f"{path}: expected a header with frame and time, and a line a frame")
+        raise ConfigError(f"{path}: expected a header with frame and time, and one line per frame")
     times = {}
     for number, row in enumerate(rows, start=2):
         try:
@@ -128,7 +128,7 @@ def earth_rotation(calibration: Calibration, times: Mapping[str, datetime]) -> E
     if len(timed) < 2:
         raise CalibrationError(
             f"{len(timed)} of {len(names)} identified frames have a time; expected two or more: "
-            "times are by the names of frames, those of pictures without the suffix"
+            "give times by the name of the frame (for a picture, its name without the suffix)"
         )
     fixed = np.stack([_on_earth(calibration, k, time) for time, k, _ in timed])
     sets = _sets(fixed)
@@ -153,7 +153,7 @@ def _on_earth(calibration: Calibration, number: int, time: datetime) -> Array:
 
 
 def _sets(fixed: Array) -> list[list[int]]:
-    """Return the rows of attitudes one after the other that are the same but for their errors."""
+    """Return the rows of successive attitudes that differ only by their errors."""
     sets: list[list[int]] = [[0]]
     for row in range(1, len(fixed)):
         turn = Rotation.from_matrix(fixed[row] @ fixed[row - 1].T).magnitude()

@@ -1,7 +1,7 @@
 """Calibration of the camera of files: frames in; a camera file and a drawing of residuals out.
 
-The camera file says in comments what is known about the camera's errors; the drawing shows the
-residuals over the detector and with the radius.
+Comments in the camera file give the errors of the camera; the drawing shows the residuals over
+the detector and with the radius.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Share by which the focal length of the camera to start from may be wrong, where no range of
-# fields is given.
+# Share by which the focal length of the first camera can be wrong, if no range of fields is
+# given.
 USUAL_ERROR = 0.1
 
 
 def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
     """Return the files and frames that a caller gives to calibrate a camera from.
 
-    Files are given as paths, folders and patterns, frames as what `Matcher.identify` takes or as
-    results of it; both alone or in a sequence.
+    Files are given as paths, folders and patterns, frames in any form that `Matcher.identify`
+    takes or as its results; both alone or in a sequence.
     """
     if _is_file(frames) or _is_one_frame(frames):
         frames = [frames]
@@ -142,7 +142,7 @@ def measured_frames(
 
 
 def names_of_files(paths: Sequence[Path]) -> list[str]:
-    """Return the name of each file's frame, which no other file has.
+    """Return a unique name for the frame of each file.
 
     The name is the file's name without its suffix; if several files share it, the path without
     the suffix; if they share that too, the path.
@@ -160,7 +160,7 @@ def starting_camera(
     image_size_px: tuple[int, int] | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> tuple[Camera, tuple[float, float]]:
-    """Return what is known of a camera before its calibration."""
+    """Return the known values of a camera before its calibration."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
     known = camera or own
@@ -256,7 +256,7 @@ def _draw_arrows(axes: Axes, calibration: Calibration) -> None:
     dx, dy = (fit.residual_px * enlarged).T
     stray = np.hypot(*fit.residual_px.T) > 4.5 * fit.noise_px
     for which, colour in ((~stray, _BLUE), (stray, _RED)):
-        # Strays point where they were seen, but no farther than the eye can use.
+        # Arrows of stray centroids point to the measured place, but have a largest length.
         longest = 2.0 * _LONG_ARROW * camera.width_px
         size = np.minimum(1.0, longest / np.maximum(np.hypot(dx, dy), 1e-9))[which]
         axes.quiver(

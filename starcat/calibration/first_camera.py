@@ -27,32 +27,32 @@ from starcat.progress import Progress, no_progress
 from starcat.specs.camera_file import camera_toml
 
 ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
-"""Distances within which a centroid is a star, in the rounds of fitting the lens."""
+"""Largest distances of a centroid from its star, in the rounds of fitting the lens."""
 
 ERROR_OF_LENS = 0.005
 """Relative error of the field of one picture that its distortion makes: it depends on where on the
 detector the stars are. Fields of an IMX219 with 7 % of distortion in the corner scatter so."""
 
 BRIGHT = 15
-"""Stars at least that tell how many of the bright ones are seen."""
+"""Smallest number of bright stars from which the share of seen stars is measured."""
 
 AT_THE_END_MAG = 0.1
-"""A limit this near to the faintest star of the database is that of the database."""
+"""A limit this near to the faintest star of the database is the limit of the database."""
 
 
 @dataclass(frozen=True)
 class FirstCamera:
-    """What photographs tell of their camera."""
+    """The camera of photographs, found from their stars."""
 
-    camera: Camera  # without distortion, in the middle of its fields
+    camera: Camera  # camera without distortion, in the middle of its fields
     fov_error_deg: float  # standard error of the field across the width
-    fit: Fit  # of the terms of the lens that the stars support
+    fit: Fit  # fit of the terms of the lens that the stars support
     reach_mag: float  # magnitude from which stars are seen half as often as bright ones
-    n_reach: int  # stars that tell it
-    is_deeper: bool  # whether the database has hardly any star that is missed
-    names: tuple[str, ...]  # of the pictures that were identified
+    n_reach: int  # number of stars that it is measured from
+    is_deeper: bool  # true if the camera sees nearly all stars of the database
+    names: tuple[str, ...]  # names of the pictures that were identified
     n_files: int
-    flip: bool | None  # how the pictures had to be read
+    flip: bool | None  # the ``flip`` with which the pictures were identified
 
     @property
     def lens(self) -> Camera:
@@ -61,11 +61,11 @@ class FirstCamera:
 
     @property
     def has_distortion(self) -> bool:
-        """Whether they support any."""
+        """Whether the stars support any distortion."""
         return len(self.fit.free) > 1
 
     def remarks(self, limit_mag: float, band: str, *, is_stated: bool) -> list[str]:
-        """Return where the values of a spec come from and how well they are known, in lines."""
+        """Return comments for a spec: the origin of its values and their errors, in lines."""
         count, stars = len(self.names), len(self.fit.seen)
         named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
         seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
@@ -97,7 +97,7 @@ class FirstCamera:
 
     @property
     def noise_px(self) -> float:
-        """Noise of a centroid as a spec states it."""
+        """Noise of a centroid, for a spec."""
         return min(50.0, round(self.fit.noise_px, 3))
 
     @property
@@ -113,7 +113,7 @@ def first_camera(
     size_px: tuple[int, int] | None = None,
     progress: Progress = no_progress,
 ) -> FirstCamera:
-    """Find the camera of pictures or files of centroids; `CalibrationError` if none tells it."""
+    """Find the camera of pictures or files of centroids; `CalibrationError` if that fails."""
     flip: bool | None = None
     found: list[FrameAnswer] = []
     why = []
@@ -147,7 +147,7 @@ def _camera_of(
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) > 1:
         listed = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
-        raise CalibrationError(f"the pictures have {listed} px; give those of one camera")
+        raise CalibrationError(f"the pictures have {listed} px; give pictures of one camera")
     focal_px = np.array([camera.focal_length_px for camera in cameras])
     errors = [one.result.focal_length_error_px or 0.0 for one in found]
     middle = cameras[0].with_focal_length(float(np.median(focal_px)))
@@ -204,7 +204,7 @@ def _lens_and_reach(
         mag, is_seen = np.concatenate(mags), np.concatenate(near)
         limit_mag = _reach(mag, is_seen)
         if min(len(row) for row in rows) < 4:
-            break  # too few to be more than those that were identified
+            break  # a frame would have fewer stars than were identified in it
         fit = supported_fit(
             _seen(found, rows, there, fit.seen.matrices), fit.values, size_px, reach_px
         )
@@ -231,8 +231,9 @@ def _in_frame(body: Array, values: Array, size_px: tuple[int, int]) -> tuple[Row
 def _reach(mag: Array, is_seen: Mask) -> float:
     """Return the magnitude from which stars are seen half as often as the bright ones.
 
-    Clouds and trees hide stars of all magnitudes. The magnitude is the one up to which the stars
-    seen exceed half of those that would be seen among the bright ones by the most.
+    Clouds and trees hide stars of all magnitudes, so the share seen among bright stars is the
+    reference. Up to the returned magnitude, the number of stars seen exceeds half of the number
+    expected from that share by the most.
     """
     order = np.argsort(mag, kind="stable")
     seen = np.cumsum(is_seen[order])

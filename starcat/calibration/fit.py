@@ -27,8 +27,8 @@ AXES = ("aspect", "skew")
 PARAMETERS = (*FOCAL, *CENTRE, *RADIAL, *TANGENTIAL, *AXES)
 """Names of the numbers, in the order of the vector.
 
-``aspect`` is the focal length along y over that along x, less 1; ``skew`` is how far x moves with
-y, the tangent of the angle by which the axes are not perpendicular.
+``aspect`` is the focal length along y over the one along x, minus 1. ``skew`` is how far x moves
+with y: the tangent of the angle by which the axes are not perpendicular.
 """
 
 
@@ -60,7 +60,7 @@ def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
 
 
 def project(values: Array, body: Directions) -> Array:
-    """Project directions with any numbers, those of a lens that folds the image included."""
+    """Project directions with any numbers, even for a lens that folds the image."""
     w, focal_px = _image(values, _plane(body)), values[0]
     aspect, skew = values[-2:]
     x = values[1] + focal_px * (w.real + skew * w.imag)
@@ -117,10 +117,10 @@ def _pair(w: Points, aspect: float, skew: float) -> Array:
     return np.column_stack([w.real + skew * w.imag, (1.0 + aspect) * w.imag])
 
 
-# Where Huber's loss turns from a parabola to lines, in standard deviations of a centroid.
+# Residual at which Huber's loss turns from a parabola to lines, in deviations of a centroid.
 BEND = 3.0
 
-# Variance of a normal variable of variance 1 where those beyond `BEND` are left out.
+# Variance of a normal variable of variance 1 if values beyond `BEND` are left out.
 KEPT_VARIANCE = 0.9733
 TURNS = 30  # most steps towards the attitudes of one camera; without wrong stars it takes three
 
@@ -130,7 +130,7 @@ CAREFUL = 2
 # Curvature of a star beyond the bend in later steps, so that none is infinitely long.
 MIN_CURVE = 0.01
 
-# A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec.
+# A smaller step ends the search for attitudes: the remaining error is 1/1000 of it, 2e-4 arcsec.
 STILL_RAD = 1e-6
 EXACT = 1e-8  # share of the sum of squares by which the last step of a fit lowers it at most
 PASSES = 4  # most fits of one camera, until the noise is known
@@ -142,9 +142,9 @@ class Seen:
 
     # shape (N,): number of the frame of each star, ascending; every number from 0 to F - 1 occurs
     frame: NDArray[np.int64]
-    centroids_px: Pixels  # shape (N, 2): where they were seen
-    icrs: Directions  # shape (N, 3): where they are
-    matrices: Array  # shape (F, 3, 3): about the attitudes, ``body = matrix @ icrs``
+    centroids_px: Pixels  # shape (N, 2): measured places
+    icrs: Directions  # shape (N, 3): directions of the stars
+    matrices: Array  # shape (F, 3, 3): approximate attitudes, ``body = matrix @ icrs``
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -171,11 +171,11 @@ class Fit:
     values : ndarray of float64, shape (P,)
         All parameters, in the order of `PARAMETERS`.
     covariance : ndarray of float64, shape (len(free), len(free))
-        Of those that were fitted, with the attitudes as unknown as they are.
+        Covariance of the fitted parameters, with unknown attitudes.
     noise_px : float
         Standard deviation of a centroid on each axis about the fit.
     residual_px : ndarray of float64, shape (N, 2)
-        Where the stars were seen less where the camera puts them.
+        Measured places of the stars minus the places where the camera puts them.
     seen : Seen
         The stars, with the attitudes that were found.
     """
@@ -228,7 +228,7 @@ def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
         residual = seen.centroids_px - project(values, body)
         by_turn = turn_derivatives(values, body)
         weight = bend_px / np.maximum(np.abs(residual), bend_px)
-        # What lies beyond the bend pulls, and in the end adds nothing to the curvature.
+        # Stars beyond the bend pull, but after the first steps add nothing to the curvature.
         curve = weight if turn < CAREFUL else np.where(weight < 1.0, MIN_CURVE, 1.0)
         normal = np.add.reduceat(np.swapaxes(by_turn * curve[:, :, None], 1, 2) @ by_turn, first)
         pull = np.add.reduceat(np.einsum("nij,ni->nj", by_turn, weight * residual), first)
@@ -247,7 +247,7 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
         tried = values.copy()
         tried[rows] = x
         if x.tobytes() != last[0]:
-            # The attitudes with a camera are near those with the camera that was tried before.
+            # Start from the attitudes of the camera that was tried before: they are near.
             near = replace(seen, matrices=last[2])
             last = x.tobytes(), *turned_to(near, tried, bend_px)
         return tried, last[1], last[2]
@@ -309,10 +309,10 @@ def _noise_px(residual_px: Array, unknowns: int) -> float:
     return max(noise * float(np.sqrt(size.size / left)), 1e-9)
 
 
-FOLDS = 5  # groups of frames that are left out in turn; each frame is its own where there are fewer
-FAR_PX = 1e6  # a bend of Huber's loss that nothing is beyond: least squares of all stars
+FOLDS = 5  # groups of frames that are left out in turn; with fewer frames each is its own group
+FAR_PX = 1e6  # a bend of Huber's loss beyond all residuals: least squares of all stars
 NEAR = 1e-5  # accuracy of the fits that are compared
-MIN_STARS = 4  # stars that a frame keeps at least
+MIN_STARS = 4  # smallest number of stars that a frame keeps
 
 # A model loses to a better one if the difference is larger than this many standard errors: of many
 # frames. Of five it is 1.9, of three 2.5.
@@ -333,19 +333,19 @@ COMPLETE = (*FOCAL, *CENTRE, *RADIAL[:2], *TANGENTIAL)
 
 @dataclass(frozen=True)
 class Trial:
-    """How one model did on the frames that were left out.
+    """The result of one model on the frames that were left out.
 
     Attributes
     ----------
     free : tuple of str
-        What the model fits.
+        Parameters that the model fits.
     held_out_px : float
-        Root mean square residual on each axis over the frames that were left out, of which their
-        attitudes take up a part; inf for a model whose image folds back on the detector.
+        Root mean square residual on each axis over the frames that were left out, after fitting
+        their attitudes; inf for a model whose image folds back on the detector.
     worse_px2 : float
-        Mean square residual on each axis less that of the best model.
+        Mean square residual on each axis minus the best model's.
     worse_error_px2 : float
-        Standard error of that difference, from how it scatters between frames.
+        Standard error of that difference, from its scatter between frames.
     is_chosen : bool
         Whether this is the model that the rule chooses.
     """
@@ -364,7 +364,7 @@ def choose_model(
     noise_px: float,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> list[Trial]:
-    """Compare models by the residuals of frames that they have not seen, and choose one."""
+    """Compare models by the residuals of frames that they were not fitted to, and choose one."""
     kept = _without_strays(seen, values, noise_px)
     squares = np.array([_held_out(kept, values, free, size_px) for free in models])
     numbers, frames = 2 * len(kept), squares.shape[1]
@@ -404,7 +404,7 @@ def is_enough(seen: Seen) -> bool:
 
 
 def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Array:
-    """Return the numbers that a model starts from."""
+    """Return the initial numbers of a model."""
     start = np.zeros_like(values)
     start[0] = values[0]
     start[1:3] = values[1:3] if CENTRE[0] in free else 0.5 * np.array(size_px)
@@ -414,9 +414,9 @@ def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Ar
 
 
 def _without_strays(seen: Seen, values: Array, noise_px: float) -> Seen:
-    """Return the stars that the complete model fits, so that all models are asked about the same.
+    """Return the stars that the complete model fits, so that all models use the same stars.
 
-    A frame with too few of them keeps all that it has.
+    A frame with too few of them keeps all its stars.
     """
     fit = fit_camera(seen, values, COMPLETE, noise_px)
     near = (np.abs(fit.residual_px) <= BEND * fit.noise_px).all(axis=1)
@@ -443,9 +443,9 @@ def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[i
 
 
 def _without_each(whole: Fit, group: NDArray[np.int64]) -> Iterator[Array]:
-    """Return the cameras of all frames but those of one group, for each group.
+    """Return, for each group, the camera of all frames that are not in the group.
 
-    They are one step of Gauss and Newton from the camera of all frames: what is left is of the
+    It is one step of Gauss and Newton from the camera of all frames: the remaining error is of
     second order in that step.
     """
     rows = [PARAMETERS.index(name) for name in whole.free]

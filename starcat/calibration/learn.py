@@ -1,4 +1,4 @@
-"""What frames teach about stars and the sensor: which stars to distrust, and the response."""
+"""Learning from frames about stars and the sensor: which stars to distrust, and the response."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from starcat.specs.reading import content_of_toml, read_spec, what_is_wrong
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
 
-CLIP = 4.0  # deviations farther away, in their noise, are not counted in the noise
-FAR = 4.0  # those in the scatter of a star count as so many noises at most: one proves nothing
-OF_A_BIN = 100  # deviations of a bin of magnitude at the least
+CLIP = 4.0  # larger deviations, in units of their noise, are not counted in the noise
+FAR = 4.0  # largest deviation in the scatter of a star, in noises: one outlier proves nothing
+OF_A_BIN = 100  # smallest number of deviations in a bin of magnitude
 MAX_BINS = 12
 HALF_OF_NORMAL = 0.6744897501960817  # half of normal deviations are smaller
 
@@ -41,10 +41,10 @@ _LOG10 = np.log(10.0)
 
 @dataclass(frozen=True)
 class StarNoise:
-    """The noise of one measurement by the magnitude measured, and what stars differ by beside it.
+    """The noise of one measurement by the measured magnitude, and the further scatter of stars.
 
-    The latter are errors of the catalog and of the model of the sensor, which more sightings of a
-    star do not average out.
+    The further scatter is due to errors of the catalog and of the model of the sensor, which more
+    sightings of a star do not average out.
     """
 
     mag: Array
@@ -58,14 +58,14 @@ class StarNoise:
 
 @dataclass(frozen=True)
 class StarMeans:
-    """What the measurements say of each star, a row each; NaN where it was not measured."""
+    """Statistics of the measurements, one row per star; NaN if the star was not measured."""
 
     count: NDArray[np.int64]
     mean: Array  # shape (stars, axes)
-    error: Array  # of the mean, each axis: with the star's own scatter if that is larger
-    scatter: Array  # of one measurement, each axis; NaN for less than two
+    error: Array  # error of the mean, each axis: with the star's own scatter if that is larger
+    scatter: Array  # scatter of one measurement, each axis; NaN for less than two
     # Common logarithms of the probabilities that chance makes mean and scatter as large; NaN
-    # where the star has too few measurements.
+    # for a star with too few measurements.
     log_chance_mean: Array
     log_chance_scatter: Array
 
@@ -94,12 +94,12 @@ class Measurements:
 
     @property
     def mean(self) -> Array:
-        """Mean of each star; 0 where it has none."""
+        """Mean of each star; 0 without measurements."""
         count = np.maximum(self.count, 1)
         return np.column_stack([self.total(column) / count for column in self.left.T])
 
     def noise(self, least: float, min_count: int) -> StarNoise:
-        """Return the noise, from how the measurements of each star differ."""
+        """Return the noise, from the differences of the measurements of each star."""
         of_star = self.count[self.star]
         factor = np.sqrt(of_star / np.maximum(of_star - 1.0, 1.0))
         within, where = (self.left - self.mean[self.star]) * factor[:, None], self.mag
@@ -116,7 +116,7 @@ class Measurements:
         return StarNoise(noise.mag, noise.sigma, _beyond(self.mean[often], variance))
 
     def by_star(self, noise: StarNoise, further: Array, min_count: int) -> StarMeans:
-        """Return what the measurements say of each star; ``further`` is an error of each mean."""
+        """Return the statistics of each star; ``further`` is a further error of each mean."""
         axes, count, sigma = self.left.shape[1], self.count, noise.at(self.mag)
         some = np.maximum(count, 1)
         mean, is_tested = self.mean, count >= min_count
@@ -143,7 +143,7 @@ class Measurements:
         )
 
     def _medians(self) -> Array:
-        """Return the median of each star on each axis; 0 where it has none."""
+        """Return the median of each star on each axis; 0 without measurements."""
         count = self.count
         first = np.cumsum(count) - count
         low, high = first + np.maximum(count - 1, 0) // 2, first + count // 2
@@ -156,9 +156,9 @@ class Measurements:
 
 
 def _beyond(mean: Array, variance: Array) -> float:
-    """Return the scatter that, added to the noise, puts half of the means where they should be.
+    """Return the scatter that, added to the noise, gives the means their expected median size.
 
-    The median does not mind a few stars that are far off.
+    A few stars that are far off do not change the median.
     """
 
     def excess(scatter: float) -> float:
@@ -174,37 +174,37 @@ FAMILY = 1e-3
 """Probability that chance alone makes any star of a database distrusted."""
 
 MIN_FRAMES = 3
-"""Fewest frames that a star is judged from."""
+"""Smallest number of frames from which a star is judged."""
 
 MIN_STARS = 20
-"""Fewest stars with a magnitude that anything is learnt from."""
+"""Smallest number of stars with a magnitude from which anything is learnt."""
 
 TESTS = ("brightness", "variable", "moved", "double", "missing")
 
 CLEAR = 3.0
-"""Noises that a star is brighter than the limit of the frames, for its mean to be fair."""
+"""The mean of a star is unbiased if it is brighter than the limit of the frames by these noises."""
 
 MIN_ROUNDS, MAX_ROUNDS = 3, 8
-FIRST_NOISE_MAG = 0.3  # until it is known
-MIN_MAG, MIN_ARCSEC = 1e-3, 1e-2  # noise is not taken to be smaller
-MIN_LOG = -300.0  # of a probability; smaller ones are no longer numbers
+FIRST_NOISE_MAG = 0.3  # noise until it is measured
+MIN_MAG, MIN_ARCSEC = 1e-3, 1e-2  # smallest noise that is assumed
+MIN_LOG = -300.0  # logarithm of a probability; smaller ones underflow
 
 
 @dataclass(frozen=True)
 class StarRecords:
-    """What was seen of each star; arrays with a row for each of the database, NaN where unknown."""
+    """Records of each star; arrays with one row per star of the database, NaN if unknown."""
 
     n_seen: NDArray[np.int64]  # frames in which it was identified
     n_expected: NDArray[np.int64]  # frames that are deep enough to show it
-    n_missed: NDArray[np.int64]  # those of them in which it was not identified
+    n_missed: NDArray[np.int64]  # expected frames in which it was not identified
     observed_mag: Array  # mean of the measured magnitudes, offsets of frames taken out
     mag_residual: Array  # this minus what the terms predict
     mag_error: Array  # standard error of it
-    mag_scatter: Array  # of one measurement
+    mag_scatter: Array  # scatter of one measurement
     offset_arcsec: Array  # seen minus database, east and north; shape (stars, 2)
     offset_error_arcsec: Array  # standard error of it on each axis
-    offset_scatter_arcsec: Array  # of one measurement, on each axis
-    # Common logarithms of the probabilities that chance goes as far, by `TESTS`; NaN where not
+    offset_scatter_arcsec: Array  # scatter of one measurement, on each axis
+    # Common logarithms of the probabilities that chance deviates as far, by `TESTS`; NaN if not
     # tested; shape (stars, tests).
     log_chance: Array
 
@@ -221,17 +221,17 @@ class Distrusted:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What identified frames say about their sensor and their stars."""
+    """The results of learning: the response of the sensor and the records of its stars."""
 
     terms: Terms
     mag_noise: StarNoise
     offset_noise: StarNoise
-    limit_mag: float  # measured magnitude from which stars are missed; inf where none are
+    limit_mag: float  # measured magnitude from which stars are missed; inf if none are
     records: StarRecords
     distrusted: tuple[Distrusted, ...]  # by row
     n_judged: int  # stars that were tested
     n_tests: int
-    n_sightings: int  # with a magnitude
+    n_sightings: int  # sightings with a magnitude
 
 
 def learn_from_frames(
@@ -245,9 +245,9 @@ def learn_from_frames(
 ) -> Lesson:
     """Fit the terms of the sensor and judge the stars.
 
-    With ``by_frame`` every frame has an offset of its own, as where exposures differ.
-    ``colour_term`` is what the magnitudes of the database have already; it bears on stars of
-    unknown colour.
+    With ``by_frame`` every frame has its own offset, for example if exposures differ.
+    ``colour_term`` is the term that the magnitudes of the database already include; it affects
+    stars of unknown colour.
     """
     found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
     if found < MIN_STARS:
@@ -284,7 +284,7 @@ class _Round:
     applied: float  # colour term that the magnitudes have
 
     def judged(self, before: Lesson | None) -> Lesson:
-        """Return what is learnt with what was learnt before."""
+        """Return the next lesson, given the previous one."""
         seen, trusted = self.seen, self.is_trusted[self.seen.star]
         use, terms = self._fitted(before)
         expected_mag = self._expected(terms)
@@ -311,7 +311,7 @@ class _Round:
         )  # fmt: skip
 
     def _fitted(self, before: Lesson | None) -> tuple[Mask, Terms]:
-        """Return the magnitudes that are fair, and the terms fitted to those of trusted stars."""
+        """Return the unbiased magnitudes, and the terms fitted to them for trusted stars."""
         seen = self.seen
         measured, sigma = np.isfinite(seen.mag), np.full(len(seen), FIRST_NOISE_MAG)
         use = measured
@@ -319,7 +319,7 @@ class _Round:
             expected_mag = self._expected(before.terms)
             sigma = np.hypot(before.mag_noise.at(expected_mag), before.mag_noise.of_stars)
             use = measured & (expected_mag < before.limit_mag - CLEAR * sigma)
-        # Where frames are so shallow that hardly a star of known colour is left, all have to do.
+        # If frames are so shallow that hardly a star of known colour is left, use all magnitudes.
         known = np.isfinite(self.stars.colour)
         is_enough = known[np.unique(seen.star[use])].sum() >= MIN_COLOURS
         rows = (use if is_enough or not known.any() else measured) & self.is_trusted[seen.star]
@@ -342,13 +342,13 @@ class _Round:
 
     @property
     def _colour(self) -> Array:
-        """The colours, the middle one where a star has none."""
+        """The colours; the middle one for a star without a colour."""
         colour = self.stars.colour
         known = colour[np.isfinite(colour)]
         return np.where(np.isnan(colour), np.median(known) if len(known) else 0.0, colour)
 
     def _unsure_mag(self, terms: Terms) -> Array:
-        """Return how far an unknown colour may put the magnitude of each star."""
+        """Return the magnitude error of each star from an unknown colour."""
         spread = abs(self.applied + (terms.colour_term or 0.0)) * float(np.std(self._colour))
         return np.where(np.isnan(self.stars.colour), spread, 0.0)
 
@@ -404,7 +404,7 @@ def _distrusted(records: StarRecords) -> tuple[tuple[Distrusted, ...], int]:
 
 @dataclass(frozen=True)
 class Learnt:
-    """A lesson, what it was learnt from, and the section of the spec of a patch release."""
+    """A lesson, its inputs, and the section of the spec of a patch release."""
 
     lesson: Lesson
     stars: SkyStars
@@ -428,7 +428,7 @@ class Learnt:
 
     @property
     def table(self) -> pa.Table:
-        """What was seen of each star that the frames should show, a row each."""
+        """The records of the stars that the frames should show, one row per star."""
         return star_table(self)
 
     def evidence(self, star: Distrusted) -> str:
@@ -437,7 +437,7 @@ class Learnt:
         return "; ".join(told)
 
     def name_of(self, star: Distrusted) -> str:
-        """Return the designation of a star, its number where it has none."""
+        """Return the designation of a star, or its number if it has none."""
         name = " ".join(self.stars.designation[star.row].split())
         return name or str(self.stars.star_id[star.row])
 
@@ -462,7 +462,7 @@ def learn_files(
     terms = lesson.terms
     known = stars.colour[np.isfinite(stars.colour)]
     rejected = {int(stars.star_id[one.row]) for one in lesson.distrusted}
-    # mag may have the colour term of an earlier lesson; the section is about the catalog's own.
+    # mag can include the colour term of an earlier lesson; the section is about the catalog's mag.
     slope = before.colour_term + (terms.colour_term or 0.0)
     zero_point_mag = terms.zero_point_mag - before.colour_term * before.reference_colour_mag
     reference = before.reference_colour_mag
@@ -487,7 +487,7 @@ def learn_files(
 
 
 def sky_stars(artifact: DatabaseFolder) -> tuple[SkyStars, str | None]:
-    """Return the stars of a database, and the bands of their colours: those that most have."""
+    """Return the stars of a database, and the bands of their colours that most stars have."""
     table, manifest = artifact.stars, artifact.manifest
     colour, bands = floats_of(table, "colour_mag"), None
     counts = pc.value_counts(table["colour_bands"].drop_null()).to_pylist()
@@ -577,9 +577,9 @@ _OBSERVED = re.compile(
 
 
 def patch_toml(learnt: Learnt, path: Path) -> str:
-    """Return the spec of a patch release: a spec with the next version, and with what was learnt.
+    """Return the spec of a patch release: a spec with the next version and the new section.
 
-    Comments of the spec stay. A section that an earlier patch release has is replaced.
+    Comments of the spec stay. The section of an earlier patch release is replaced.
     """
     spec = read_spec(path)
     if f"{spec.name}-{spec.version}" != learnt.stars.name:
@@ -600,7 +600,7 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
 
 
 def star_table(learnt: Learnt) -> pa.Table:
-    """Return what was seen of each star that the frames should show, a row each."""
+    """Return the records of the stars that the frames should show, one row per star."""
     records, stars = learnt.lesson.records, learnt.stars
     verdict = {one.row: one.verdict for one in learnt.lesson.distrusted}
     rows = np.flatnonzero((records.n_seen > 0) | (records.n_expected > 0))
@@ -635,7 +635,7 @@ def _colour_stars(learnt: Learnt) -> int:
 
 
 def content_of(learnt: Learnt) -> dict[str, Any]:
-    """Return all of it as JSON has it."""
+    """Return all of it as values for JSON."""
     lesson, terms = learnt.lesson, learnt.lesson.terms
     limit = lesson.limit_mag
     return {

@@ -1,7 +1,7 @@
-"""What a sensor makes of stars whose magnitudes are known: zero point, colour term, depth.
+"""The response of a sensor to stars of known magnitude: zero point, colour term, depth.
 
 ``measured = mag + zero point + offset of the frame + colour term x colour + noise``. Pure
-functions of arrays with a row for each sighting.
+functions of arrays with one row per sighting.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from scipy.stats import binom
 from starcat.arrays import Array, Mask, Rows
 
 HUBER = 1.345  # deviations, in their noise, from which on a measurement counts less
-OF_A_BIN = 100  # measurements of a bin of magnitude at the least
+OF_A_BIN = 100  # smallest number of measurements in a bin of magnitude
 MAX_BINS = 48
-COMPLETE = 0.85  # share of what the best bins see, from which on stars are expected
-COVERED = (
-    1e-3  # a frame that misses so many as one in a thousand does says nothing of what it lacks
-)
+COMPLETE = 0.85  # stars are expected in a bin that sees this share of the best bins
+COVERED = 1e-3  # frames that miss more stars than 99.9 % of all frames are ignored
 MIN_COLOURS = 10  # stars of known colour that a colour term needs
-MIN_STEPS, MAX_STEPS = 10, 50  # of the fit; each has new weights
+MIN_STEPS, MAX_STEPS = 10, 50  # steps of the fit; each has new weights
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,9 @@ class Terms:
 
     zero_point_mag: float
     zero_point_error_mag: float
-    colour_term: float | None  # None where too few stars have a colour
+    colour_term: float | None  # None if too few stars have a colour
     colour_term_error: float | None
-    frame_offset_mag: Array  # of each frame, beside the zero point; 0 unless they were fitted
+    frame_offset_mag: Array  # offset of each frame from the zero point; 0 unless fitted
 
     def predicted(self, mag: Array, colour: Array, frame: Rows | None) -> Array:
         """Return the magnitudes that the sensor should measure, in frames or in a usual one."""
@@ -55,8 +53,8 @@ def fit_terms(
 
     Offsets of frames are hundreds of unknowns, but each is the mean of its frame once the colour
     term is known: means are taken out of both sides, and one unknown is left (Frisch and Waugh
-    1933). Errors are from how the stars scatter, as the sightings of a star share what is wrong
-    with it. Stars without colour have no part in it, unless nearly all have none.
+    1933). Errors are computed from the scatter between stars, because the sightings of a star share
+    its error. Stars without a colour are left out, unless nearly all have none.
     """
     known = np.isfinite(colour)
     has_colour = len(np.unique(colour[known])) >= MIN_COLOURS
@@ -109,15 +107,15 @@ def _error(pull: Array, star: Rows) -> float:
 class Depth:
     """How deep the frames see."""
 
-    limit_mag: float  # measured magnitude from which stars are missed; inf where none are
-    chance: Array  # that each sighting is seen; NaN where nothing is expected
+    limit_mag: float  # measured magnitude from which stars are missed; inf if none are
+    chance: Array  # probability that each sighting is seen; NaN if it is not expected
 
 
 def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) -> Depth:
     """Find which sightings are expected, from how often stars of each brightness are seen.
 
-    Nothing is expected of stars near the limit and beyond, and of frames that miss more than
-    chance does: the limb of the Earth or the baffle may hide a part of them.
+    Stars near the limit and beyond are not expected, and no stars of frames that miss more than
+    chance explains: the limb of the Earth or the baffle can hide a part of such frames.
     """
     used = np.flatnonzero(is_trusted)
     bins = int(np.clip(len(used) // OF_A_BIN, 1, MAX_BINS))
@@ -130,7 +128,7 @@ def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) ->
     is_full = seen >= COMPLETE * usual * size
     limit = np.inf
     if not is_full[-1]:
-        # The faintest bin that is full may end in the limit.
+        # The limit can lie in the faintest bin that is full.
         first = int(np.flatnonzero(is_full)[-1]) if is_full.any() else 0
         is_full[first:] = False
         limit = float(predicted[parts[first][0]])

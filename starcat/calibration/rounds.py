@@ -1,4 +1,4 @@
-"""Frames of a camera that is hardly known to stars that are identified in them.
+"""Identification of the stars in frames of a camera that is hardly known.
 
 The first step finds any frame at any focal length of a range. From there on the camera is fitted
 to the stars of all frames that were identified, the frames are identified with that camera, within
@@ -41,23 +41,23 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import NOISE_DEVIATIONS
 from starcat.progress import Progress
 
-WIDE_PX = 6.0  # tolerance as long as the camera is hardly known
+WIDE_PX = 6.0  # tolerance while the camera is hardly known
 NARROW_PX = 0.5  # smallest tolerance, however good the centroids are
 
-# Ratio of neighbouring focal lengths of the first step, for a method that has to be told the focal
-# length. Within `WIDE_PX` it bears an error of half of that and more.
+# Ratio of neighbouring focal lengths of the first step, for a method that needs the focal length.
+# The tolerance `WIDE_PX` allows an error of more than half of this step.
 STEP = 1.015
 FOV_ERROR = 0.1  # error of the focal length that the method ``triangle`` finds by itself
-FOUND_PX = 4.0  # tolerance of the first step where the focal length is found with the attitude
+FOUND_PX = 4.0  # tolerance of the first step if the focal length is found with the attitude
 
 # Middle parts of the frame that the first step tries: a lens distorts least in the middle.
 SHARES = (1.0, 0.7, 0.5)
 
-# Brightest centroids of a frame, without magnitudes those nearest to the middle, that the first
-# step asks about: a question without an answer takes a tenth of the time that all take.
+# Number of centroids of a frame that the first step uses, the brightest ones or, without
+# magnitudes, the innermost: a search without an answer takes a tenth of the time of all centroids.
 FEW = 16
 AT_ONCE = 3  # frames that are tried together at all focal lengths, before others
-GROWTH = 1.3  # how much larger the part of the frame is that the next round identifies
+GROWTH = 1.3  # factor by which the identified part of the frame grows in the next round
 MAX_ROUNDS = 12  # largest number of rounds; it takes four to seven
 
 # The models that a round chooses from.
@@ -72,13 +72,13 @@ ROUND_MODELS = (
 
 @dataclass(frozen=True)
 class IdentifiedFrame:
-    """What the matcher says about the frames."""
+    """The results of the matcher for the frames."""
 
-    # one a frame, about the centroids as they were given; those outside of the part of the frame
-    # that was asked about have no star
+    # one result per frame, for the centroids as they were given; centroids outside of the part of
+    # the frame that was searched have no star
     results: tuple[MatchResult, ...]
-    camera: Camera  # that they were identified with
-    tolerance_px: float  # within which
+    camera: Camera  # camera of the identification
+    tolerance_px: float  # tolerance of the identification
 
     @property
     def found(self) -> list[int]:
@@ -87,13 +87,13 @@ class IdentifiedFrame:
 
     @property
     def focal_length_px(self) -> float:
-        """The focal length that the first frame that was identified has found."""
+        """The focal length that was found with the first identified frame."""
         found = self.results[self.found[0]].camera
         return (found or self.camera).focal_length_px
 
     @property
     def stars(self) -> list[bytes]:
-        """Which centroid is which star, to be compared."""
+        """The star of each centroid, to compare two rounds."""
         return [result.star_index.tobytes() for result in self.results]
 
     def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
@@ -195,14 +195,14 @@ def settled(
 
 
 def supported_fit(seen: Seen, values: Array, size_px: tuple[int, int], tolerance_px: float) -> Fit:
-    """Return the fit of the model that the stars support, of those of a round."""
+    """Return the fit of the model of a round that the stars support."""
     free: tuple[str, ...] = FOCAL
     noise_px = tolerance_px / NOISE_DEVIATIONS
     if is_enough(seen):
         free = chosen(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
     for terms in (free, FOCAL):
         fit = fit_camera(seen, start_of(values, terms, size_px), terms, noise_px)
-        with suppress(ConfigError):  # all frames together may fold where those of the trials do not
+        with suppress(ConfigError):  # the fit to all frames can fold although the trials do not
             camera_of(fit.values, size_px)
             break
     return fit
@@ -218,7 +218,7 @@ def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
 
 
 def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
-    """Return the answer about some centroids as one about all of them."""
+    """Return the answer for some centroids as an answer for all of them."""
     index = np.full(count, -1, dtype=np.int32)
     index[rows] = result.star_index
     dropped = tuple((int(rows[row]), reason) for row, reason in result.dropped)

@@ -76,7 +76,7 @@ def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
     """
     x, y, z, w = _quaternion_product((-q_from[0], -q_from[1], -q_from[2], q_from[3]), q_to)
     sine = math.copysign(math.hypot(x, y, z), w)
-    # The vector part tells small angles, where the cosine would lose their digits.
+    # Small angles are taken from the vector part, because the cosine would lose their digits.
     scale = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine else 0.0
     return x * scale, y * scale, z * scale
 
@@ -169,9 +169,9 @@ def information(
 ) -> Array:
     """Return the information matrix of an attitude that the centroids of stars determine.
 
-    ``sum(w (I - b b^T))`` over the directions b: its inverse is the covariance of the small
-    rotations that the attitude is off by, where w is one over the variance of a direction on each
-    axis across it; without weights the unit is that variance, the same for all.
+    It is ``sum(w (I - b b^T))`` over the directions b. Its inverse is the covariance of the small
+    rotations of the attitude's error if w is one over the variance of a direction on each axis
+    across it. Without weights this variance, the same for all directions, is the unit.
 
     Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
     """
@@ -183,8 +183,8 @@ def information(
     x, y, z = directions.T
     found = np.empty((4, 4))
     found[:3, :3] = of_angles
-    # A turn d moves the direction u of a star by d x u; a longer focal length moves that of its
-    # centroid by u_z e_z - u_z^2 u, towards the axis.
+    # A turn d moves the direction u of a star by d x u; a longer focal length moves the direction
+    # of its centroid by u_z e_z - u_z^2 u, towards the axis.
     found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
     found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
     return found
@@ -198,9 +198,9 @@ def information_of_groups(
     Parameters
     ----------
     directions : ndarray of float64, shape (M, 3)
-        Unit vectors, those of each group in a frame of its own.
+        Unit vectors; each group can have its own frame.
     group : ndarray of int, shape (M,)
-        The group of each, from 0.
+        The group of each direction, from 0.
     count : int
         Number of groups.
     weights : ndarray of float64, shape (M,), optional
@@ -209,7 +209,7 @@ def information_of_groups(
     Returns
     -------
     ndarray of float64, shape (count, 3, 3)
-        Zero where a group has no direction.
+        Zero for a group without directions.
     """
     found = np.empty((count, 3, 3))
     for (i, j), term in information_terms(directions).items():
@@ -219,9 +219,9 @@ def information_of_groups(
 
 
 def information_terms(directions: Directions) -> dict[tuple[int, int], Array]:
-    """Return ``I - b b^T`` of each direction by row and column, those above the diagonal once.
+    """Return ``I - b b^T`` of each direction by row and column, on and above the diagonal.
 
-    The diagonal is that of sums of squares, which keep their digits in a narrow field.
+    The diagonal is computed as sums of squares, which keep their digits in a narrow field.
     """
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z

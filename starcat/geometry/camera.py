@@ -177,8 +177,8 @@ class Camera:
     def pixels_from_directions(self, body: Directions) -> Array:
         """Project directions in the camera frame, of any length, onto the detector.
 
-        NaN where a direction lies behind the camera, or so far off the axis that the distortion
-        folds its image back.
+        NaN for a direction that lies behind the camera, or so far off the axis that the
+        distortion folds its image back.
         """
         z = np.where(body[:, 2:] > 0.0, body[:, 2:], np.nan)
         if self.distortion.is_none:
@@ -190,10 +190,10 @@ class Camera:
         return np.asarray(pixels)
 
     def directions_from_pixels(self, centroids_px: Pixels) -> Array:
-        """Return the directions that centroids point at.
+        """Return the directions of centroids.
 
-        Unit vectors in the camera frame; NaN where no direction inside the fold has that image,
-        which happens off the detector only.
+        Unit vectors in the camera frame; NaN if no direction inside the fold has that image,
+        which happens only off the detector.
         """
         body = np.empty((len(centroids_px), 3))
         np.subtract(centroids_px, self._axis_px, out=body[:, :2])

@@ -1,7 +1,7 @@
-"""Distortion: where a lens puts a direction that a pinhole would put elsewhere, and back.
+"""Distortion: the difference between the images of a lens and of a pinhole, and its inverse.
 
-Points are x + i y in focal lengths from the optical axis, which is what a direction's x/z and
-y/z are without distortion. Pixels are the camera's.
+Points are x + i y in focal lengths from the optical axis; without distortion they are x/z and y/z
+of a direction. Pixels are the camera's.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NEWTON_STEPS = 50
 
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a value that has to be a finite number in an open interval; a bool is none."""
+    """Return a value that has to be a finite number, not a bool, in an open interval."""
     value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number may be too large for a float
@@ -146,7 +146,7 @@ class Distortion:
         return np.asarray(z * factor + s * complex(self.p2, self.p1))
 
     def undistorted(self, image: Points) -> Points:
-        """Return which directions the lens puts at images; NaN where there is none.
+        """Return the directions that the lens puts at images; NaN if there is none.
 
         Newton's method in the plane, started from a table of the radial part. At a distance
         d short of the fold, images that differ by a rounding are 1e-16/d apart in direction.

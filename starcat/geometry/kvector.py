@@ -64,9 +64,9 @@ class KVector:
 
 
 def build_kvector(values: Array) -> KVector:
-    """Build the K-vector of ascending, finite values; ValueError where they are not.
+    """Build the K-vector of values; ValueError unless they are ascending and finite.
 
-    It refers to the values, it does not copy them.
+    It refers to the values and does not copy them.
 
     >>> index = build_kvector(np.array([0.1, 0.2, 0.2, 0.7]))
     >>> index.exact(0.15, 0.2)

@@ -1,7 +1,7 @@
-"""Star patterns: the area of a triangle, and how neighbours about a star are numbered.
+"""Star patterns: the area of a triangle, and the numbering of neighbours about a star.
 
-Products number what the catalog has around every star; the matcher numbers what a frame has
-around a centroid, and the two meet only where both count alike. So each rule stands here once.
+Products number the neighbours of every star of the catalog; the matcher numbers the neighbours of a
+centroid in a frame. They match only if both are numbered alike, so each rule is here only once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def bin_of(
     """Return the bins of successive angles and separations in the look-up table.
 
     ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and not its
-    upper one, but for the last, which includes all that lies above.
+    upper end; the last bin includes all values above.
 
     >>> bin_of([0.0, 1.0, 9.0], [0.3, 0.1, 0.9], 1.0, 0.2, 3, 2)
     array([1, 2, 5])
@@ -42,8 +42,8 @@ def cell_of(x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int) 
     Gnomonic coordinates about the star in focal lengths, x towards the alignment star and y
     counter-clockwise of it on the sky as seen; the grid spans ``-tan(radius)`` to
     ``tan(radius)``. The number is ``row * cells_per_side + column``, rows along y, both upwards
-    from 0. A cell includes its lower edges and not its upper ones; what lies outside goes to
-    the edge.
+    from 0. A cell includes its lower edges and not its upper ones; points outside of the grid
+    belong to the cells at its edge.
 
     >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
     array([0, 3, 3])
@@ -61,8 +61,8 @@ def cell_of(x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int) 
 def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> Whole:
     """Return the rings that separations fall in.
 
-    From 0, the innermost. A ring includes its inner end and not its outer one, but for the
-    last, which includes all that lies beyond.
+    From 0, the innermost. A ring includes its inner end and not its outer end; the last ring
+    includes all larger separations.
 
     >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
     array([0, 1, 1, 1])
@@ -74,7 +74,7 @@ def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> Whole:
 def sector_of(turn_rad: ArrayLike, sectors: int) -> Whole:
     """Return the sectors that angles from the nearest neighbour fall in.
 
-    Position angle less that of the nearest neighbour; sector 0 begins there, counter-clockwise.
+    Position angle minus the nearest neighbour's, where sector 0 begins, counter-clockwise.
 
     >>> sector_of(np.radians([0.0, 95.0, -5.0]), 4)
     array([0, 1, 3])
@@ -98,7 +98,7 @@ def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
 
 
 def triangle_area(a: Array, b: Array, c: Array) -> Array:
-    """Return the area of plane triangles from their sides in any order; 0 where they do not close.
+    """Return the area of plane triangles from their sides in any order; 0 if they do not close.
 
     Heron's formula in the order of operations of Kahan 2014, which keeps its digits for
     needle-like triangles.

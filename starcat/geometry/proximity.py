@@ -1,4 +1,4 @@
-"""Who is near whom on the sky: nearest neighbours, and all pairs within a separation."""
+"""Neighbours on the sky: nearest neighbours, and all pairs within a separation."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from starcat.geometry.sphere import chord_from_separation, separation
 from starcat.threads import map_in_order
 
 AT_ONCE = 50_000
-"""Points whose neighbours a thread looks for at once."""
+"""Number of points whose neighbours a thread searches at once."""
 
 SAMPLE = 1000
-"""Stars whose neighbours tell how far apart the others are."""
+"""Number of stars from which the typical distance of neighbours is measured."""
 
 MAX_NEAR = 8.0
-"""Stars within the radius of a star, on average, up to which all pairs are looked at."""
+"""All pairs are searched if a star has at most this many stars, on average, within the radius."""
 
 
 def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
@@ -39,9 +39,9 @@ def nearest_chords(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return the nearest star of each point that is not the point itself.
 
-    ``itself`` is the row of ``stars`` that is the point, -1 where none is. Of several stars at
-    the same distance that of the lowest rank is taken. Chords are infinite, and rows the number
-    of stars, where there is no other star.
+    ``itself`` is the row of the point in ``stars``, -1 if it is not a star. Of several stars at
+    the same distance the star with the lowest rank is taken. If there is no other star, the chord
+    is infinite and the row is the number of stars.
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = scipy.spatial.cKDTree(stars, leafsize=16, balanced_tree=False)
@@ -59,7 +59,7 @@ def nearest_chords(
         ranked = np.where(found < len(stars), np.append(rank, 0)[found], np.iinfo(np.int64).max)
         first = ranked.argmin(axis=1)
         best[rows], index[rows] = least, found[np.arange(len(rows)), first]
-        # Where the last of those found is as near as the first, more may be.
+        # If the last star found is as near as the first, there can be more at that distance.
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
     return best, index
@@ -68,10 +68,10 @@ def nearest_chords(
 def _nearest_of_pairs(
     tree: scipy.spatial.cKDTree, stars: Directions, rank: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Return the nearest other star of most stars, which takes less time than one by one.
+    """Return the nearest other star of most stars, which is faster than a search for each star.
 
-    All pairs within a radius are looked at, in which nine of ten have another star. Where
-    that are too many, as in clusters, and for the tenth, chords are infinite.
+    All pairs within a radius are computed; nine of ten stars have another star within it. For the
+    tenth star, and for all if there are too many pairs, as in clusters, chords are infinite.
     """
     best, index = np.full(len(stars), np.inf), np.full(len(stars), len(stars))
     some = stars[np.random.default_rng(0).integers(len(stars), size=SAMPLE)]

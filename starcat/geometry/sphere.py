@@ -1,8 +1,8 @@
 """Geometry on the celestial sphere: directions, separations, tangent plane, spiral points, caps.
 
-Directions are unit vectors, float64, one row a star, in whatever frame the caller uses
-(ICRS throughout starcat). Angles are radians inside and degrees only where a name says so.
-Nothing here reads files or knows of catalogs.
+Directions are unit vectors, float64, one row per star, in the frame of the caller (ICRS throughout
+starcat). Angles are in radians, or in degrees if the name ends in ``_deg``. Nothing here reads
+files or depends on catalogs.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def chord_from_separation(separation_rad: float) -> float:
 def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
     """Return the east and north unit vectors at positions.
 
-    At a pole the right ascension says which way east is.
+    At a pole the right ascension determines the direction of east.
     """
     ra = np.radians(np.asarray(ra_deg, dtype=np.float64))
     dec = np.radians(np.asarray(dec_deg, dtype=np.float64))
@@ -113,7 +113,7 @@ def _length(v: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", v, v)))
 
 
-_ROUNDING = 1e-12  # by so much a zone is wider than its cap: more than the sines are off by
+_ROUNDING = 1e-12  # margin by which a zone is wider than its cap: more than the sines' rounding
 
 
 @dataclass(frozen=True)

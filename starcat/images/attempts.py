@@ -1,8 +1,8 @@
 """Further attempts at an image that was not identified: with other spots of the same image.
 
-Each attempt measures the image in another way and searches for its spots. By chance alone an
-answer is the more likely the more often a frame is searched for, so that the bound of an answer
-of a further attempt is multiplied by all searches that a frame can have (`counted`).
+Each attempt measures the image in another way and searches for its spots. Every search makes an
+answer by chance more likely, so the bound of an answer of a further attempt is multiplied by the
+number of all searches that a frame can have (`counted`).
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 
 DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
-"""Factor of the threshold of the second attempt, and the most spots of all that measure again."""
+"""Factor of the threshold of the second attempt, and most spots of attempts that measure again."""
 
 HIGHER_THRESHOLDS = (8.0, 15.0)
 BRIGHTEST = 40
-"""Brightest spots of the first measurement that the last attempt is made with."""
+"""Number of brightest spots of the first measurement that the last attempt uses."""
 
 SAME_SPOT_PX = 0.5
 """Centroids of one spot in two measurements are nearer to each other than this."""
 
 MAX_SEARCHES = 7
-"""Searches whose answer can be given: two of the first attempt, which also tries the focal length
-as it is stated, and one of each further attempt."""
+"""Number of searches whose answer can be returned: two of the first attempt, which also tries the
+focal length as stated, and one of each further attempt."""
 
 
 @dataclass(frozen=True)
 class FurtherAttempt:
-    """How an image is measured once more."""
+    """A further measurement of an image."""
 
-    number: int  # 2 for the first of the further ones
-    words: str  # which spots these are
-    threshold: float | None = None  # None: spots are those of the first measurement, fewer of them
+    number: int  # 2 for the first further attempt
+    words: str  # description of its spots
+    threshold: float | None = None  # None: use fewer of the spots of the first measurement
     without_hot_pixels: bool = False
     without_blocks: bool = False
 
@@ -48,7 +48,7 @@ class FurtherAttempt:
 
 
 def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[FurtherAttempt]:
-    """Return the attempts after the first; if a limit ended that, only those with fewer spots."""
+    """Return the attempts after the first; only attempts with fewer spots if a limit ended it."""
     deeper = max(1.0, DEEPER_THRESHOLD * given.threshold)
     if not is_limited:
         yield FurtherAttempt(
@@ -65,9 +65,9 @@ def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[Fu
 
 
 def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:
-    """Return whether spots are others than those of all searches before.
+    """Return whether the spots differ from the spots of all searches so far.
 
-    The same spots once more would cost time, and could hardly give another answer.
+    Searching the same spots again would cost time and hardly give another answer.
     """
     for known in searched:
         if len(known) == len(centroids_px):
@@ -80,7 +80,7 @@ def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:
 def counted(result: MatchResult, limit: float) -> MatchResult | None:
     """Return the answer of a further attempt with its bound for all searches; None without one.
 
-    The probability that chance agrees in any of K searches is at most the sum of those in each.
+    The probability that chance agrees in any of K searches is at most the sum of all K of them.
     An answer whose bound times K is above the limit is withheld.
     """
     if not result.ok:

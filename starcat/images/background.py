@@ -1,7 +1,7 @@
-"""What stands above the background of a star image, and the noise that it stands in.
+"""The light above the background of a star image, and the noise of the background.
 
 Input is a grey image, output is a `SkyLevels`. Background and noise vary slowly over the image, and
-single hot pixels can be taken out. What is a star is not decided here.
+single hot pixels can be removed. This module does not decide which pixels belong to stars.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from starcat.version import install_command
 
 Grey = NDArray[np.float32]
 
-SMALLEST_PX = 16  # narrowest image in which a background can be told from stars
+SMALLEST_PX = 16  # narrowest image in which background and stars can be separated
 _BOX_PX = 64
-# Boxes of the background, tried one after the other where there are clouds.
+# Boxes of the background, tried in this order if there are clouds.
 _BOXES_PX = (64, 32, 16)
 _SAMPLE_PX, _SAMPLES = 48, 6
 _EXCESS_SIGMA_PX = (1.0, 4.0)
-# Share of the pixels at the black point between which the noise is told from the others.
+# If the share of pixels at the black point is in this range, the others give the noise.
 _CUT_SHARE = (0.2, 0.985)
 _STAR_NOISE = 4.5
-_FLAT_EXCESS = 0.3  # smoothed pixels with so little of the noise of white ones are flat, not noisy
+_FLAT_EXCESS = 0.3  # a smoothed image with less than this of the white noise is flat, not noisy
 _MAX_EXCESS = 10.0
 # Noise is white up to the first; the background has structure beyond the second.
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
@@ -38,7 +38,7 @@ _HOT_NOISE = 4.0
 # A hot pixel's neighbours have less than this part of the light that a star would give them.
 _HOT_PART = 0.25
 # The median of a star's 8 neighbours is more than this part of its brightest pixel, if its spot is
-# wider than 0.6 px; that of a hot pixel is not, even where some neighbours are hot too.
+# wider than 0.6 px; the median of a hot pixel is not, even if some neighbours are hot too.
 _HOT_MEDIAN_PART, _HOT_ROUNDS = 0.15, 3
 
 
@@ -46,18 +46,18 @@ _HOT_MEDIAN_PART, _HOT_ROUNDS = 0.15, 3
 class SkyLevels:
     """An image and its background."""
 
-    raw: Grey  # shape (height, width): grey values; 0 where they are left out
+    raw: Grey  # shape (height, width): grey values; 0 in pixels that are left out
     above: Grey  # shape (height, width): the same above the background
     noise: Grey  # shape (height, width): standard deviation of the background, grey values
     # shape (height, width): pixels left out, because their values are not finite
     mask: Mask
-    # whether the noise of filtered pixels is larger than that of white noise: coarse digits, a
+    # whether filtered pixels have more noise than filtered white noise: coarse digits, a
     # clipped background, JPEG, clouds
     is_rough: bool = False
-    # whether there is next to no noise: what compression left of it are steps
+    # whether there is next to no noise: compression turned it into steps
     is_flat: bool = False
     box_px: int = _BOX_PX  # side of the boxes in which the background was found
-    # noise of pixels that are smoothed by a pixel, over what white noise would leave of it
+    # noise after smoothing by a pixel, over the noise of white noise smoothed alike
     excess: float = 1.0
 
 
@@ -73,7 +73,7 @@ def load_sep() -> Any:
 
 
 def subtract_background(image: ArrayLike) -> SkyLevels:
-    """Take the background off an image."""
+    """Subtract the background of an image."""
     values = np.asarray(image)
     if values.ndim != 2 or min(values.shape) < SMALLEST_PX or values.dtype.kind not in "buif":
         raise ConfigError(
@@ -94,8 +94,8 @@ def subtract_background(image: ArrayLike) -> SkyLevels:
 def unmasked(values: Grey, mask: Mask) -> Grey:
     """Return the values of the pixels that are not left out; the array itself if it has no other.
 
-    An image of a large camera fills a good part of the memory that a request may take, so it is
-    copied only if it has to be.
+    An image of a large camera fills a large part of the memory of a request, so it is copied only
+    if necessary.
     """
     return values[~mask] if mask.any() else values.reshape(-1)
 
@@ -106,12 +106,12 @@ def _leveled(raw: Grey, mask: Mask) -> SkyLevels:
     levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
     excess = _excess(levels)
     if max(excess) < _FLAT_EXCESS:
-        # Compression took the noise away and left steps that are no light.
+        # Compression removed the noise and left steps that are not light.
         noise = np.maximum(levels.noise, _step(unmasked(raw, mask)))
         return replace(levels, noise=noise, is_flat=True)
     if max(excess) < _WHITE_EXCESS:
-        return levels  # white, within what a few boxes tell
-    # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
+        return levels  # white noise, as far as a few boxes show
+    # The mode of coarse digits is a digit; after smoothing, the mode is near the mean.
     smooth = scipy.ndimage.gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
     for box in _BOXES_PX:
         del levels  # before the next ones take the same memory again
@@ -131,16 +131,16 @@ def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -
     above[mask] = 0.0
     noise = background.rms(dtype=np.float32)
     if shown is not raw:
-        noise *= np.float32(np.sqrt(4.0 * np.pi) * 1.0)  # what the smoothing took of white noise
+        noise *= np.float32(np.sqrt(4.0 * np.pi) * 1.0)  # as before the smoothing of white noise
     np.maximum(noise, least, out=noise)
     return SkyLevels(raw, above, noise, mask, box_px=box)
 
 
 def _excess(levels: SkyLevels) -> tuple[float, float]:
-    """Return the noise of smoothed pixels over that of smoothed white noise, for two widths.
+    """Return the noise of smoothed pixels over the noise of smoothed white noise, for two widths.
 
-    Some boxes of the image stand for all of it, and of them those with less. Stars are left
-    out; where nothing else is left, the noise is without bounds.
+    A sample of boxes represents the image, and of them the boxes with less noise. Stars are left
+    out; if nothing else is left, the noise is infinite.
     """
     boxes = _sample(levels)
     fine, coarse = _EXCESS_SIGMA_PX
@@ -204,10 +204,10 @@ def _step(values: Grey) -> np.float32:
 
 
 def _noise_above_black(values: Grey) -> float:
-    """Return the noise of a background of which most lies below the black point; else 0.
+    """Return the noise of a background that lies mostly below the black point; else 0.
 
-    How many values are cut, and how many of the others are above one value, gives the standard
-    deviation of a Gaussian. Where hardly any of the noise is left, the rest may be stars.
+    The share of values that are cut, and the share above one other value, give the standard
+    deviation of a Gaussian. If hardly any of the noise is left, the rest can be stars.
     """
     black = float(values.min())
     cut = float((values == black).mean())
@@ -241,8 +241,8 @@ def repair_hot_pixels(levels: SkyLevels, psf_sigma_px: float) -> SkyLevels:
 def mask_hot_pixels(levels: SkyLevels) -> SkyLevels:
     """Replace bright pixels among dark ones by the median of those, clusters of them included.
 
-    Many of them seem to be noise, so that the background is measured once more without them. It
-    costs stars whose light falls on one pixel, so it is for images that have no answer else.
+    Many hot pixels look like noise, so the background is measured again without them. Stars whose
+    light falls on one pixel are lost: use this only for images that have no answer otherwise.
     """
     for _ in range(_HOT_ROUNDS):
         y, x = _bright_pixels(levels)

@@ -1,8 +1,8 @@
 """Many files to answers in one run: folders, patterns and lists of pictures or centroids.
 
-The database is opened once. Pictures are measured by a few processes while those before them are
+The database is opened once. A few processes measure pictures while the previous pictures are
 identified, in the order of the files. A file that cannot be used has an error in place of answers,
-and the others go on.
+and the run continues with the other files.
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from starcat.storage.file_formats import RAW_MAKERS
 CENTROID_SUFFIXES = (".csv", ".json")
 TILE_PX = 256  # longest side of the small picture that is kept of each
 
-_FEW = 6  # so many pictures are measured sooner than a process has started
+_FEW = 6  # for this number of pictures or fewer, starting processes would take longer
 _MAX_WORKERS = 4
-_AHEAD = 2  # pictures that are measured before they are asked for, for each process
+_AHEAD = 2  # pictures per process that are measured in advance
 
-_COARSE = 8  # pixels of a tile between those that its background is taken from
+_COARSE = 8  # step in pixels at which the background of a tile is sampled
 
 Small = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class BatchItem:
-    """One file of many: its answers, or why there are none."""
+    """One file of many: its answers, or the reason why there are none."""
 
     path: Path
     answers: tuple[FrameAnswer, ...] = ()
     error: ConfigError | None = None
     notes: tuple[str, ...] = ()
-    small: Small | None = None  # of a picture: it, reduced to a tile of a contact sheet
+    small: Small | None = None  # a picture reduced to a tile of a contact sheet
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def is_batch(inputs: Sequence[str]) -> bool:
 def files_of(inputs: Sequence[str]) -> list[Path]:
     """Return the files of folders, patterns and names, each once, numbers in names in order.
 
-    Of a folder these are its pictures, or its files of centroids if it has no pictures.
+    For a folder they are its pictures, or its files of centroids if it has no pictures.
     """
     found: dict[Path, None] = {}
     for given in inputs:
@@ -96,7 +96,7 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
 
 
 def frame_files(inputs: Sequence[str]) -> list[Path]:
-    """Return the files that folders, patterns and names stand for, or stdin (``-``) alone."""
+    """Return the files of folders, patterns and names, or stdin (``-``) alone."""
     return files_of(inputs) if not inputs or is_batch(inputs) else [Path(inputs[0])]
 
 
@@ -176,8 +176,8 @@ def _measured_files(
             yield pending.popleft().result()
     except BrokenProcessPool as error:
         raise ConfigError(
-            "a process that measured pictures was ended from outside, perhaps for want of "
-            "memory; give fewer or smaller pictures at once"
+            "a process that measured pictures was ended from outside, perhaps because memory "
+            "ran out; give fewer or smaller pictures at once"
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -1,8 +1,8 @@
 """Blocks of JPEG: whether an image has them, and the image without the steps at their edges.
 
-Strong compression leaves of each block of 8 by 8 pixels its mean and what stands out of it. A
-smooth sky becomes a staircase, and the corners of its steps look like spots. The grid is found in
-the image itself, so that images that were turned over, or saved as PNG afterwards, have one too.
+Strong compression keeps only the mean and the strongest contrasts of each block of 8 by 8 pixels.
+A smooth sky becomes a staircase, and the corners of its steps look like spots. The grid is found in
+the image itself, so it is also found in images that were turned over, or saved as PNG afterwards.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MIN_STEP_RATIO = 1.5
 
 
 def without_block_edges(image: Grey | Array) -> Grey | None:
-    """Return an image less the median of each of its JPEG blocks; None if it has no blocks.
+    """Return an image minus the median of each of its JPEG blocks; None if it has no blocks.
 
     Without their medians neighbouring blocks have no step between them. Stars that fill less than
     half of a block stand out as before. Leaving out the pixels at the edges would take nearly half

@@ -1,8 +1,8 @@
 """Spots of light in an image: found above the background and measured with sub-pixel accuracy.
 
-Input is one grey image, output are centroids and brightness, brightest first. Background,
-detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
-which the extra ``images`` brings. Stars that are streaks are measured at their middles
+The input is a grey image, the output is centroids and brightness, brightest first. Background,
+detection, windowed centroids and apertures are computed by sep, Source Extractor as a library,
+which the extra ``images`` installs. Stars that are streaks are measured at their middles
 (`streaks.py`); blooming is not handled.
 """
 
@@ -40,12 +40,12 @@ from starcat.products.blends import APERTURE_SIGMA, widths_px
 
 _log = logging.getLogger(__name__)
 
-# Pixels above the threshold that sep is given room for: so many, and these parts of the image, the
-# second if the first is full. sep takes the memory of all of them, some 40 bytes for each.
+# Size of sep's buffer for pixels above the threshold: this number plus the first of these parts of
+# the image, or the second if the first is full. sep allocates about 40 bytes for each pixel.
 _ROOM, _ROOM_PARTS = 300_000, (0.03, 0.3)
-_ROOM_IS_FULL = "pixel buffer full"  # part of what sep says then
+_ROOM_IS_FULL = "pixel buffer full"  # part of the error of sep
 _MAX_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
-# The threshold is raised by this factor, so many times, where the room does not do.
+# If the buffer is too small, the threshold is raised by this factor, up to this many tries.
 _RAISE, _TRIES = 1.5, 4
 # A plateau: pixels that differ by no more than read noise, and by half a per cent.
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
@@ -53,7 +53,7 @@ _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
 
 @dataclass(frozen=True)
 class Spots:
-    """What was found in one image, brightest first."""
+    """The spots of one image, brightest first."""
 
     # shape (N, 2): pixels (x right, y down, origin at the outer corner of the top-left pixel)
     centroids_px: Pixels
@@ -62,7 +62,7 @@ class Spots:
     # shape (N,): standard error of a centroid on each axis, pixels
     sigma_px: Array
     psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
-    streak: Streak | None = None  # how far the stars moved while the shutter was open
+    streak: Streak | None = None  # motion of the stars during the exposure
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -90,7 +90,7 @@ def find_spots(
         if value is not None and not 0.0 < value < np.inf:
             text = f"{name} is {value}; expected a positive number"
             raise ConfigError(text, key=name, value=value)
-    # No name for what is between them: it is as large as what comes of it.
+    # The intermediate result has no name, so that its memory is freed: it is as large as `levels`.
     if without_hot_pixels:
         levels = mask_hot_pixels(subtract_background(image))
     else:
@@ -169,7 +169,7 @@ def _is_saturated(levels: SkyLevels, found: NDArray[Any]) -> Mask:
 
 
 def _windowed(levels: SkyLevels, found: NDArray[Any], window: float) -> Array:
-    """Return windowed centroids; barycentres where a window drifts to the spot beside it."""
+    """Return windowed centroids; a barycentre if the window drifts to a neighbouring spot."""
     start = np.stack([found["x"], found["y"]], axis=1)
     x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
     centroids = np.stack([x, y], axis=1)
@@ -204,11 +204,11 @@ def centres_of_mass(light: Array, places: Pixels, box_px: int) -> Pixels:
 
 
 def detect(levels: SkyLevels, sigma: float, threshold: float) -> NDArray[Any]:
-    """Return what stands out after smoothing with a star's shape.
+    """Return the spots that stand out after smoothing with a star's shape.
 
-    Where noise is white, its part that is left by the filter is known. Where it is not
-    (`Levels.is_rough`: coarse digits, a clipped background, JPEG, clouds), the noise is measured
-    in the filtered image.
+    If the noise is white, the part of it that the filter leaves is known. If it is not
+    (`SkyLevels.is_rough`: coarse digits, a clipped background, JPEG, clouds), the noise is
+    measured in the filtered image.
     """
     reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
     profile = np.exp(-0.5 * (reach / sigma) ** 2)
@@ -221,13 +221,13 @@ def detect(levels: SkyLevels, sigma: float, threshold: float) -> NDArray[Any]:
     for attempt in range(_TRIES):
         try:
             return extract(image, least * _RAISE**attempt, noise, levels.mask, kernel)
-        except MemoryError:  # says nothing of the image
+        except MemoryError:  # not a fault of the image
             raise
         except Exception as error:  # sep raises nothing more special when a buffer is full
             _log.info("at %.3g sigma: %s", threshold * _RAISE**attempt, error)
     further = f"threshold={np.ceil(threshold * _RAISE**_TRIES):.0f}"
     raise ConfigError(
-        f"the image has too much in it to tell stars from the sky: even at "
+        f"the image has too much in it to separate stars from the sky: even at "
         f"{threshold * _RAISE ** (_TRIES - 1):.1f} times the noise too many pixels stand out; "
         "check that it is a star image, state how wide a star is (psf_sigma_px=1.5) or raise "
         f"the threshold further ({further})",

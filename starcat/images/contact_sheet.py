@@ -1,4 +1,4 @@
-"""One picture of many frames: a tile for each, its identified stars ringed, and what was found."""
+"""One picture of many frames: a tile for each, with rings at identified stars and a caption."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WIDEST = 10  # tiles in a row
 
 
 def check_sheet(path: Path | None) -> None:
-    """Refuse a name that is no PNG, before the work for it is done."""
+    """Refuse a name that is not a PNG file, before the work starts."""
     if path is not None and path.suffix.lower() != SUFFIX:
         raise ConfigError(f"{path}: a contact sheet is a {SUFFIX} file; choose another name")
 

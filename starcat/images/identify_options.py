@@ -1,4 +1,4 @@
-"""How frames of a file are identified: what the command, the REST interface and the page ask."""
+"""Options for the frames of a file: the same for the command, the REST interface and the page."""
 
 from __future__ import annotations
 

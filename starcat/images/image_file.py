@@ -1,15 +1,15 @@
 """Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
-HEIC, as telephones write it, and BMP are read too, and not written.
+HEIC, as telephones write it, and BMP are read but not written.
 
-A dark frame, dead pixels and a mosaic of colours are taken out of such an array, and copies of
-files are written that say where in the sky each pixel is.
+A dark frame, dead pixels and a mosaic of colours are removed from such an array, and copies of
+files are written with a WCS that gives the place of each pixel in the sky.
 
-What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
-FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
-by imagecodecs, and HEIC by pi-heif, which the extra ``images`` brings. Stacks of other numbers of
-planes are refused, unless one of them is chosen. Raw pictures of cameras, known by their suffix,
-are read by rawpy, which the extra ``raw`` brings.
+The kind of a file is detected from its first bytes, not its name. Colour becomes luminance, also in
+FITS files with three planes. Pillow reads the kinds whose bits it all keeps; imagecodecs reads
+16-bit colour, and pi-heif HEIC; the extra ``images`` installs them. Stacks of other numbers of
+planes are refused, unless one of them is chosen. Raw pictures of cameras, recognized by their
+suffix, are read by rawpy, which the extra ``raw`` installs.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _KINDS = {
 _OF_PILLOW = ("PNG", "TIFF", "JPEG", "BMP")
 # Brands of the container of HEIC, at byte 8, after its size and "ftyp".
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
-# What is written under which suffix.
+# Kind of file that is written for each suffix.
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
     ".jpg": "JPEG", ".jpeg": "JPEG",
@@ -78,7 +78,7 @@ _OF_A_WCS = re.compile(
 def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None) -> Grey:
     """Read the grey values of an image.
 
-    The FITS standard does not say which row is the top one. Programs that write arrays put the
+    The FITS standard does not define which row is the top one. Programs that write arrays put the
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
     """
@@ -110,7 +110,7 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
                 values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}", fields=error.fields) from error
-    except MemoryError:  # says nothing about the file
+    except MemoryError:  # not a fault of the file
         raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
@@ -137,7 +137,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any], bool]:
-    """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
+    """Return the plane of a FITS file, and whether its header puts the first row at the bottom."""
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyWarning
 
@@ -206,7 +206,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         if is_grey:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
-        # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
+        # Whole numbers, so that the step of the digits can be found: grey as colour stays as it is.
         # Pillow has the weights of `_LUMINANCE`, and takes a byte a pixel for the result.
         return np.asarray(picture.convert("RGB").convert("L"))
 
@@ -238,7 +238,7 @@ def _grey_of_raw(data: bytes) -> NDArray[Any]:
         ) from error
     with rawpy.imread(io.BytesIO(data)) as raw:
         values = raw.raw_image_visible.astype(np.float32)
-        if values.ndim == 3:  # of a sensor without a mosaic
+        if values.ndim == 3:  # from a sensor without a mosaic
             return _luminance(np.moveaxis(values, 2, 0))
         values -= np.array(raw.black_level_per_channel, dtype=np.float32)[raw.raw_colors_visible]
     return grey_of_mosaic(values).astype(np.float32)
@@ -283,7 +283,7 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
 
 
 def time_in_file(path: Path) -> datetime | None:
-    """Return the middle of the exposure that a FITS header or EXIF tells, as UTC; None without."""
+    """Return the middle of the exposure from a FITS header or EXIF, as UTC; None without one."""
     data = _unpacked(path)
     try:
         found = _time_of_fits(data) if data.startswith(b"SIMPLE  =") else _time_of_exif(data)
@@ -476,7 +476,7 @@ def _fits_of(image: NDArray[Any]) -> PrimaryHDU:
 
 
 def _add_wcs(header: Header, result: MatchResult, bottom_up: bool) -> None:
-    """Add the keywords of a WCS; SIP is beyond what the standard has, and is written too."""
+    """Add the keywords of a WCS, including SIP, which is not in the standard."""
     for card in result.wcs(bottom_up=bottom_up).to_header(relax=True).cards:
-        if not card.keyword.startswith("MJDREF"):  # which would be the time of no observation
+        if not card.keyword.startswith("MJDREF"):  # there is no time of observation
             header.append(card, end=True)

@@ -72,7 +72,7 @@ def check_kind(path: Path | None, what: str = "plot") -> None:
         raise ConfigError(f"{path}: a {what} is one of {', '.join(KINDS)}; choose another name")
 
 
-# Colours of the sky, of what is identified and of what is not.
+# Colours of the sky, of identified spots and of other spots.
 SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
 # Colours of names, and the radius of a mark above which the first one is taken.
 _BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
@@ -98,8 +98,8 @@ class FrameAxes:
     scale: float  # points of the drawing per pixel
     size: tuple[int, int]  # width and height of the camera, pixels
     centroids: Array  # middles of the marks, (N, 2), pixels
-    names: Sequence[str | None]  # None where it is not known what a mark is
-    radii: Array  # of the marks, points
+    names: Sequence[str | None]  # name of each mark; None if it is not identified
+    radii: Array  # radii of the marks, points
 
     @property
     def points(self) -> Array:
@@ -139,7 +139,7 @@ def draw_sky(frame: FrameAxes, image: NDArray[Any] | None) -> None:
 
 
 def draw_marks(frame: FrameAxes) -> None:
-    """Draw a ring around what is identified, and a diamond around what is not."""
+    """Draw a ring around identified spots, and a diamond around other spots."""
     is_star = np.array([name is not None for name in frame.names], dtype=bool)
     for chosen, marker, colour in ((is_star, "o", STAR), (~is_star, "D", LOST)):
         x, y = frame.centroids[chosen].T
@@ -171,7 +171,7 @@ def draw_compass(frame: FrameAxes, compass: tuple[Array, Array] | None) -> Array
 
 
 def draw_names(frame: FrameAxes, taken: Array) -> int:
-    """Write the names that find room, those of the largest marks first."""
+    """Write as many names as fit, starting with the largest marks."""
     from matplotlib.patheffects import withStroke
 
     widths = [LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in frame.names]
@@ -200,7 +200,7 @@ def place_labels(
     frame: tuple[float, float],
     taken: Array,
 ) -> dict[int, tuple[float, float]]:
-    """Place labels beside round marks, one after the other, each where it covers nothing.
+    """Place labels next to round marks, in order, each at a place where it covers nothing.
 
     Examples
     --------
@@ -257,8 +257,8 @@ def stretch(image: NDArray[Any]) -> Array:
 def _brightest(image: NDArray[Any]) -> Array:
     """Return the brightest of each block of pixels, blocks of one pixel if the image is small.
 
-    Values that are not finite do not count; a block without others is NaN. The blocks are made row
-    by row: all of a large image as float64 is more than a request has room for.
+    Values that are not finite are ignored; a block without finite values is NaN. The blocks are
+    made row by row, because a whole large image as float64 exceeds the memory of a request.
     """
     height, width = image.shape
     step = max(max(height, width) // _LONG_SIDE_PX, 1)
@@ -274,14 +274,14 @@ def _brightest(image: NDArray[Any]) -> Array:
 GRID, LINES, PLANET = "#3d6b86", "#8f86c9", "#ffe08a"
 _STEPS_DEG = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0)
 _POINTS = 181
-_INTERVALS = 5  # wanted number of intervals of the grid across the frame
+_INTERVALS = 5  # intended number of intervals of the grid across the frame
 
 
 @dataclass(frozen=True)
 class Overlay:
     """Lines and planets in pixels."""
 
-    # shape (P, 2): what a line of the grid is called, and its points; NaN where there is no image
+    # label of a line of the grid, and its points, shape (P, 2); NaN outside of the image
     grid: tuple[tuple[str, Array], ...] = ()
     figures: tuple[Array, ...] = ()  # shape (P, 2): lines of constellations
     bodies: tuple[BodyInFrame, ...] = ()  # planets, the Sun and the Moon
@@ -290,7 +290,7 @@ class Overlay:
 def overlay_from_attitude(
     matrix: Matrix, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
 ) -> Overlay:
-    """Return what lies behind the stars of a frame."""
+    """Return the lines and planets of a frame, which are drawn behind its stars."""
     return Overlay(_grid(matrix, camera), _figures(matrix, camera, epoch_jyear), bodies)
 
 

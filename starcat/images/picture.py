@@ -1,4 +1,4 @@
-"""A picture of one frame: the image or its centroids, which are which stars, where north is.
+"""A picture of one frame: the image or its centroids, with the names of stars and the compass.
 
 The same input gives the same bytes. Nothing is identified here.
 """
@@ -109,9 +109,9 @@ def draw(
 
 
 def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
-    """Return the names that stars are known by; the catalog's own where there is no other.
+    """Return the common names of stars, or the catalog's own name if there is no other.
 
-    The spot of a planet has an empty name: it is identified, and named beside its place.
+    The spot of a planet has an empty name: it is identified, and its name is drawn separately.
     """
     rows = np.flatnonzero(result.star_index >= 0)
     stars = result.star_index[rows]

@@ -1,8 +1,8 @@
-"""Star images: what a detector records of stars at known places, with all of its noise.
+"""Star images: the image that a detector records of stars at known places, with all of its noise.
 
-Input are centroids and magnitudes, output is one frame of 16 bits. The point spread function is
-a Gaussian, integrated over each pixel. Not drawn are smear, blooming, cosmic rays and optics
-whose spot changes over the field.
+The input is centroids and magnitudes, the output is one frame of 16 bits. The point spread function
+is a Gaussian, integrated over each pixel. Smear, blooming, cosmic rays and spots that change over
+the field are not drawn.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _MAX_ELECTRONS = 1e15  # above it a count has no digits left; numpy draws none a
 class Optics:
     """A lens and a detector, for one exposure.
 
-    The light of a star is that of Liebe 2002, "Accuracy performance of star trackers - a
+    The light of a star follows Liebe 2002, "Accuracy performance of star trackers - a
     tutorial", IEEE Transactions on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
@@ -43,7 +43,7 @@ class Optics:
     read_noise_e: float = 8.0  # standard deviation of the read-out, electrons
     gain_e_per_adu: float = 1.0  # electrons of one step of the file
     bias_adu: float = 100.0  # steps added to every pixel, so that noise does not fall below zero
-    full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
+    full_well_e: float = 50_000.0  # electrons that a pixel can hold; more are lost
     hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
 
@@ -116,7 +116,7 @@ def write_simulated(path: Path, frame: SimulatedFrame, camera: Camera, seed: int
         return
     if suffix not in WRITTEN_KINDS:
         raise ConfigError(
-            f"{path}: the name says no kind of frame that starcat writes; end it with one of "
+            f"{path}: the name has no suffix of a frame that starcat writes; end it with one of "
             f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
         )
     size = camera.width_px, camera.height_px

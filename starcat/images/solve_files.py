@@ -1,7 +1,7 @@
 """Frames of a file to answers: the same for the command, the REST interface and the page.
 
-A file holds centroids or is an image. `identify_file` measures it and answers its frames one after
-the other, each when it is asked for; an answer is JSON, a row of a table, a picture or a WCS.
+A file holds centroids or is an image. `identify_file` measures it and answers its frames in turn,
+each when it is requested; an answer is JSON, a row of a table, a picture or a WCS.
 """
 
 from __future__ import annotations
@@ -58,16 +58,16 @@ IMAGE_SUFFIXES = (
     ".heif", ".bmp",
 )  # fmt: skip
 
-CAMERA_NAME = "camera.toml"  # what messages call the text of a camera file
+CAMERA_NAME = "camera.toml"  # name of the text of a camera file in messages
 
 
 @dataclass(frozen=True)
 class LocalInputs:
-    """What only who runs starcat on his own machine can give beside the options."""
+    """Inputs in addition to the options, only for users who run starcat on their own machine."""
 
-    camera: Camera | None = None  # in place of the text of a camera file
+    camera: Camera | None = None  # replaces the text of a camera file
     dark: Path | None = None  # an image with the lid on, which is subtracted
-    mask: Path | None = None  # an image, not zero where no stars are wanted
+    mask: Path | None = None  # an image; pixels that are not zero are ignored
     observer: Observer | None = None
     track: bool = False  # the frames are a sequence
 
@@ -76,13 +76,13 @@ class LocalInputs:
 class MeasuredFile:
     """The centroids of a file, and the image (height, width) that they were found in, if any.
 
-    Of one of many files the image is not kept, but its shape is.
+    If the file is one of many, the image is not kept, but its shape is.
     """
 
     frames: Sequence[MeasuredFrame]
     image: NDArray[Any] | None = None
-    shape: tuple[int, ...] | None = None  # of the image; None where the file holds centroids
-    spots: Spots | None = None  # with the errors of the centroids; None where a file holds them
+    shape: tuple[int, ...] | None = None  # shape of the image; None for a file of centroids
+    spots: Spots | None = None  # centroids with their errors; None for a file of centroids
 
     def brightest(self, count: int) -> MeasuredFile:
         """Return an image with fewer of its spots, the brightest."""
@@ -96,13 +96,13 @@ class MeasuredFile:
 
 @dataclass(frozen=True)
 class FrameAnswer:
-    """A frame, the stars and the attitude found for it, and what the time adds to them."""
+    """A frame, the stars and the attitude found for it, and results that need the time."""
 
     frame: MeasuredFrame
     result: MatchResult
     observer: Observer | None = None
-    spots: Spots | None = None  # of an image: those of the frame
-    attempt: FurtherAttempt | None = None  # of an image that was identified after the first attempt
+    spots: Spots | None = None  # the spots of the frame if it is an image
+    attempt: FurtherAttempt | None = None  # the attempt that identified an image, after the first
 
     @cached_property
     def sky(self) -> SkyInTime | None:
@@ -138,7 +138,7 @@ class FileAnswers:
     camera: Camera
     options: IdentifyOptions
     local: LocalInputs
-    tracker: Tracker | None = None  # of a sequence of several files
+    tracker: Tracker | None = None  # tracker of a sequence of several files
 
     @property
     def is_image(self) -> bool:
@@ -153,7 +153,7 @@ class FileAnswers:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             answer = self._answer(frame, search, error)
-            if tracker is not None:  # however often the frame was searched for, it is one frame
+            if tracker is not None:  # once per frame, even after several searches
                 tracker.record(answer.result, self.camera)
             yield answer
 
@@ -175,7 +175,7 @@ class FileAnswers:
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
     ) -> MatchResult:
-        """Return a refused answer with what a second look has found."""
+        """Return a refused answer with the findings of a second look."""
         if self.local.track or self.options.prior_q is not None:
             return refused
         return explained(
@@ -211,7 +211,7 @@ class FileAnswers:
         return None
 
     def _measured_again(self, attempt: FurtherAttempt) -> MeasuredFile | None:
-        """Return the image with its spots of an attempt; None where it does not apply."""
+        """Return the image with its spots of an attempt; None if the attempt does not apply."""
         if attempt.threshold is None:
             return self.measured.brightest(BRIGHTEST)
         try:
@@ -226,7 +226,7 @@ class FileAnswers:
                 self.path, attempt.options(self.options), self.local, image=image,
                 without_hot_pixels=attempt.without_hot_pixels,
             )  # fmt: skip
-        except ConfigError:  # too much stands out: the first measurement has said what it could
+        except ConfigError:  # too much stands out: keep the result of the first measurement
             return None
 
     @cached_property
@@ -271,7 +271,7 @@ class FileAnswers:
         self._check_way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
-                "track=True does not tell planets from stars; leave out time, or track=True",
+                "track=True does not separate planets from stars; leave out time, or track=True",
                 fields=("track=True", "time"),
             )
 
@@ -319,13 +319,13 @@ class FileAnswers:
         return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
-        """Return what a user should know beside the answers."""
+        """Return notes for the user in addition to the answers."""
         unknown = said_of_columns([first.frame]) if first else None
         notes = [unknown] if unknown else []
         if first and first.spots is not None and first.spots.streak is not None:
             notes.append(
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
-                "attitude are those of the middle of the exposure."
+                "attitude hold for the middle of the exposure."
             )
         if first and first.attempt is not None:
             notes.append(
@@ -372,7 +372,7 @@ def identify_file(
     options: IdentifyOptions | None = None,
     local: LocalInputs | None = None,
 ) -> FileAnswers:
-    """Measure a file, or ``-`` for stdin, and identify its frames when they are asked for."""
+    """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
     return answers_of(path, measure_picture(path, chosen, own), matcher, chosen, own)
@@ -381,7 +381,7 @@ def identify_file(
 def identify_either_way(
     path: Path, matcher: Matcher, options: IdentifyOptions
 ) -> tuple[FileAnswers, list[FrameAnswer]]:
-    """Identify a file; where its first frame only matches mirrored, with its rows the other way."""
+    """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
         answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}))
         found = list(answers)

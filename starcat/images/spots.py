@@ -13,10 +13,10 @@ from starcat.images.background import SkyLevels, pixels_around, unmasked
 from starcat.matcher.result import MatchResult
 
 CREDIBLE_CHI_SQUARE = (0.5, 2.0)
-"""Reduced chi-squares of an answer between which the noise of its spots is taken as its weights."""
+"""Range of an answer's reduced chi-square in which the noise of its spots gives their weights."""
 
 MIN_DEPTH = 2.0
-"""Standard deviations from a sky that was not clipped down to its darkest pixel, at least."""
+"""Smallest depth of the darkest pixel below a sky that was not clipped, standard deviations."""
 
 
 def centroid_sigma_px(
@@ -24,7 +24,7 @@ def centroid_sigma_px(
 ) -> Array:
     """Return the standard errors of windowed centroids on each axis; infinite where not known.
 
-    That is without light, or with a gain that is NaN.
+    An error is not known without light, or with a gain that is NaN.
 
     ``flux`` is the light of each spot and ``noise`` the standard deviation of a pixel of its
     background, both in steps of the image; the spot as the pixels show it and the window are
@@ -53,8 +53,8 @@ def electrons_per_step(levels: SkyLevels) -> float:
     """Judge the gain of a camera from the noise of the sky, as if its photons were all noise.
 
     The black point is taken to be the darkest pixel. Read noise makes the gain seem smaller than
-    it is, and the errors of bright stars larger. NaN where the sky was clipped, so that no pixel
-    is darker than it by `MIN_DEPTH` of its noise.
+    it is, and the errors of bright stars larger. NaN if the sky was clipped, so that no pixel is
+    darker than it by `MIN_DEPTH` of its noise.
     """
     background = unmasked(levels.raw - levels.above, levels.mask)
     sky = float(np.median(background, overwrite_input=True))
@@ -67,10 +67,10 @@ def electrons_per_step(levels: SkyLevels) -> float:
 
 
 def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
-    """Return the answer to an image, weighted by the noise of its spots where that is their error.
+    """Return the answer to an image, weighted by the noise of its spots if that is their error.
 
-    In a lens that is not calibrated it is not all of it, and in a picture whose sky was clipped it
-    is not known: there all spots weigh the same.
+    An uncalibrated lens adds further errors, and in a picture with a clipped sky the noise is not
+    known: then all spots have the same weight.
     """
     if not result.ok:
         return result
@@ -79,9 +79,9 @@ def weighed(result: MatchResult, sigma_px: Array) -> MatchResult:
     return weighted if low <= weighted.reduced_chi_square <= high else result
 
 
-SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
+SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that can be found
 _STEP = 1.15
-_HALF_PX = 16  # a star is looked at this far to each side
+_HALF_PX = 16  # pixels on each side of a star that are used
 _REACH_SIGMA = 4.0
 _MAX_SPOTS = 150
 _SPOTS_AT_ONCE = 2000  # noise can have tens of thousands, each of which takes 9 kB or more
@@ -198,7 +198,7 @@ def sigma_of_stars(levels: SkyLevels, places: Array, peak: Array) -> float:
         return _SHARP_PX
     sigma = sigma[sigma > _SHARP_PX]
     sigma = sigma[:_MAX_SPOTS]
-    # Not of logarithms: clouds are wide, and no width of theirs is as frequent as a star's.
+    # Not of logarithms: clouds are wide, and none of their widths is as frequent as a star's.
     near = np.abs(np.log(sigma / _densest(np.sort(sigma)))) < np.log(1.35)
     # Of two or three widths that differ none is near their mode.
     return float(np.clip(np.median(sigma[near] if near.any() else sigma), *SIGMA_RANGE_PX))

@@ -1,9 +1,9 @@
 """Stars that moved while the shutter was open: streaks, measured at their middles.
 
 A camera that turns at a steady rate draws every star as a bar, and the middle of the bar is where
-the star was at the middle of the exposure: that is the time of the centroids. How long the bars
-are and which way they lie is seen from the bright ones; a filter of their shape finds the others.
-The bars of one frame are taken to be parallel and of one length, as they are where the camera
+the star was at the middle of the exposure: that is the time of the centroids. The length and the
+direction of the bars are measured on the bright ones; a filter of their shape finds the others.
+The bars of one frame are assumed to be parallel and of one length, as they are if the camera
 turns about an axis across its boresight.
 """
 
@@ -29,7 +29,7 @@ _ALIGNED = 0.9  # length of the mean of unit vectors with twice the angle: 1 if 
 _NARROWEST_PX = 0.6
 _REACH_SIGMA = 4.0
 _BRIGHTEST = 12  # bars that the length and the width are measured on
-_ROUNDS = 4  # a faint bar is found in pieces, and looked at farther out each time
+_ROUNDS = 4  # a faint bar is found in pieces, and measured farther out in each round
 _WIDEST_PX, _ACROSS_PX = 5.0, 15
 _OF_LONGEST = 0.5  # bars shorter than this part of the longest ones are pieces of bars
 
@@ -38,7 +38,7 @@ _OF_LONGEST = 0.5  # bars shorter than this part of the longest ones are pieces 
 class Streak:
     """The bar that a star draws."""
 
-    dx_px: float  # from one end to the other, to the right; which end is first is not known
+    dx_px: float  # one end minus the other, to the right; which end is first is not known
     dy_px: float
     psf_sigma_px: float  # standard deviation of the spot that was drawn along the bar
 
@@ -71,7 +71,7 @@ class Streak:
     def sigma_px(self, flux: Array, noise: Array, gain_e_per_adu: float) -> Array:
         """Return the standard error of middles, the same along and across: the mean of both.
 
-        That of the best fit of a bar much longer than wide: along it only the ends tell.
+        It holds for the best fit of a bar much longer than wide: along it only the ends count.
         """
         length, spot = max(self.length_px, self.psf_sigma_px), self.psf_sigma_px
         bright = np.where(flux > 0.0, flux, np.nan)
@@ -106,7 +106,7 @@ def streak_of(found: NDArray[Any], shape: tuple[int, int]) -> Streak | None:
 
 
 def refined(levels: SkyLevels, streak: Streak, places: Array) -> Streak:
-    """Return a bar as the brightest bars of an image are, measured at their ends and across."""
+    """Return the common bar of the brightest bars of an image, measured at the ends and across."""
     for _ in range(_ROUNDS):
         spans, acrosses = _profiles(levels, streak, places[:_BRIGHTEST])
         lengths = [length for length in map(_length, spans) if length > 0.0]
@@ -137,7 +137,7 @@ def _profiles(levels: SkyLevels, streak: Streak, places: Array) -> tuple[Array, 
 
 
 def _length(light: Array) -> float:
-    """Return how far light goes on above half of what it is in the middle; 0 if it ends nowhere."""
+    """Return the distance up to which light stays above half of its middle value; 0 if no end."""
     smooth = gaussian_filter1d(light, 2.0)
     half = len(light) // 2
     level = 0.5 * float(np.median(smooth[half - half // 8 : half + half // 8 + 1]))

@@ -1,6 +1,6 @@
 """The matcher: centroids and an artifact become identified stars and an attitude.
 
-The room needs numpy and h5py only, so that it can run on a small machine.
+This package needs only numpy and h5py, so that it can run on a small machine.
 """
 
 from starcat.rooms import lazy_names

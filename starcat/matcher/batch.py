@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class BatchResult(Sequence[MatchResult]):
     """The answers to many frames of one camera: a sequence, with arrays over all frames.
 
-    All methods and engines return it. As of any sequence, ``bool`` says whether there are frames,
-    and not whether one is identified: ask ``any(answers)`` or ``all(answers)``.
+    All methods and engines return it. As for any sequence, ``bool`` is true if there are frames,
+    even if none is identified: use ``any(answers)`` or ``all(answers)``.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Frames of a camera of which only a range of fields of view is known.
+"""Frames of a camera whose field of view is only known as a range.
 
 Each level of the database serves a part of the range: it is a database of its own, with the stars
 and the triangles of that level alone, for frames of about one field of view; within that part the
@@ -39,29 +39,29 @@ from starcat.matcher.settings import (
 from starcat.matcher.verification import AT_ONCE, BestOf, agree, agreeing_centroids
 
 MAX_CENTROIDS = 40
-"""Brightest centroids of a frame that are compared with a level, which has about 20 stars a field
-of its size, and 40 a frame that is wider by half."""
+"""Number of brightest centroids of a frame that are compared with a level. A level has about 20
+stars per field of its size, and 40 per frame that is wider by half."""
 
 BRIGHTEST = TriangleOrder(most_centroids=10)
-"""Triangles where magnitudes are known: those of the stars that a level's triangles are of."""
+"""Triangles if magnitudes are known: of the same bright stars as the triangles of a level."""
 
 BY_CHANCE = 1.0
-"""Candidates of a batch that are worked out although they agree by chance, on average."""
+"""Mean number of candidates of a batch that are worked out although they agree by chance."""
 
 _OWN = 3
-"""Centroids of a candidate, which its attitude was computed from."""
+"""Number of centroids of a candidate, from which its attitude was computed."""
 
 BEYOND = 1.25
-"""Factor by which the outer levels serve focal lengths beyond those that they are made for: a
-frame of other proportions than the camera's has another width for the same area."""
+"""Factor by which the outer levels are used beyond the focal lengths that they are made for: a
+frame with other proportions than the camera has another width for the same area."""
 
 
 @dataclass(frozen=True)
 class BlindLevel:
     """One level."""
 
-    # Tangent of half the field of view: the geometric mean of those across width and height, so
-    # that it does not depend on which of the two is longer.
+    # Tangent of half the field of view: the geometric mean of the tangents across width and
+    # height, which does not depend on which of the two is longer.
     half_width: float
     database: Database  # its stars, and triangles with the rows of these
     rows: NDArray[np.int64]  # rows of its stars in the artifact; shape (N,)
@@ -117,7 +117,7 @@ def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
 
 
 def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> ProductArrays:
-    """Return the columns that triangles of an unknown scale are looked up by."""
+    """Return the columns by which triangles of an unknown scale are looked up."""
     u, v, w = (directions[rows] for rows in corners)
     a, b, c = (
         2.0 * np.arcsin(0.5 * np.linalg.norm(one - other, axis=1))
@@ -151,7 +151,7 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class _Search:
-    """One part's frame, its candidates, and the best that came of them."""
+    """The frame of one part, its candidates, and the best agreement so far."""
 
     part: ImagePart
     whole: Observation
@@ -198,16 +198,16 @@ def _focal_px(camera: Camera, fov_x_deg: float) -> float:
 def identify_blind(
     settings: Settings, database: Database, frame: Frame, fov_deg: tuple[float, float]
 ) -> MatchResult:
-    """Identify a frame of a camera of which only a range of fields of view is known.
+    """Identify a frame of a camera if only a range of its field of view is known.
 
-    The false-match probability of an answer is that of its level times the number of levels that
-    were searched. The bound of one level counts all attitudes and all focal lengths of its part
-    of the range (`false_match_probability`), with the number of its own stars in the frame. The
-    parts cover the whole range and do not overlap, and the probability that chance agrees in
-    any of K parts is at most the sum of those in each. So no answer is given in any of them
-    whose bound is above the limit divided by K. Only the brightest of many spots are compared;
-    which these are does not depend on where in the frame they lie, so that the bound holds for
-    them as for a frame that has no others.
+    The false-match probability of an answer is its level's probability times the number of levels
+    that were searched. The bound of one level counts all attitudes and all focal lengths of its
+    part of the range (`false_match_probability`), with the number of its own stars in the frame.
+    The parts cover the whole range and do not overlap, and the probability that chance agrees in
+    any of K parts is at most the sum of their K probabilities. So an answer is withheld if its
+    bound in its part is above the limit divided by K. Only the brightest of many spots are
+    compared. Which spots these are does not depend on their positions in the frame, so the bound
+    holds for them as for a frame without other spots.
     """
     database.check_has_products("an onboard image serves one field of view", key="fov")
     check_scale_free(settings)
@@ -266,9 +266,9 @@ def _run(searches: Sequence[_Search]) -> Limit | None:
 def _verify(candidates: Candidates, search: _Search) -> None:
     """Work out the agreements of the candidates that stand out, until one is certain.
 
-    Each level has thousands of candidates for a frame, nearly all of them false. Beside its own
-    three, each has as many agreeing centroids as chance brings near stars: a Poisson variate,
-    whose mean is that of the batch. Those are worked out that hardly any of the batch reaches.
+    Each level has thousands of candidates for a frame, nearly all of them false. Besides its own
+    three centroids, a false candidate has as many agreeing centroids as chance brings near stars: a
+    Poisson variate with the mean of the batch. Only unusually high numbers are worked out.
     """
     frame, database = search.used, search.part.level.database
     matrices, factors, counts = [], [], []

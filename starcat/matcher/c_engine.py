@@ -1,7 +1,7 @@
 """The C library that flies (``onboard/``), called with an onboard image.
 
-It is compiled when a wheel is built. Where it is missing, or cannot take a frame, the matcher of
-numpy serves, with the same rules and the same stars.
+It is compiled when a wheel is built. If it is missing or cannot take a frame, the numpy matcher
+is used, with the same rules and the same stars.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ except ImportError:  # the wheel was built without a compiler
 
 
 MAX_STEPS = 300_000_000
-"""Steps of the library, which are smaller than those of numpy, for one frame: about a second."""
+"""Steps of the library for one frame: about a second. They are smaller than the numpy steps."""
 
 CHUNK = 256
-"""Frames that one thread takes at a time."""
+"""Number of frames that one thread takes at a time."""
 
 STATUSES: dict[int, Status] = {
     0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match",
 }  # fmt: skip
-"""What a frame came to, by the number that the library returns: -14 where the steps are used up."""
+"""Result of a frame, by the number that the library returns: -14 if the steps are used up."""
 
 REASONS: tuple[Reason, ...] = (
     "chance", "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "steps",
@@ -112,12 +112,12 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class _Batch:
-    """What the library has written for many frames of one camera."""
+    """The output of the library for many frames of one camera."""
 
     # One ``starcat_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
     # identified.
     records: NDArray[np.void]
-    # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
+    # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
     star_index: NDArray[np.int32]
     star_ids: NDArray[np.int64]
     frames: Frames
@@ -125,12 +125,12 @@ class _Batch:
 
     @cached_property
     def codes(self) -> list[int]:
-        """Return the number that each frame came to."""
+        """Return the result number of each frame."""
         codes: list[int] = self.records["status"].tolist()
         return codes
 
     def result(self) -> BatchResult:
-        """Return it as Python has it; a frame that the library did not take is a no_match."""
+        """Return the batch as Python objects; a frame that the library refused is a no_match."""
         found = self.records
         has_attitude = found["status"][:, None] == _onboard.lib.STARCAT_IDENTIFIED
         attitudes = np.where(has_attitude, found["q_body_from_icrs"], np.nan)
@@ -162,7 +162,7 @@ class CEngine:
         directions: Array | None = None,
     ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
-        # Memory of numpy begins at a multiple of 16, as the library wants it; bytes need not.
+        # The library needs memory that begins at a multiple of 16, as numpy arrays do.
         words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
         words.view(np.uint8)[: len(data)] = np.frombuffer(data, dtype=np.uint8)
         self._words, self.image = words, ffi.new("starcat_image *")
@@ -180,7 +180,7 @@ class CEngine:
         self.database = database
 
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
-        """Return what asks the library about frames of a camera."""
+        """Return the search of the library for frames of a camera."""
         return Search(self, camera, settings, fov_error)
 
 
@@ -191,7 +191,7 @@ def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
         return (ffi.NULL,)
     first = ffi.new("uint32_t[]", int(image.n_stars) + 1)
     table = ffi.new("starcat_neighbours *", [database.camera.radius_rad, 0, 0, first, ffi.NULL])
-    lib.starcat_list_all_neighbours(image, table)  # how many there are
+    lib.starcat_list_all_neighbours(image, table)  # counts them
     table.capacity = first[int(image.n_stars)]
     table.neighbour = kept = ffi.new("starcat_neighbour[]", table.capacity)
     status = lib.starcat_list_all_neighbours(image, table)
@@ -207,7 +207,7 @@ class Search:
         self.camera, self._settings, self._fov_error = camera, settings, fov_error
         self._noise_px = settings.noise_px
         self._database = engine.database
-        # The library is given addresses: what stands there has to be kept.
+        # The library is given addresses: the objects at these addresses have to be kept.
         self._kept = engine, _camera(camera), _options(settings, fov_error)
         addresses = [engine.image, *self._kept[1:], engine.rows]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
@@ -221,9 +221,9 @@ class Search:
         prior: Prior | None = None,
         sigma_px: Array | None = None,
     ) -> MatchResult | None:
-        """Identify the stars of a frame; None where the library does not take it.
+        """Identify the stars of a frame; None if the library does not take it.
 
-        This is what a call costs beside the library: arrays go there and back as bytes.
+        The overhead of a call is the copying of arrays to the library and back, as bytes.
         """
         count = len(centroids_px)
         if count > self._most:
@@ -258,9 +258,9 @@ class Search:
         return prior.checked(found, self.camera, self._settings.tolerance_px)
 
     def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
-        """Identify the stars of frames; return the answers, and the frames that have none.
+        """Identify the stars of frames; return the answers, and the frames without an answer.
 
-        The library does not take the latter: a camera or a number is beyond its limits.
+        The library refuses these frames: a camera or a number is beyond its limits.
         """
         count, starts = len(frames), frames.starts
         records, star_index = np.zeros(count, _answer_dtype()), np.full(starts[-1], -1, np.int32)
@@ -352,7 +352,7 @@ def _refusal(
 
 
 class _Memory:
-    """The memory that a call works in, half a megabyte, and views of what it leaves there."""
+    """The memory that a call works in, half a megabyte, and views of the results in it."""
 
     def __init__(self) -> None:
         ffi, most = _onboard.ffi, int(_onboard.lib.STARCAT_MAX_CENTROIDS)
@@ -361,8 +361,8 @@ class _Memory:
 
 
 _FREE: list[_Memory] = []
-"""Memory that no call works in at present. A call takes one from here or makes one, so that there
-are as many as there ever were calls at once; taking and putting back are atomic."""
+"""Memory that no call uses at present. A call takes one from here or makes a new one, so there are
+as many as there were calls at the same time; taking and putting back are atomic."""
 
 
 def _double_pointer(array: Array | None) -> Any:
@@ -397,13 +397,13 @@ def _options(settings: Settings, fov_error: float) -> Any:
 
 
 MAX_FEATURES = 4_000_000
-"""Triangles or pairs of a database that are made an image unasked: that takes a second."""
+"""Largest number of triangles or pairs that ``auto`` makes an image of, which takes a second."""
 
 
 def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
-    """Return the engine of a database, made once; None where the library does not serve it.
+    """Return the engine of a database, made once; None if the library does not support it.
 
-    Unless it is wanted ``always``, no image is made of more than `MAX_FEATURES`.
+    Unless ``always`` is set, no image is made of more than `MAX_FEATURES`.
     """
     if _onboard is None or method not in FEATURES:
         return None

@@ -37,16 +37,16 @@ from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
 
 MAX_CENTROIDS = 512
-"""Largest number of centroids of a frame that are searched; the C library has room for as many."""
+"""Largest number of centroids of a frame that are searched, also by the C library."""
 
 
 @dataclass(frozen=True)
 class Brightest:
-    """The centroids of a frame that are searched, and the frame that they are of."""
+    """The centroids of a frame that are searched, and their whole frame."""
 
     whole: Frame
     rows: Rows  # rows of the whole frame that are searched, ascending
-    dropped: Dropped  # of the whole frame
+    dropped: Dropped  # centroids of the whole frame that are not used
 
     @property
     def frame(self) -> Frame:
@@ -60,10 +60,10 @@ class Brightest:
         )
 
     def answer_of(self, searched: MatchResult) -> MatchResult:
-        """Return the answer to the whole frame from that to its searched part.
+        """Return the answer to the whole frame from the answer to its searched part.
 
-        Centroids that were not searched have no star. In a frame of so many centroids some lie
-        near any star by chance.
+        Centroids that were not searched have no star: in a frame with this many centroids some
+        lie near any star by chance.
         """
         star_index = np.full(len(self.whole), -1, dtype=np.int32)
         star_index[self.rows] = searched.star_index
@@ -86,8 +86,8 @@ def brightest_of(frame: Frame) -> Brightest:
     mag = np.zeros(len(rows))
     if frame.mag is not None:
         mag = np.nan_to_num(known_magnitudes(frame.mag)[rows], nan=np.inf)
-    # Centroids at exactly the same place count once. Few frames have any, so that in nearly all
-    # of them it is enough to sort twice as many as are needed.
+    # Centroids at exactly the same place count once. Few frames have any, so it is nearly always
+    # enough to sort twice as many centroids as are needed.
     for count in (2 * MAX_CENTROIDS, len(rows)):
         first = _first(mag, hashes, count)
         distinct, repeats = without_repeats(rows[first], px)
@@ -119,7 +119,7 @@ def brightest_of_frames(frames: Frames) -> tuple[Frames, dict[int, Brightest]]:
 
 
 def _first(mag: Array, hashes: NDArray[np.uint64], count: int) -> Rows:
-    """Return the brightest, in order; all that are as bright as the last one are sorted too."""
+    """Return the brightest rows, in order, including all that are as bright as the last one."""
     near = np.arange(len(mag))
     for key in (mag, hashes):
         if len(near) > count:
@@ -148,20 +148,20 @@ SIGMA = "sigma_px"
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """The centroids of one frame, as a file has them."""
+    """The centroids of one frame, as in its file."""
 
-    name: str  # name of the frame; that of the file where the frame has none of its own
+    name: str  # name of the frame; the name of the file if the frame has no name
     centroids_px: Array  # pixels, in the order of the file; shape (N, 2)
-    # Magnitudes, NaN where a centroid has none; None where the file has none. Those of light are
-    # -2.5 log10 of it, their zero point unknown; shape (N,).
+    # Magnitudes, NaN for a centroid without one; None if the file has none. For a column of light
+    # they are -2.5 log10 of it, with an unknown zero point; shape (N,).
     mag: Array | None = None
-    sigma_px: Array | None = None  # noise of each on each axis; NaN where a centroid has none
+    sigma_px: Array | None = None  # noise of each centroid on each axis; NaN if not stated
     # Columns or keys of the file that are not known, and so were not used.
     ignored: tuple[str, ...] = ()
 
 
 MAX_BYTES = 1 << 30
-"""Of a file of centroids: ten million of them as text."""
+"""Largest size of a file of centroids: ten million centroids as text."""
 
 HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a CSV file whose first line is numbers."""
@@ -171,7 +171,7 @@ def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
     path = Path(path)
     try:
-        # Spreadsheets put a mark of the byte order before the header.
+        # Spreadsheets write a byte order mark before the header.
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing as error:
         text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
@@ -235,7 +235,7 @@ def is_number(text: str) -> bool:
 
 
 def _magnitudes(values: Array, name: str) -> Array:
-    """Return magnitudes of a column; NaN where there is no light."""
+    """Return magnitudes of a column; NaN for a centroid without light."""
     if name not in _LIGHT:
         return values
     bright = np.where(values > 0.0, values, np.nan)
@@ -305,7 +305,7 @@ def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
 
 
 def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
-    """Return what a user should know about columns that were not used."""
+    """Return a note for the user about columns that were not used."""
     names = sorted({name for frame in frames for name in frame.ignored})
     if not names:
         return None
@@ -321,13 +321,13 @@ def _number(value: Any, name: str, where: str) -> float:
         if isinstance(value, bool):
             raise ValueError
         return float(value)
-    except (TypeError, ValueError, OverflowError):  # an integer of 400 digits is no float
+    except (TypeError, ValueError, OverflowError):  # an integer of 400 digits is too large
         found = reprlib.repr(value)
         raise ConfigError(f"{where}: {name} is {found}; expected a number") from None
 
 
 def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
-    """Read the frames of a stream, each as soon as it is there."""
+    """Read the frames of a stream, each as soon as it is complete."""
     rest = enumerate(lines, start=1)
     filled = ((number, line.removeprefix("\ufeff")) for number, line in rest if line.strip())
     begin, first = next(filled, (1, ""))
@@ -344,7 +344,7 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
 
 
 def read_stdin() -> Iterator[MeasuredFrame]:
-    """Read the frames of stdin, each as soon as it is there."""
+    """Read the frames of stdin, each as soon as it is complete."""
     try:
         yield from read_stream(sys.stdin)
     except UnicodeDecodeError as error:

@@ -1,36 +1,36 @@
 """The probability that chance alone agrees with a frame as well as an attitude does.
 
-It is bounded by an expected number: that of the attitudes, over the whole sky, which put as many
-stars as near to centroids that lie anywhere on the detector. This number does not depend on how
+It is bounded by an expected number: the number of attitudes, over the whole sky, that put as many
+stars as near to centroids at random places on the detector. This number does not depend on how
 many candidates a method has tried.
 
 There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
 of them, the frames whose squared residuals sum to less than Q in some attitude fill the
-volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
-dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
-all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
+volume ``8 pi^2 f^3 sqrt(det H)`` times the volume of a ball of radius sqrt(Q) in the 2n - 3
+dimensions that the fit leaves free, out of A^n for all frames. The first factor is the volume
+of all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
 three angles. The product is the expected number. Its sum over the N - 3 possible values of
 n bounds the probability. M is counted around the field, so the bound is higher in a crowded
-field, and where most of the field is left unexplained.
+field, and if most of the field is left unexplained.
 
-Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
-dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
-dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
-by the logarithm of f. The two ends of the range add that of the known focal length once.
+Focal length. If it is fitted, the frames that agree form a manifold with a fourth dimension:
+the volume is ``8 pi^2 f^3 L sqrt(det H)`` times the volume of a ball in 2n - 4 dimensions, L
+being the logarithm of the range and H having a fourth row for the derivatives by the logarithm
+of f. The two ends of the range add the expected number of a known focal length once.
 
 Magnitudes. Assignments of centroids to stars that they are not compatible with are never
 agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
-places of the centroids are random; it says nothing of their magnitudes. So the expected
-number is that of random places with the magnitudes that the frame has, whatever they are:
-it holds also where the magnitudes of false spots are those of the stars, and where the
-stated error is wrong (then true frames may be missed).
+places of the centroids are random; it makes no assumption about their magnitudes. So the
+expected number is the number for random places with the magnitudes of the frame, whatever they
+are. It also holds if false spots have the same magnitudes as stars, and if the stated error is
+wrong (then true frames can be missed).
 
-Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
-the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
-if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
-noise tells, before any residual is seen, which n will matter: with one star fewer than n*
-an agreement of true stars is typically not certain, with one more it is so many times over.
-So n* has the largest share and every further n a tenth of the one before (`_log_share`).
+Noise. If no noise is stated, each of the N - 3 values of n is allotted the same share of
+the probability: the expected number is divided by 1 / (N - 3). Any other shares are valid
+too, if they add up to 1 at every attitude and do not depend on where the centroids are. A
+stated noise shows, before any residual is seen, which n will matter: with one star fewer than
+n* an agreement of true stars is typically not certain, with one more it is far beyond certain.
+So n* has the largest share, and every further n has a tenth of the previous share (`_log_share`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ NEARLY_CERTAIN = 1e-7
 """Largest expected number of agreements of true stars that are likely to be answers."""
 
 NEXT_SHARE = 0.1
-"""Share of a number of stars over that of its neighbour on the side of the typical number."""
+"""Share of a number of stars over the share of the next number towards the typical one."""
 
 
 def false_match_probability(
@@ -111,7 +111,7 @@ def largest_squares_px(
 ) -> Array:
     """Return the largest sums of squared residuals of n stars that are answers, pixels squared.
 
-    It is what `false_match_probability` returns ``limit`` for, where ``noise_px`` is stated.
+    For these sums `false_match_probability` returns ``limit``, if ``noise_px`` is stated.
     ``information`` are determinants of sums of the squared derivatives (`place_information`).
     """
     most = min(n_centroids, stars_in_frame)
@@ -124,9 +124,9 @@ def largest_squares_px(
 
 
 def place_information(body: Array) -> dict[tuple[int, int], Array]:
-    """Return what each direction adds to the sums of products of derivatives by the three angles.
+    """Return the terms of each direction in the sums of products of derivatives by three angles.
 
-    Arrays of shape (N,) by row and column, those above the diagonal once; directions have the
+    Arrays of shape (N,) by row and column, on and above the diagonal; directions have the
     shape (N, 3). In units of the focal length, as `false_match_probability` has them.
     """
     x, y = (body[:, :2] / body[:, 2:]).T
@@ -137,7 +137,7 @@ def place_information(body: Array) -> dict[tuple[int, int], Array]:
 def _sums(body: Array) -> list[list[float]]:
     """Return the sums of the products of 1, x, y, x x, x y and y y, over places (x, y).
 
-    They hold all that the derivatives of the places are made of.
+    All sums of the derivatives of the places follow from them.
     """
     powers = np.empty((6, len(body)))
     powers[0] = 1.0
@@ -186,11 +186,11 @@ def _log_expected(
 def _log_share(
     n: int, most: int, assignments: Callable[[int], float], noise_px: float, camera: Camera
 ) -> float:
-    """Return the logarithm of the share of n, which is ``most`` at the most.
+    """Return the logarithm of the share of n, which is at most ``most``.
 
-    The typical number of stars, n*, is the smallest whose agreements are `NEARLY_CERTAIN` where
+    The typical number of stars, n*, is the smallest whose agreements are `NEARLY_CERTAIN` if
     their stars are spread over the whole frame and the squared residuals are what the noise
-    makes on average; the largest possible one where there is none.
+    makes on average. If no number is, it is the largest possible one.
     """
     numbers = range(MIN_STARS, most + 1)
     square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
@@ -218,15 +218,15 @@ def log_compatible_assignments(most: int, compatible: Mask) -> Array:
 
     Two bounds are taken from the centroids, two from the stars, and the least is returned. Let
     centroid i have c_i compatible stars. If each centroid of a choice took any of its stars, even
-    one that is taken, the product of their c_i would count the ways; its sum over all choices of n
-    is the elementary symmetric polynomial e_n(c_1, ..., c_N).
+    one that is taken, the number of assignments would be the product of their c_i; its sum over all
+    choices of n is the elementary symmetric polynomial e_n(c_1, ..., c_N).
 
     The theorem of Bregman counts stars once: a square matrix of zeros and ones has a permanent of
     at most the product of ``(r!)^(1/r)`` over its rows, r being their sums. The n rows of a
-    choice, with M - n rows of ones below them, are such a matrix, and each assignment of the
-    choice occurs ``(M - n)!`` times in its permanent. The sum over the choices is therefore
-    ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!`` at the most, with ``g_i = (c_i!)^(1/c_i)``
-    (0 where c_i is). If all are compatible, this is the number of `log_assignments`.
+    choice, with M - n rows of ones below them, form such a matrix, and each assignment of the
+    choice occurs ``(M - n)!`` times in its permanent. The sum over the choices is therefore at
+    most ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!``, with ``g_i = (c_i!)^(1/c_i)``
+    (0 if c_i is 0). If all are compatible, this is the number of `log_assignments`.
 
     Bregman 1973, "Some properties of nonnegative matrices and their permanents".
     """

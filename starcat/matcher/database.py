@@ -1,4 +1,4 @@
-"""The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
+"""The products of an artifact in the matcher: arrays mapped from its HDF5 file.
 
 Only what a method needs is opened. Datasets are not read but mapped; every one is checked against
 its layout when the database is opened, because an index that leads out of its table would
@@ -51,12 +51,12 @@ READABLE_LAYOUT = 1
 """Major version of the HDF5 layout that this matcher reads."""
 
 NEWEST_SCHEMAS = {"stars": 2}
-"""Newest major version of a product's schema that this matcher reads, where it is not 1."""
+"""Newest major version of a product's schema that this matcher reads, if it is not 1."""
 
 
 @dataclass(frozen=True)
 class ProductArrays:
-    """One product: its columns and indices by dataset, and the numbers beside them."""
+    """One product: its columns and indices by dataset, and its attributes."""
 
     arrays: Mapping[str, NDArray[Any]]
     numbers: Numbers = field(default_factory=dict)
@@ -72,18 +72,18 @@ class ProductArrays:
 
 @dataclass(frozen=True)
 class Database:
-    """What a matcher needs of an artifact."""
+    """The parts of an artifact that a matcher needs."""
 
     name: str  # ``<name>-<version>``
-    camera: Camera  # that it was built for
-    epoch_jyear: float  # of the directions
+    camera: Camera  # camera that the database was built for
+    epoch_jyear: float  # epoch of the directions
     star_id: NDArray[np.int64]
     directions: Directions
     mag: Array
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
-    folder: Path | None = field(default=None, compare=False)  # that it was read from
-    # The onboard image that all this was read from, which has no products.
+    folder: Path | None = field(default=None, compare=False)  # of the artifact
+    # The onboard image, if the database was read from one; it has no products.
     image: OnboardImage | None = None
     _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
@@ -92,12 +92,12 @@ class Database:
         return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
 
     def check_has_products(self, why: str, **fact: Any) -> None:
-        """Check that this is no onboard image, which has none."""
+        """Check that this is not an onboard image, which has no products."""
         if self.image is not None:
             raise ConfigError(f"{why}; open the database that it is of", **fact)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what goes to another process: all but what can be made again there."""
+        """Return the state for another process, without what can be made again there."""
         return {**vars(self), "_cache": {}}
 
     def cached(self, make: Callable[..., Made], *arguments: float) -> Made:
@@ -112,8 +112,8 @@ class Database:
 def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     """Open the database of an artifact, given its folder or ``database.h5``, and some products.
 
-    The arrays are read-only views of the file, which has to stay in place. `ProductError` if there
-    is no database, it lacks a product, or a part of it is not what a build writes;
+    The arrays are read-only views of the file, which has to stay in place. `ProductError` if the
+    database or a product is missing, or a part of it is not as a build writes it;
     `SchemaVersionError` if its layout or a product's schema is of another major version.
     """
     path = _database_file(artifact)
@@ -209,7 +209,7 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
     stars = _product(file, mapped, "stars", path)
     camera = json.loads(file.attrs["camera"])
     name = f"{file.attrs['name']}-{file.attrs['version']}"
-    # Bytes that are no text are damage, which is told here and not where the name is used.
+    # A name that is not valid text is damage; raise the error here, not where the name is used.
     name.encode()
     count = len(stars["star_id"])
     return Database(
@@ -298,7 +298,7 @@ def _check_version(found: str, newest: int, product: str, path: Path) -> None:
 def check_product(
     name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, star_count: int
 ) -> None:
-    """Check that a product is as its layout says; `ProductError` names what is not."""
+    """Check that a product has its layout; `ProductError` names the first difference."""
     layout = LAYOUTS[name]
     checks = _Checks(name, arrays, star_count)
     rows = len(arrays[layout.columns[0]])
@@ -389,11 +389,11 @@ class _Checks:
         off = np.abs(squares - 1.0)
         if len(off) and not off.max() < 1e-9:
             row = int(np.argmax(~(off < 1e-9)))
-            raise damaged(self.product, "x, y, z", f"is no unit vector in row {row}")
+            raise damaged(self.product, "x, y, z", f"is not a unit vector in row {row}")
 
 
 def damaged(product: str, what: str, found: str) -> ProductError:
-    """Return the error of a database that no build wrote as it is."""
+    """Return the error for a database that was changed after its build."""
     return ProductError(
         f"{product}/{what} {found}; the database is damaged. Build the database again, or fetch "
         "it again",

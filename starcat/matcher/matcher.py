@@ -2,7 +2,7 @@
 
 A method proposes which centroids are which stars; every proposal goes through the same
 verification, and only an agreement that chance does not explain is an answer. The readable
-reference is in numpy; where it can, the C library answers, with the same stars.
+reference is in numpy. If possible, the C library answers, with the same stars.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ MAX_CAMERAS = 16
 
 @dataclass(frozen=True)
 class _WithDatabase:
-    """The first field of a `Matcher`, before those of its settings."""
+    """The first field of a `Matcher`, before the fields of its settings."""
 
     database: Database
 
@@ -133,7 +133,7 @@ class Matcher(Settings, _WithDatabase):
         verify : bool, default True
             Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
             any change since the build: about 2 ms for each MB of the file. The manifest itself
-            is believed, and a ``database.h5`` without one is not compared; `starcat.verify`
+            is trusted, and a ``database.h5`` without one is not compared; `starcat.verify`
             checks everything. With False only types, lengths, ranges and references are checked.
             An onboard image has checksums of its own, which are always checked.
 
@@ -155,7 +155,7 @@ class Matcher(Settings, _WithDatabase):
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable))
-            if verify:  # last, as what is missing or of another version has an error of its own
+            if verify:  # last: a missing product or another version has its own error
                 check_digest(path)
         return cls(
             database,
@@ -189,9 +189,9 @@ class Matcher(Settings, _WithDatabase):
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels, in any order. Those that are not finite (or masked), outside of the frame or
-            repeat another get no star and are reported. Of more than 512 the brightest are
-            searched, and `MatchResult.n_not_searched` counts the others. A frame of
+            Pixels, in any order. Centroids that are not finite (or masked), outside of the frame
+            or repeated get no star and are reported. If there are more than 512, the brightest
+            are searched, and `MatchResult.n_not_searched` counts the others. A frame of
             `starcat.simulate`, `starcat.read_frames` or a result is read with its ``mag`` and
             ``sigma_px``. A table (astropy, pandas, polars, Arrow, structured array, mapping) is
             read by name: ``x_px``, ``y_px``, and ``mag`` and ``sigma_px`` if it has them.
@@ -199,15 +199,15 @@ class Matcher(Settings, _WithDatabase):
         camera : Camera, optional
             The database's own by default.
         mag : array_like of float64, shape (N,), optional
-            They decide what is tried first; with ``noise_mag`` also what is accepted, and their
-            zero point has to be that of the database. NaN, a masked entry, and any number outside
-            of -100 to 100 are unknown magnitudes.
+            Magnitudes. They decide what is tried first; with ``noise_mag`` also what is accepted,
+            and then they must have the zero point of the database. NaN, a masked entry, and any
+            number outside of -100 to 100 are unknown magnitudes.
         sigma_px : array_like of float64, shape (N,), optional
-            Standard deviation of each centroid on each axis, NaN where it is not known: weights of
-            the attitude of an answer, of which its covariance is made. Stars do not depend on them.
+            Standard deviation of each centroid on each axis, NaN if unknown. They weight the
+            attitude of an answer and give its covariance. Stars do not depend on them.
         fov_error : float
-            Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
-            length is found with the attitude, which the method ``triangle`` can.
+            Largest relative error of the camera's focal length, 0 to 0.5. If it is above 0, the
+            focal length is found with the attitude; this needs the method ``triangle``.
         prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
             Attitude that is expected, as ``q_body_from_icrs`` or as a scipy ``Rotation`` like
             `MatchResult.rotation` returns, and its largest error as an angle of rotation, at most
@@ -215,11 +215,11 @@ class Matcher(Settings, _WithDatabase):
             ``SkyCoord`` is the expected boresight alone: the whole sky is searched, and an
             attitude whose boresight is farther from it than the error is withheld.
         fov_deg : float or pair of float, optional
-            Field across the width in place of the camera's, of a lens without distortion; or the
-            narrowest and the widest possible, where no more is known, with the product ``levels``.
+            Field across the width in place of the camera's, for a lens without distortion. If only
+            a range is known: the narrowest and widest field; this needs the product ``levels``.
         explain : bool, default False
             Whether a frame that is not identified is tried mirrored, and in fields of half to
-            twice the stated one, for 2 seconds at most. What explains it is in
+            twice the stated one, for 2 seconds at most. An explanation that is found is in
             ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``.
 
         Returns
@@ -230,7 +230,7 @@ class Matcher(Settings, _WithDatabase):
         Raises
         ------
         ConfigError
-            If an array is of another shape, the prior no quaternion, an error missing or too large.
+            If a shape is wrong, the prior not a quaternion, or an error missing or too large.
         """
         # The first test is the faster one, and nearly all calls have an array.
         if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
@@ -370,13 +370,13 @@ class Matcher(Settings, _WithDatabase):
 
     @property
     def _c_engine(self) -> CEngine | None:
-        """The C library with this matcher's image, where it serves."""
+        """The C library with this matcher's image; None if it cannot be used."""
         if self.engine == "numpy" or not has_default_search(self):
             return None
         return c_engine(self.database, self.method, self.engine == "c")
 
     def _without_c(self) -> str:
-        """Return why the C library does not serve this matcher."""
+        """Return why the C library cannot be used with this matcher."""
         if not is_compiled():
             return (
                 "this starcat was installed without a C compiler; install one, then starcat again"
@@ -389,14 +389,14 @@ class Matcher(Settings, _WithDatabase):
 
     @cached_property
     def _searches(self) -> dict[tuple[Camera | int, float], Search]:
-        """Those asked for last, by the camera and its error, and by the identity of the camera.
+        """The latest searches, by camera and its error, and by the identity of the camera.
 
-        Each holds its own camera, so that no other one has its identity. Equal ones share it.
+        Each search holds its camera, so that the identity stays unique. Equal cameras share one.
         """
         return {}
 
     def _in_c(self, camera: Camera, fov_error: float = 0.0) -> Search | None:
-        """Return what asks the C library about frames of a camera, where it serves."""
+        """Return the search of the C library for a camera; None if it cannot be used."""
         found = self._searches.get((id(camera), fov_error))
         if found is None:
             found = self._searches.get((camera, fov_error))
@@ -411,13 +411,13 @@ class Matcher(Settings, _WithDatabase):
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what goes to another process: all but addresses."""
+        """Return the state for another process, without addresses."""
         return {name: value for name, value in vars(self).items() if name != "_searches"}
 
     def _timed(
         self, frame: Frame, search: Callable[[Settings, Database, Frame], MatchResult]
     ) -> MatchResult:
-        """Identify a frame with numpy, and say how long that took and what was asked."""
+        """Identify a frame with numpy; add the time, and what the caller gave, to the answer."""
         before_s = time.perf_counter()
         found = search(self._settings, self.database, frame)
         return replace(
@@ -429,7 +429,7 @@ class Matcher(Settings, _WithDatabase):
         )
 
     def _checked_fov_error(self, fov_error: float) -> float:
-        if type(fov_error) is float and fov_error == 0.0:  # in nearly all calls, so at once
+        if type(fov_error) is float and fov_error == 0.0:  # nearly all calls end here
             return fov_error
         fov_error = in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
         if not fov_error:

@@ -20,10 +20,10 @@ from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
 STEPS_BEFORE_VOTES = 2000
-"""Steps of comparing patterns before votes are counted."""
+"""Number of steps that compare patterns before votes are counted."""
 
 STEPS_AFTER_VOTES = 5000
-"""Steps of comparing patterns after that, in a frame whose centroids all have a vote."""
+"""Number of steps that compare patterns after the votes, if all centroids of a frame can vote."""
 
 
 def solve(
@@ -71,12 +71,12 @@ def _search(
 
 
 def search_sky(observation: Observation, database: Database, best: BestOf) -> None:
-    """Search without a prior attitude: from what is cheap to what is thorough.
+    """Search without a prior attitude, with cheap methods first and thorough ones later.
 
     The patterns of the method come first. If the first ones do not solve the frame, votes follow
     (`starcat.matcher.methods.votes`), and in a frame of more centroids than have a vote the other
-    patterns. The bound on false matches is that of the best agreement: it holds for all attitudes
-    together, however many are tried.
+    patterns. The bound on false matches is the bound of the best agreement: it holds for all
+    attitudes together, and does not depend on how many are tried.
     """
     patterns = proposals(observation, database)
     if not votes.can_vote(observation, database):
@@ -103,7 +103,7 @@ def _try(
     best: BestOf,
     steps: float = math.inf,
 ) -> bool:
-    """Try candidates until one is certain, or so many steps are taken; return whether one is."""
+    """Try candidates until one is certain or ``steps`` are taken; return whether one is certain."""
     most = observation.budget.steps + steps
     for candidates in proposed:
         verify_candidates(candidates, observation, database, best)
@@ -119,7 +119,7 @@ def result_of_search(
     limit: Limit | None = None,
     prior: Prior | None = None,
 ) -> MatchResult:
-    """Return the answer that the best agreement of a search stands for, or why it is none."""
+    """Return the answer from the best agreement of a search, or the reason why it is withheld."""
     count = len(observation) + len(observation.dropped)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
     most = observation.settings.max_false_match_probability

@@ -1,4 +1,4 @@
-"""One frame as it was given, as the methods see it, and the candidates that they make of it."""
+"""A frame as it was given and as the methods see it, and the candidates that they propose."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class HasCentroids(Protocol):
 
 
 FrameLike = ArrayLike | HasCentroids | Mapping[str, ArrayLike]
-"""What a caller can give for the centroids of a frame: numbers, a frame, or a table by column."""
+"""Types that a caller can give for the centroids of a frame: numbers, a frame, or a table."""
 
 
 @dataclass(eq=False)  # a frozen one would take three times as long to make
 class Frame:
-    """The centroids of a frame as they were given, and the camera that they were given with."""
+    """The centroids of a frame and the camera, as the caller gave them."""
 
     centroids_px: Pixels
     mag: Array | None  # NaN for a centroid without one
     camera: Camera
-    # Standard deviation of each centroid on each axis; NaN or infinite where it is not known.
+    # Standard deviation of each centroid on each axis; NaN or infinite if not known.
     sigma_px: Array | None = None
 
     def __len__(self) -> int:
@@ -62,7 +62,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Frames(Sequence[Frame]):
-    """Frames of one camera, one after the other."""
+    """A sequence of frames of one camera."""
 
     # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``.
     starts: NDArray[np.int64]
@@ -94,7 +94,7 @@ def as_frame(
     mag: ArrayLike | None = None,
     sigma_px: ArrayLike | None = None,
 ) -> Frame:
-    """Return a copy of what a caller gives as a frame; errors as those of `as_arrays`."""
+    """Return a copy of the arrays of a caller as a frame; raise errors as `as_arrays` does."""
     px, *each = as_arrays(centroids_px, mag, sigma_px)
     known, sigma = (None if one is None else one.copy() for one in each)
     return Frame(px.copy(), known, camera, sigma)
@@ -178,7 +178,7 @@ def _checked_sigma(sigma_px: Array) -> Array:
     if len(wrong):
         raise ConfigError(
             f"sigma_px of centroid {wrong[0]} is {sigma_px[wrong[0]]:g}; expected above 0, or NaN "
-            "where it is not known",
+            "if it is not known",
             key="sigma_px",
             value=sigma_px,
         )
@@ -191,7 +191,7 @@ def as_frames(
     mag: Iterable[ArrayLike] | None = None,
     sigma_px: Iterable[ArrayLike] | None = None,
 ) -> Frames:
-    """Return copies of what a caller gives as frames; errors as those of `as_arrays`."""
+    """Return copies of the arrays of a caller as frames; raise errors as `as_arrays` does."""
     pixels = _sequence("frames", centroids_px)
     beside = {
         name: None if given is None else _sequence(name, given)
@@ -202,7 +202,7 @@ def as_frames(
             text = f"{name} of {len(given)} frames; expected {len(pixels)}"
             raise ConfigError(text, key=name, value=given)
     joined = _joined(pixels, *beside.values())
-    if joined is None:  # one after the other, which finds what is wrong, or not an array
+    if joined is None:  # check each frame on its own, to find which one is wrong
         none = [None] * len(pixels)
         columns = [none if given is None else given for given in beside.values()]
         each = [as_arrays(*row) for row in zip(pixels, *columns, strict=True)]
@@ -216,7 +216,7 @@ def as_frames(
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
-    """Return an argument that has to have an entry for each frame; an iterator is run through."""
+    """Return an argument that needs one entry per frame; an iterator becomes a list."""
     if not isinstance(values, str | bytes) and columns_of(values) is None:
         with suppress(TypeError):
             return values if hasattr(values, "__len__") else list(values)
@@ -237,8 +237,8 @@ def _joined(
 ) -> tuple[list[int], Pixels, Array | None, Array | None] | None:
     """Return the sizes of frames and their arrays joined in one go.
 
-    None if they do not fit, or are not all plain arrays of numbers: what a list, a table, a masked
-    array or a quantity holds is found by `as_arrays`.
+    None if they do not fit, or are not all plain arrays of numbers: `as_arrays` reads lists,
+    tables, masked arrays and quantities.
     """
     arrays: list[Array | None] = []
     for given in (centroids_px, *beside):
@@ -274,20 +274,20 @@ def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigE
 class Observation:
     """The usable centroids of a frame.
 
-    They are in order of brightness where magnitudes are known, else the nearest to the centre
+    They are in order of brightness if magnitudes are known, else the nearest to the centre is
     first, so that nothing depends on the order in which they were given.
     """
 
     rows: Rows  # row of each centroid in the frame as it was given
     centroids_px: Pixels
     body: Directions  # directions in the camera frame
-    mag: Array | None  # NaN for a centroid without one; None where none is known
+    mag: Array | None  # NaN for a centroid without one; None if no magnitude is known
     camera: Camera
     settings: Settings
     dropped: Dropped = ()
-    fov_error: float = 0.0  # largest relative error of the focal length, 0 where it is known
+    fov_error: float = 0.0  # largest relative error of the focal length, 0 if known
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
-    sigma_px: Array | None = None  # noise of each centroid; None where it is not known
+    sigma_px: Array | None = None  # noise of each centroid; None if not known
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -325,16 +325,16 @@ class Observation:
         return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
 
     def compatible(self, star_mag: Array, rows: Rows | slice = slice(None)) -> Mask | None:
-        """Return which centroids may be which stars by their magnitudes; None if all may be.
+        """Return which centroids can be which stars by their magnitudes; None if all can be.
 
-        ``rows`` are the centroids that are asked about: all unless given.
+        ``rows`` are the rows of the centroids, by default all.
         """
         if self.mag is None or self.settings.noise_mag is None:
             return None
         return compatible_pairs(self.mag[rows], star_mag, self.settings.noise_mag)
 
     def in_frame(self, star_index: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the stars of usable centroids as those of the frame, -1 for all others."""
+        """Return the stars of usable centroids in the order of the frame, -1 elsewhere."""
         index = np.full(len(self) + len(self.dropped), -1, dtype=np.int32)
         index[self.rows] = star_index
         return index
@@ -402,7 +402,7 @@ def _own_order(centroids_px: Pixels, mag: Array | None, camera: Camera) -> Rows:
 
 
 def without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
-    """Return rows without those at exactly the place of an earlier one, and the latter."""
+    """Return rows without repeats of exactly the same place, and the repeats."""
     x = np.sort(given[rows, 0])
     if not (x[1:] == x[:-1]).any():
         return rows, []
@@ -426,7 +426,7 @@ def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Correspondences of m >= 2 centroids and stars, one a row, the most promising first."""
+    """Correspondences of m >= 2 centroids and stars, one per row, the most promising first."""
 
     centroids: NDArray[np.integer[Any]]  # rows of the observation, shape (K, m)
     stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order

@@ -1,7 +1,7 @@
-"""Why a frame was not identified: it is tried mirrored, and in fields of half to twice the stated.
+"""Why a frame was not identified: try it mirrored, and in fields of half to twice the stated one.
 
-Nothing found here is an answer. It says what is wrong with the statement about the camera, and it
-has to pass the bound on false matches like an answer, with all searches of the frame counted.
+A finding is not an answer. It shows what is wrong in the stated camera, and it must pass the bound
+on false matches like an answer, with all searches of the frame counted.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from starcat.matcher.refusal import Known, Reason, Refusal
 from starcat.matcher.result import MatchResult
 
 FOV_ERROR = 0.05
-"""Error of the focal length that is allowed where none is stated. Data sheets are off by so much:
-an IMX219 with 48.8 deg on paper has 50.5."""
+"""Error of the focal length that is allowed if none is stated. Data sheets can be this wrong: an
+IMX219 with 48.8 deg on paper has 50.5."""
 
 WIDE_FOV_ERROR = 0.15
 """Error of the focal length that is tried first, with the distortion of the stated camera."""
 
 FACTOR = 2.0
-"""Fields from the stated one over this factor to that times it are tried."""
+"""Fields from the stated field divided by this to the stated field times this are tried."""
 
 WIDEST_DEG = 120.0
 """Widest field that is tried; a spec takes no wider one."""
@@ -40,16 +40,16 @@ PARTS = 2
 the smaller the part, the fewer triangles are similar by chance."""
 
 TIME_S = 2.0
-"""Seconds of the processor that all this takes at most, however busy the machine is. No search
-begins that would exceed them if it took as long as the longest before."""
+"""Largest processor time of all these attempts, seconds. No search begins that would exceed it if
+it took as long as the longest search before."""
 
 SEARCHES = 2
-"""Searches for the answer, where the caller does not count them: as stated, and with an error."""
+"""Number of searches before, if the caller does not count them: as stated, and with an error."""
 
 
 Search = Callable[[MeasuredFrame, float, Camera | None, float], MatchResult]
-"""The answer to a frame with an error of its focal length, with another camera than that of the
-caller unless it is None, and within a time in seconds."""
+"""The answer to a frame: arguments are the frame, the error of its focal length, a camera (None for
+the caller's camera) and a time limit in seconds."""
 
 
 def parts_of_fields(camera: Camera) -> list[tuple[Camera, float]]:
@@ -84,12 +84,12 @@ def explained(
     limit: float,
     searches: int = SEARCHES,
 ) -> MatchResult:
-    """Return a refused answer with what a second look has found.
+    """Return a refused answer with the findings of a second look.
 
     The frame is tried mirrored and, ``with_fields``, in other fields of view, the nearest first,
     for `TIME_S` in all. The probability that chance agrees in any of K searches is at most the sum
-    of those in each. ``searches`` are those of the frame so far; a finding whose probability times
-    all of them, these included, is above the ``limit`` is not told.
+    of their K probabilities. ``searches`` is the number of searches of the frame so far; a finding
+    is left out if its probability times the number of all searches is above the ``limit``.
     """
     refusal = refused.refusal
     if refusal is None:
@@ -118,7 +118,7 @@ def explained(
 
 
 class _Time:
-    """What is left of the time of a second look."""
+    """The time that is left for a second look."""
 
     def __init__(self) -> None:
         self._end_s, self._longest_s = time.thread_time() + TIME_S, 0.0

@@ -1,12 +1,12 @@
-"""Poses: an attitude and the camera that it is tried with, their fit, and how far that reaches.
+"""Poses: an attitude and the camera that it is tried with, their fit, and how far the fit holds.
 
-Where the focal length is known, the camera is the caller's and only the attitude is fitted. Where
-it is known to some per cent, it is fitted with the attitude.
+If the focal length is known, the camera is the caller's and only the attitude is fitted. If it is
+known to some per cent, it is fitted with the attitude.
 
 Ten stars within 100 px hardly determine how the camera is turned about their middle. An attitude
-that only they agree with is not due to chance, and yet it may be wrong at the edge of the frame.
-So the accuracy that the matched stars give is compared with the one that all stars of the frame
-would give.
+that only they agree with is not due to chance, and yet it can be wrong at the edge of the frame.
+So the accuracy that the matched stars give is compared with the accuracy that all stars of the
+frame would give.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Candidates, Observation
 
 _SCALINGS = 2
-"""Rounds that find the scale of a few stars; a second one, because angles are no tangents."""
+"""Rounds that find the scale of a few stars. The second corrects for angles taken as tangents."""
 
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""
 
 SHAPE_CHANCE = 3e-3
-"""Probability that noise looks as much like another shape of the frame, below which it is one."""
+"""A frame has another shape if noise gives as large a difference less often than this."""
 
 SHAPE_TOLERANCES = 2.0
-"""How far another shape moves the corners at least, in tolerances."""
+"""Smallest shift of the corners by another shape, in tolerances."""
 
 MIN_BREADTH = 1e-4
-"""Least breadth of matched stars that tell the shape of a frame: the determinant of their second
-moments over the square of its trace."""
+"""Least breadth of matched stars from which the shape of a frame is measured: the determinant of
+their second moments over the square of its trace."""
 
 SURE_CORNER = 0.5
-"""Largest error of a corner, in tolerances, that stars may leave which determine their frame where
-the focal length is taken as known; where it is fitted, twice as much, as its error is in that."""
+"""Stars determine their frame if the error of its corners is at most this, in tolerances, with a
+known focal length; twice this with a fitted one, as the error then includes the focal length's."""
 
 MIN_WEIGHT = 1e-8
-"""Least weight of a centroid over the largest of its frame; rounding leaves no room for less."""
+"""Least weight of a centroid over the largest of its frame; rounding errors exclude lower ones."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +161,11 @@ def focal_length_error_px(
 
 
 def student_widening(free: int) -> float:
-    """Return by how much to widen a standard error of residuals of which so many are free.
+    """Return the factor that widens a standard error from residuals with ``free`` degrees.
 
-    Three of it then have the coverage of three standard deviations: it is the quantile of Student's
-    t over that of the normal distribution (Abramowitz and Stegun 1964, 26.7.5, at z = 3), within
-    1.5 % from 5 on. ``onboard/src/answer.c`` has the same.
+    Three widened errors have the coverage of three standard deviations. The factor is the quantile
+    of Student's t over the normal quantile (Abramowitz and Stegun 1964, 26.7.5, at z = 3), within
+    1.5 % from 5 degrees on. ``onboard/src/answer.c`` has the same function.
     """
     return 1.0 + (2.5 + (5.75 + 10.0625 / free) / free) / free
 
@@ -197,10 +197,10 @@ def explained_fraction(
 def determines_frame(
     matched: Directions, residual_rad: float, pose: Pose, observation: Observation, factor: float
 ) -> bool:
-    """Return whether stars alone put every corner of a frame where it is.
+    """Return whether the stars alone determine the place of every corner of a frame.
 
-    That is so if its error is a small part of the tolerance even where the focal length is not
-    trusted but fitted; ``factor`` is the reach over the final one.
+    They do if the error of every corner is a small part of the tolerance, even with a fitted focal
+    length instead of the known one; ``factor`` is the reach over the final reach.
     """
     try:
         covariance: Array = np.linalg.inv(information(matched, with_scale=True)).astype(np.float64)
@@ -257,21 +257,21 @@ def is_deformed(
     """Return whether a frame differs in scale, or in shape, from the stars that it matches.
 
     A frame of another scale means that the camera's focal length is wrong; one of another shape,
-    that its pixels are not square, or that its axes are not at right angles. The attitude may be
+    that its pixels are not square, or that its axes are not at right angles. The attitude can be
     right, but towards the edge of the frame stars are taken for their neighbours.
 
     Parameters
     ----------
     predicted_px, centroids_px : arrays of shape (N, 2), N >= 4
-        Where the attitude puts the matched stars, and where they are; pixels.
+        Places where the attitude puts the matched stars, and their centroids; pixels.
     camera : Camera
         Gives the distance from the middle of the frame to its corners.
     tolerance_px : float
-        A difference that moves the corners less than this is none.
+        A difference that moves the corners less than this is ignored.
     is_partial : bool
-        Whether the stars explain a part of the frame only. Then the shape is tested, too: lenses
-        that nobody has calibrated differ from square pixels a little, and where stars everywhere
-        in the frame match, that does no harm.
+        Whether the stars explain only a part of the frame. Then the shape is tested, too. If they
+        match everywhere in the frame, it is not, because an uncalibrated lens differs a little
+        from square pixels, which does no harm.
     """
     inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
     offset = centroids_px - predicted_px
@@ -293,7 +293,7 @@ def is_deformed(
     c, d = (yy * x_dy - xy * y_dy) / determinant, (xx * y_dy - xy * x_dy) / determinant
     if 0.5 * math.hypot(a - d, b + c) * corner_px <= SHAPE_TOLERANCES * tolerance_px:
         return False
-    # Of a turn and a scale, and of any linear map: what they leave of the offsets. Of noise, the
+    # The offsets that remain after a turn and a scale, and after any linear map. For noise, their
     # ratio is below r with the probability r**(N - 3) (Fisher's F with 2 and 2N - 6 degrees).
     of_similar = left - ((x_dx + y_dy) ** 2 + (x_dy - y_dx) ** 2) / extent
     of_linear = left - (a * x_dx + b * y_dx + c * x_dy + d * y_dy)

@@ -1,8 +1,8 @@
-"""A prior attitude: what is known of an attitude before the frame is looked at.
+"""A prior attitude: the attitude that is expected before the frame is looked at.
 
-Only the stars near the prediction are compared with the frame: a centroid, the anchor, may be any
-star near where it is predicted, and with another centroid each of them makes a candidate. The
-verification of what that proposes is that of any other method.
+Only the stars near the prediction are compared with the frame. A centroid, the anchor, can be any
+star near its predicted place; each of these stars, with another centroid, makes a candidate. The
+candidates are verified as those of any other method are.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ CLOSE = 8.0
 units of the largest error of a centroid."""
 
 MAX_ANCHORS = 8
-"""Centroids that are compared with the stars near where they are predicted."""
+"""Number of centroids that are compared with the stars near their predicted places."""
 
 MAX_STARS = 1500
-"""Stars around a prior attitude; where there are more, looking up patterns is quicker."""
+"""Stars around a prior attitude; with more of them, looking up patterns is quicker."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Prior:
     error_rad: float
 
     def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
-        """Return an answer if its attitude is as near as the error says."""
+        """Return an answer if its attitude is within the error of the prior."""
         if not answer.ok:
             return answer
         q_found = answer.q_body_from_icrs.tolist()
@@ -70,7 +70,7 @@ class BoresightPrior:
     error_rad: float
 
     def checked(self, answer: MatchResult) -> MatchResult:
-        """Return an answer if its boresight is as near as the error says."""
+        """Return an answer if its boresight is within the error of the prior."""
         if not answer.ok or separation(answer.matrix[2], self.direction) <= self.error_rad:
             return answer
         return _withheld(answer)
@@ -101,11 +101,11 @@ class HasIcrs(Protocol):
 
 
 PriorLike = ArrayLike | HasQuaternion | HasIcrs
-"""What a caller can give as a prior: an attitude, or the direction of the boresight."""
+"""Types that a caller can give as a prior: an attitude, or the direction of the boresight."""
 
 
 def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | BoresightPrior | None:
-    """Return a prior from what a caller states."""
+    """Return a prior from the caller's arguments."""
     if prior is None and error_deg is None:
         return None
     if prior is None or error_deg is None:
@@ -127,7 +127,7 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
         raise ConfigError(text, key="prior", value=prior)
     error_deg = in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
-    # Its length carries no meaning, and that of four times 1e308 would overflow.
+    # The length carries no meaning, and the length of four times 1e308 would overflow.
     scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
     length = math.hypot(*scaled)
     return Prior(np.array([part / length for part in scaled]), math.radians(error_deg))
@@ -192,13 +192,13 @@ def anchored_pairs(
     near: Rows,
     reach_rad: float,
 ) -> Iterator[Candidates]:
-    """Propose what two centroids are, as the C library does, a batch for each two.
+    """Propose the stars of two centroids, as the C library does, one batch for each two centroids.
 
-    The anchor may be any star up to ``reach_rad`` from its predicted direction, the nearest first.
-    The other centroid is the star nearest to where it then has to be, of those up to as far from
-    its own predicted direction and as far from the anchor's star as the two centroids are. It is
-    the centroid farthest from the anchor, which determines the attitude best; as that may be a
-    false spot, the next one in order serves too.
+    The anchor can be any star up to ``reach_rad`` from its predicted direction, the nearest first.
+    The star of the other centroid is the one nearest to the place that the anchor then implies,
+    among stars within ``reach_rad`` of its prediction and at the observed distance from the star
+    of the anchor. The other centroid is the one farthest from the anchor, which determines the
+    attitude best; as that can be a false spot, the next centroid in order is used too.
     """
     stars, count = database.directions[near], len(observation)
     cosine = predicted @ stars.T
@@ -234,5 +234,5 @@ def anchored_pairs(
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:
-    """Return the angle that the errors of centroids may turn a frame by."""
+    """Return the largest angle by which the errors of centroids turn a frame."""
     return 2.0 * tolerance_px / min(camera.width_px, camera.height_px)

@@ -1,4 +1,4 @@
-"""Why a frame was not identified, and what to try: only what would be new to the caller."""
+"""Why a frame was not identified, and what to try that the caller has not tried yet."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Reason = Literal[
 ]  # fmt: skip
 
 Known = Literal["magnitudes", "noise_mag", "noise_px", "dropped", "explained"]
-"""What a hint need not say, or can refer to: the caller has stated it, or it was tried."""
+"""Facts that decide which advice a hint gives: inputs that the caller gave, attempts made."""
 
 MESSAGES: dict[Reason, str] = {
     "too_few_stars": f"fewer than {MIN_STARS} centroids of the frame are usable",
-    "no_candidate": "no pattern of the frame is one of the database",
-    "prior": "no attitude as near to the prior as its error says explains the frame",
+    "no_candidate": "no pattern of the frame is in the database",
+    "prior": "no attitude within the stated error of the prior explains the frame",
     "chance": "no attitude fits better than chance",
     "share_of_frame": "the best agreement explains too little of the frame",
     "scale": "the frame has another scale or shape than the camera",
@@ -34,7 +34,7 @@ MESSAGES: dict[Reason, str] = {
 
 @dataclass(frozen=True)
 class Clause:
-    """One thing to try, and when it is of use."""
+    """One piece of advice, and its conditions."""
 
     text: str
     unless: Known | None = None
@@ -44,7 +44,7 @@ class Clause:
 def known_of(
     has_magnitudes: bool, noise_px: float | None, noise_mag: float | None, has_dropped: bool
 ) -> frozenset[Known]:
-    """Return what the caller of a search has given."""
+    """Return the inputs that the caller of a search has given."""
     stated: dict[Known, bool] = {
         "magnitudes": has_magnitudes,
         "noise_px": noise_px is not None,
@@ -55,7 +55,7 @@ def known_of(
 
 
 _MAGNITUDES = Clause("give magnitudes", unless="magnitudes")
-_FALSE_STARS = Clause("leave out centroids that are no stars")
+_FALSE_STARS = Clause("leave out centroids that are not stars")
 _EXPLAIN = Clause(
     "have other fields and the mirrored frame tried: explain=True", unless="explained"
 )
@@ -63,7 +63,7 @@ _EXPLAIN = Clause(
 CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     "too_few_stars": (
         Clause("find more stars, with a longer exposure or a lower threshold"),
-        Clause("look at 'dropped' for those that were not used", only_if="dropped"),
+        Clause("see 'dropped' for the centroids that were not used", only_if="dropped"),
     ),
     "no_candidate": (
         Clause("allow a wider tolerance of centroids (tolerance_px)"),
@@ -103,7 +103,7 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
     "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
 }
-"""What to try, by reason. Parameters of Python and of the service stand in brackets."""
+"""Advice by reason. Parameters of Python and of the service stand in brackets."""
 
 
 def _joined(clauses: list[str]) -> str:
@@ -114,7 +114,7 @@ def _joined(clauses: list[str]) -> str:
 HINTS: dict[Reason, str] = {
     reason: _joined([clause.text for clause in clauses]) for reason, clauses in CLAUSES.items()
 }
-"""All that there is to try, by reason."""
+"""All advice of a hint, by reason."""
 
 _NAME = r"[a-z_]+(?:=[\d.]+)?"
 _BRACKETS = re.compile(rf"\(({_NAME}(?:, {_NAME})*)\)")
@@ -145,13 +145,13 @@ class Refusal:
         ``mirrored`` (it would be found upside down), or ``time`` and ``steps`` (the limit that
         ended the search).
     n_matched : int
-        Centroids with a star in the best agreement; 0 where there was none.
+        Centroids with a star in the best agreement; 0 without an agreement.
     false_match_probability : float
-        Bound on the probability that chance agrees as well as it; 1 where there was none.
+        Bound on the probability that chance agrees as well; 1 without an agreement.
     share : float
-        Share of the frame that it explains, by weight; 0 where there was none.
+        Share of the frame that the best agreement explains, by weight; 0 without an agreement.
     n_centroids : int
-        Usable centroids of the frame; 0 where that is not known.
+        Usable centroids of the frame; 0 if not known.
     camera : Camera or None
         The camera that explains the frame in another field of view or mirrored, if one does.
     focal_error : float or None
@@ -160,13 +160,13 @@ class Refusal:
         Whether the caller stated that the frame is turned over (``flip``); None without a
         statement. It changes the words about a mirrored frame.
     stated_fov_deg : float or None
-        Field across the width that was stated, where ``focal_error`` is known.
+        Field across the width that was stated, if ``focal_error`` is known.
     is_of_database : bool
         Whether that is the field of the database's own camera.
     tried_fov_deg : (float, float) or None
         Narrowest and widest field that was searched, if other fields were.
     known : frozenset of str
-        What the caller has given, and what was tried: advice of which the hint has none.
+        Inputs that the caller gave, and attempts that were made: the hint does not advise them.
     """
 
     reason: Reason
@@ -191,7 +191,7 @@ class Refusal:
 
     @property
     def message(self) -> str:
-        """The reason as a sentence begins, with the numbers of the best agreement."""
+        """The reason as the start of a sentence, with the numbers of the best agreement."""
         text = MESSAGES[self.reason]
         if self.reason == "mirrored" and self.flip:
             text = "the frame matches only mirrored: it was turned over, and was upright before"

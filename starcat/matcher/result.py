@@ -46,8 +46,8 @@ Origin = Literal["lost_in_space", "tracking"]
 
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
-"""Bytes of ``starcat_answer`` (``many.h``) where its arrays begin, and where those of the star
-numbers and star rows of the centroids follow."""
+"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
+star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class MatchResult:
     status : {"identified", "no_match", "too_few_stars"}
         Only ``identified`` comes with stars and an attitude.
     star_index : ndarray of int32, shape (N,)
-        Row of the database, -1 where none.
+        Row of the database for each centroid, -1 without a star.
     matrix : ndarray of float64, shape (3, 3)
         Attitude, body from ICRS: ``v_body = matrix @ v_icrs``, with x right, y down and z along
         the boresight. NaN unless identified.
@@ -71,16 +71,16 @@ class MatchResult:
         Row and reason of every centroid that was not used: ``not_finite``, ``out_of_frame``
         or ``duplicate``.
     camera : Camera or None
-        The camera that the answer holds for: the one that was given, with the focal length that
-        was found where it was looked for. None unless identified.
+        The camera that the answer holds for: the camera that was given, with the fitted focal
+        length if it was fitted. None unless identified.
     focal_length_error_px : float or None
-        Standard error of that focal length; None where it was not looked for.
+        Standard error of a fitted focal length; None if it was not fitted.
     origin : {"lost_in_space", "tracking"}
-        Whether the whole sky was searched, or what is near a prior attitude.
+        Whether the whole sky was searched, or the surroundings of a prior attitude.
     refusal : Refusal or None
         Why there is no answer; None for an answer.
     time_s : float
-        Time that the answer took; NaN where nobody measured. It is no part of the answer.
+        Time that the answer took; NaN if not measured. Answers are compared without it.
     n_not_searched : int
         Usable centroids that the search left out, because the frame has more than the 512
         brightest; their stars are not known. 0 in nearly all frames.
@@ -101,13 +101,13 @@ class MatchResult:
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     n_not_searched: int = 0
-    # The frame as it was given, the stars, and the noise of a centroid where it was stated: what
-    # the properties are made of when they are asked for.
+    # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
+    # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
-    # What the C library has written: the derived properties, which are views of it.
+    # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
 
     @classmethod
@@ -130,7 +130,7 @@ class MatchResult:
 
     @property
     def fits_fov_deg(self) -> float | None:
-        """Field across the width that explains a frame which the stated field does not, degrees.
+        """Another field across the width that explains the frame if the stated one does not, deg.
 
         None if the frame was identified, if no other field was searched (``explain``), or if none
         explains it.
@@ -144,7 +144,7 @@ class MatchResult:
 
     @cached_property
     def star_ids(self) -> NDArray[np.int64]:
-        """Permanent star number of each centroid, shape (N,), -1 where none."""
+        """Permanent star number of each centroid, shape (N,), -1 without a star."""
         if self._record is not None:
             return np.ndarray(len(self.star_index), np.int64, self._record, IDS_AT)
         if self.database is None or not self.ok:
@@ -198,10 +198,10 @@ class MatchResult:
     def covariance_arcsec2(self) -> NDArray[np.float64]:
         """Covariance of the attitude, shape (3, 3); NaN unless identified.
 
-        Of the small rotations about the axes of the camera frame (x right, y down, z along the
-        boresight), square arcseconds. With the stated noise of a centroid where there is one, else
-        with that of the residuals, widened so that three standard errors have the coverage of three
-        standard deviations (Student's t). The camera is taken as exact.
+        It is for small rotations about the axes of the camera frame (x right, y down, z along the
+        boresight), in square arcseconds. It uses the noise of a centroid if that is stated, else
+        the noise of the residuals, widened so that three standard errors have the coverage of
+        three standard deviations (Student's t). The camera is taken as exact.
         """
         if self._record is not None:
             return np.ndarray((3, 3), np.float64, self._record, COVARIANCE_AT)
@@ -212,10 +212,10 @@ class MatchResult:
 
     @cached_property
     def reduced_chi_square(self) -> float:
-        """Squared residuals in the stated noise, a degree of freedom; NaN if none is stated.
+        """Squared residuals over the stated noise, per degree of freedom; NaN without a noise.
 
-        It is 1 on average where ``noise_px`` or ``sigma_px`` is right, the square of how many
-        times too small where it is not. Errors of the camera raise it too.
+        It is 1 on average if ``noise_px`` or ``sigma_px`` is right, and k^2 if the stated noise is
+        k times too small. Errors of the camera raise it too.
         """
         return reduced_chi_square(self.stars, self._free)
 
@@ -229,7 +229,7 @@ class MatchResult:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of the answer should know beside it, in sentences."""
+        """Remarks on the answer, in sentences."""
         told, count = [], len(self.star_index)
         if self.n_not_searched:
             searched = count - len(self.dropped) - self.n_not_searched
@@ -282,7 +282,7 @@ class MatchResult:
         )
 
     def rotation(self) -> Rotation:
-        """Return the attitude as scipy has it: ``rotation().apply(v_icrs)`` is ``v_body``.
+        """Return the attitude as a scipy rotation: ``rotation().apply(v_icrs)`` is ``v_body``.
 
         Returns
         -------
@@ -312,8 +312,8 @@ class MatchResult:
         Returns
         -------
         dict
-            Numbers, texts, lists, dicts and None only, so that ``json.dumps`` writes it: what is
-            NaN is None. ``stars`` has one entry per centroid, in the order of the frame.
+            Only numbers, texts, lists, dicts and None, so that ``json.dumps`` writes it: None
+            stands for NaN. ``stars`` has one entry per centroid, in the order of the frame.
 
         Raises
         ------
@@ -385,7 +385,7 @@ class MatchResult:
 
     @property
     def skycoord(self) -> SkyCoord:
-        """The boresight, as astropy has it: a ``SkyCoord`` in ICRS.
+        """The boresight as a ``SkyCoord`` of astropy in ICRS.
 
         `NotIdentifiedError` unless identified, `ConfigError` where astropy is not installed.
         """
@@ -430,7 +430,7 @@ class MatchResult:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what goes to another process: the stars, not the database they are of."""
+        """Return the state for another process: the stars without their database."""
         content = {**vars(self), "frame": None, "database": None, "_record": None}
         content["q_body_from_icrs"] = self.q_body_from_icrs
         if self.database is not None:
@@ -483,7 +483,7 @@ class MatchResult:
 
 
 def _facts(result: MatchResult) -> dict[str, Any]:
-    """Return what an answer says of the whole frame, as JSON has it."""
+    """Return the values of an answer for the whole frame, as in its JSON."""
     found: dict[str, Any] = {"status": result.status, "origin": result.origin}
     found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
     if result.ok:
@@ -572,7 +572,7 @@ NO_MATRIX.flags.writeable = False
 def no_match(
     count: int, dropped: Dropped = (), refusal: Refusal | None = None, **facts: Any
 ) -> MatchResult:
-    """Return the answer to a frame of so many centroids that was not identified.
+    """Return the answer to a frame of ``count`` centroids that was not identified.
 
     ``facts`` are further fields of the answer.
     """

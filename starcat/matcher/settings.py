@@ -17,12 +17,12 @@ Engine = Literal["auto", "c", "numpy"]
 Limit = Literal["time", "steps"]
 
 TOLERANCE_PX = 2.0
-"""Tolerance where neither it nor the noise of a centroid is stated."""
+"""Tolerance if neither it nor the noise of a centroid is stated."""
 
 NOISE_DEVIATIONS = 3.0
-"""Tolerance in standard deviations of a centroid on one axis, where that is stated.
+"""Tolerance in standard deviations of a centroid on one axis, if that noise is stated.
 
-A centroid farther than `REACH` times as many from its star, 4.5, is one of 25,000.
+One of 25,000 centroids is farther from its star than `REACH` times this, 4.5 deviations.
 """
 
 REACH = 1.5
@@ -32,25 +32,25 @@ It is larger than 1 because an attitude that was computed from a few stars has a
 """
 
 CERTAIN = 1e-9
-"""Largest false-match probability of an answer, unless another one is asked for.
+"""Default of the largest false-match probability of an answer.
 
-Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
+If the caller allows more, a hundredth of it ends the search; else the best answer is taken.
 """
 
 LARGEST = {"tolerance_px": 200.0, "noise_px": 50.0, "noise_mag": 10.0}
 """Largest values that can be stated; beyond them any spot is any star."""
 
 MAX_TRIANGLES = 5000
-"""Triangles of centroids that are looked up, in the order of their selection."""
+"""Number of triangles of centroids that are looked up, in the order of their selection."""
 
 MAX_STEPS = 100_000
-"""Steps that a frame may take unless another number is asked for; about a second with numpy."""
+"""Default of the steps that a frame may take; about a second with numpy."""
 
 MIN_SHARE = 1.0 / 3.0
 """Smallest share of a frame that the attitude of an answer explains.
 
-The share is that of the centroids or that of the stars, whichever is larger. Every one of them
-is weighted by the uncertainty that the matched stars leave in its position (`weighted_share`).
+It is the share of the centroids or the share of the stars, whichever is larger. Each of them is
+weighted by the uncertainty that the matched stars leave in its position (`weighted_share`).
 Without weights, the many stars of one cluster would accept an attitude that is right in the
 cluster and wrong in the rest of the frame.
 """
@@ -59,10 +59,10 @@ SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
 
 LOOKUP = 10
-"""Steps of looking up one pattern of a frame."""
+"""Number of steps that count for looking up one pattern of a frame."""
 
 AGREEMENT = 50
-"""Steps of refining an attitude once, for each full `PAIRS` of centroids and stars."""
+"""Steps that count for refining an attitude once, for each full `PAIRS` of centroids and stars."""
 
 PAIRS = 4000
 """Pairs of a centroid and a star near the frame, up to which a refinement costs `AGREEMENT`."""
@@ -78,10 +78,10 @@ class TriangleOrder:
         ``brightness`` is S3's, ``inradius`` S4's, the largest first; ``compact`` has the
         triangles with the shortest long side first, which the most fields hold whole. ``spread``
         takes the most compact triangle at every centroid, then the second of each, and so on.
-        ``auto`` is ``brightness`` where magnitudes are known, else ``spread`` in frames with more
+        ``auto`` is ``brightness`` if magnitudes are known, else ``spread`` in frames with more
         than ``most_centroids``, else ``compact``.
     min_side_px : float
-        Triangles with a shorter side are left out, as those of double stars (d_min of S3).
+        Triangles with a shorter side are left out, for example at double stars (d_min of S3).
     min_angle_deg : float
         Triangles with a narrower angle are left out, as three stars in a line (theta_min of S3).
     most_centroids : int
@@ -113,40 +113,40 @@ class Settings:
     method : str
         A key of `METHODS`.
     tolerance_px : float
-        Largest error of a centroid, as a radius: 2 px, or three times ``noise_px`` where that is
-        stated.
+        Largest error of a centroid, as a radius: 2 px by default, or three times ``noise_px`` if
+        that is stated.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
     selection : TriangleOrder
         Order and limits of the triangles of centroids, for the methods that use triangles.
     noise_px : float, optional
-        Standard deviation of a centroid on each axis. Stating it, instead of a tolerance, makes
-        frames of few stars certain that would be withheld.
+        Standard deviation of a centroid on each axis. If it is stated instead of a tolerance,
+        frames of few stars become certain that would otherwise be withheld.
     noise_mag : float, optional
-        Standard deviation of the magnitudes of centroids in the band of the database, its zero
-        point included. Where it is stated, a centroid is no star whose magnitude differs by
-        more than 3.5 of it, and agreements of magnitudes count as evidence.
+        Standard deviation of the magnitudes of centroids in the band of the database, including
+        the error of their zero point. If it is stated, a centroid cannot be a star whose magnitude
+        differs by more than 3.5 of it, and agreements of magnitudes count as evidence.
     engine : {"auto", "c", "numpy"}
         ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
         and ``pyramid`` with the default selection: with triangles forty times as fast from
-        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` where
-        it can serve.
+        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` if it
+        can be used.
     min_share : float
-        Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
-        Where it is not larger than that, agreements that chance gives less often than 1e-14 and
-        whose stars determine the whole frame need none.
+        Smallest share of the frame, by weight, that the attitude of an answer explains; a third
+        by default. Up to a third, no share is required of agreements that chance gives less often
+        than 1e-14 and whose stars determine the whole frame.
     max_steps : float
         Candidates that numpy may compare for a frame (`Budget`), 2 to 20 microseconds each; then
         the best answer so far is given, or none. The same number gives the same answer. 100,000 by
         default, which is about a second. Steps of the C library are smaller, 1 to
         5 nanoseconds each; its own limit is about a second too.
     time_limit_s : float
-        Seconds that a frame may take. Infinite by default. Where this, ``min_share`` or
-        ``max_steps`` is given, ``auto`` is ``numpy``.
+        Seconds that a frame may take. Infinite by default. If this, ``min_share`` or ``max_steps``
+        is given, ``auto`` is ``numpy``.
     """
 
     method: str = "triangle"
-    # None stands for what is not given, which __post_init__ replaces.
+    # None means not given: __post_init__ replaces it.
     tolerance_px: float = None  # type: ignore[assignment]
     max_false_match_probability: float = CERTAIN
     selection: TriangleOrder = TriangleOrder()
@@ -191,7 +191,7 @@ def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> 
 
     A quantity is converted to the unit of the parameter.
     """
-    if type(value) is float and 0.0 < value <= most:  # in nearly all calls, so at once
+    if type(value) is float and 0.0 < value <= most:  # nearly all calls end here
         return value
     value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
@@ -205,7 +205,7 @@ def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> 
 
 
 def has_default_search(settings: Settings) -> bool:
-    """Return whether what only numpy can be told is as by default."""
+    """Return whether the settings that only numpy supports have their defaults."""
     own = (settings.selection, settings.min_share, settings.max_steps, settings.time_limit_s)
     return own == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
 
@@ -224,7 +224,7 @@ def check_scale_free(settings: Settings) -> None:
 
 
 class BudgetSpentError(Exception):
-    """A search is over before it has come to its end."""
+    """A search ended because its budget was spent."""
 
     def __init__(self, limit: Limit) -> None:
         super().__init__(f"the {limit} of a search are used up")
@@ -233,10 +233,10 @@ class BudgetSpentError(Exception):
 
 @dataclass
 class Budget:
-    """What is left of a search.
+    """The steps and the time that a search has left.
 
     A step is a candidate that is compared with the frame. It takes 2 to 20 microseconds, in long
-    searches 2 to 6. The steps of the C library are others, of 1 to 5 nanoseconds. Looking up
+    searches 2 to 6. The C library has smaller steps, of 1 to 5 nanoseconds. Looking up
     a pattern of the frame counts as `LOOKUP` steps, refining an attitude as `AGREEMENT` or more.
     The same budget in steps gives the same answer everywhere; a limit of time does not.
     """
@@ -247,7 +247,7 @@ class Budget:
     _start_s: float = field(default_factory=time.perf_counter, repr=False)
 
     def spend(self, steps: int) -> None:
-        """Take steps; `BudgetSpentError` where none are left."""
+        """Take steps; `BudgetSpentError` if none are left."""
         if self.steps + steps > self.max_steps:
             raise BudgetSpentError("steps")
         self.steps += steps

@@ -1,4 +1,4 @@
-"""Answers as astropy, scipy and matplotlib have them: tables, world coordinates, pictures.
+"""Answers as objects of astropy, scipy and matplotlib: tables, world coordinates, pictures.
 
 Each library is imported when it is needed; a program that only matches needs none of them.
 """
@@ -33,10 +33,10 @@ SIP_ORDERS = range(2, 10)
 """Orders of the polynomials of SIP: 9 is the highest that the convention has."""
 
 SIP_ERROR_PX = 0.005
-"""The first order that is as good as this, at every place that is looked at, is taken."""
+"""The lowest order whose error is below this at all tested places is used."""
 
 FIRST_CENTRE_PX = 0.5
-"""Where the centre of the first pixel is, which FITS calls 1."""
+"""Place of the centre of the first pixel; FITS calls it 1."""
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ def sky_object_table(columns: Mapping[str, Any], facts: Mapping[str, Any]) -> QT
 
 
 def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
-    """Return a direction as astropy has it."""
+    """Return a direction as an object of astropy."""
     return _astropy("coordinates").SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs")
 
 
@@ -93,8 +93,8 @@ def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
 
 @lru_cache(maxsize=16)
 def _sip(camera: Camera, bottom_up: bool) -> tuple[Array, Array, Array, Array]:
-    """Return the polynomials that take the distortion away, and those that put it back."""
-    # The ends of an interval want more places than its middle.
+    """Return the polynomials that remove the distortion, and the polynomials that add it."""
+    # The ends of an interval need more places than its middle.
     along = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41))
     x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
     px = np.column_stack([x.ravel(), y.ravel()])
@@ -132,10 +132,10 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
 
 
 def plot(result: Any, output: Any, image: Any, name: str) -> Figure:
-    """Return the picture of a result, drawn by the room of pictures where it is installed."""
+    """Return the picture of a result, drawn by `starcat.images` if that is installed."""
     try:
-        # That room stands below this one, and is as far from it as astropy is: whoever only
-        # matches has neither.
+        # `starcat.images` uses this package and is optional here, as astropy is: a small install
+        # that only matches has neither.
         pictures = import_module("starcat.images.picture")
         drawn: Figure = pictures.draw_result(result, output, image, name)
     except ModuleNotFoundError as error:

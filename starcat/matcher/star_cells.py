@@ -1,7 +1,7 @@
 """Stars of a database near directions: in a cap, and by cells of the sky.
 
-Most of the many candidates of a frame are wrong. The cells tell quickly how many centroids each
-candidate explains. They are made when a database first needs them.
+Most of the many candidates of a frame are wrong. With the cells it is quick to count the centroids
+that each candidate explains. They are made when a database first needs them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SMALLEST_REACH = 0.25 * MIN_SIDE
 """Cells of the smallest side serve all reaches up to this."""
 
 MANY_STARS = 15_000
-"""So many stars are searched by zones; a product of all is faster for fewer."""
+"""Number of stars from which zones are searched; a product with all stars is faster for fewer."""
 
 
 def stars_in_cap(database: Database, axis: Array, radius_rad: float) -> Rows:

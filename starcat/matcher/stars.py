@@ -1,4 +1,4 @@
-"""The stars of an answer: where each is, where it was seen, and what that says of the attitude."""
+"""The stars of an answer: their places, their centroids, and the accuracy of the attitude."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
 
 STEP_PX = 0.01
-"""Step of the differences that say how a direction moves with its pixel, to 1e-9 of that."""
+"""Step of the differences that give the derivative of a direction by its pixel, to 1e-9."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class MatchedStars:
     star_index : ndarray of int32, shape (n,)
         Rows of the database.
     star : tuple of str
-        Designations; the number where the database has none.
+        Designations; the star number if the database has none.
     ra_deg, dec_deg : ndarray of float64, shape (n,)
         ICRS, at the epoch of the database.
     mag : ndarray of float64, shape (n,)
@@ -48,10 +48,10 @@ class MatchedStars:
     separation_arcsec : ndarray of float64, shape (n,)
         Angle between the centroid's direction and the star's.
     observed_mag, difference_mag : ndarray of float64, shape (n,)
-        Magnitude of the centroid as it was given, and this minus the database's; NaN where none
-        was given. The zero point is the caller's.
+        Magnitude of the centroid as it was given, and this minus the database's; NaN if not
+        given. The zero point is the caller's.
     sigma_px : ndarray of float64, shape (n,)
-        Noise of the centroid on each axis as it was stated; NaN where it was not.
+        Noise of the centroid on each axis as it was stated; NaN if not stated.
     """
 
     spot: NDArray[np.int64]
@@ -84,7 +84,7 @@ NO_STARS = MatchedStars(_NO_ROWS, _NO_ROWS, _NO_ROWS.astype(np.int32), (), *(11 
 
 
 def name_of_number(star_id: int) -> str:
-    """Return what to call a star of an onboard image, which has numbers only.
+    """Return the name of a star of an onboard image, which has only numbers.
 
     The embedded sky has the stars that Gaia lacks under their negative numbers of Hipparcos.
     """
@@ -99,9 +99,9 @@ def matched_stars(
     database: Database,
     noise_px: float | None,
 ) -> MatchedStars:
-    """Return the stars that centroids were found to be, -1 where none, a row for each star.
+    """Return the stars that centroids were identified as, one row per star.
 
-    ``noise_px`` is that of the centroids of a frame that states none of each.
+    ``noise_px`` is the noise of all centroids if the frame does not state it for each.
     """
     spot = np.flatnonzero(star_index >= 0)
     row = star_index[spot]
@@ -137,15 +137,15 @@ def matched_stars(
 
 
 def degrees_of_freedom(stars: MatchedStars, unknowns: int) -> int:
-    """Return two a star whose noise is known, less the ``unknowns`` that were fitted."""
+    """Return two per star whose noise is known, minus the ``unknowns`` that were fitted."""
     return 2 * int(np.isfinite(stars.sigma_px).sum()) - unknowns
 
 
 def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     """Return the squared offsets of centroids, in their noise, over the degrees of freedom.
 
-    It is 1 on average where the noise is stated rightly; NaN where none is stated or nothing is
-    left.
+    It is 1 on average if the stated noise is right; NaN if no noise is stated or no degree of
+    freedom is left.
     """
     if free <= 0:
         return math.nan
@@ -175,16 +175,16 @@ def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
 def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
-    Of the small rotations about the axes of the camera (x right, y down, z along the boresight),
-    square arcseconds; NaN where the stars determine no attitude. The noise of a centroid, where it
-    is not stated, is that of the residuals, of whose 2n numbers the ``unknowns`` were fitted, times
-    `student_widening`.
+    It is for small rotations about the axes of the camera (x right, y down, z along the boresight),
+    in square arcseconds; NaN if the stars determine no attitude. If the noise of a centroid is not
+    stated, it is computed from the 2n residuals, of which ``unknowns`` numbers were fitted, and
+    multiplied by `student_widening`.
 
-    The attitude is that of Wahba's problem with the weights w of `weights_of`, whose error is
-    ``A^-1 sum(w b x db)``: A is the `information` of the directions b, and the errors db of these
-    are those of the pixels by the derivative of the camera. With a camera of a narrow field and
+    The attitude solves Wahba's problem with the weights w of `weights_of`, so its error is
+    ``A^-1 sum(w b x db)``: A is the `information` of the directions b, and their errors db are the
+    errors of the pixels by the derivative of the camera. With a camera of a narrow field and
     equal weights this is the inverse of A times the variance of a direction. An error that all
-    stars share, as of the focal length or the distortion, is not in it.
+    stars share, such as of the focal length or the distortion, is not included.
     """
     px = np.column_stack([stars.x_px, stars.y_px])
     weights, sigma_px = weights_of(stars.sigma_px), stars.sigma_px

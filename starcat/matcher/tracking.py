@@ -1,8 +1,8 @@
-"""Tracking: a sequence of frames, each looked for near where the ones before it lead to.
+"""Tracking: a sequence of frames; each is searched near the attitude predicted from the last ones.
 
-The camera is taken to go on turning as it did, about the same axes of its own frame. How far that
-may be wrong follows from how far it last was. A frame that is not there is searched for in the
-whole sky at once, so that a jump costs one slow frame and no answer.
+The camera is assumed to keep turning as it did, about the same axes of its own frame. The allowed
+error of the prediction follows from the errors of the last predictions. A frame that is not there
+is searched for in the whole sky at once, so a jump costs one slow frame but no answer.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ FLOOR = 2.0
 """Smallest error of a prediction, in units of the largest error of a centroid."""
 
 MARGIN = 2.0
-"""Error that is allowed for a prediction, over that of the last ones."""
+"""Error that is allowed for a prediction, over the error of the last predictions."""
 
 FADING = 0.5
-"""What the error of an earlier prediction counts, for every frame since."""
+"""Weight of the error of an earlier prediction, for every frame since."""
 
 MAX_STEPS = 5.0
-"""Time since the last answer after which it tells nothing, over that between the last two."""
+"""Longest time of a prediction after the last answer, over the time between the last two."""
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the last answers say of the next one."""
+    """The motion that the last answers predict."""
 
     q_body_from_icrs: Quaternion
     time: float
@@ -107,22 +107,22 @@ class Tracker:
         Parameters
         ----------
         centroids_px, camera, mag, sigma_px, fov_error, prior, prior_error_deg
-            As for `Matcher.identify`; a prior, of a gyroscope for example, takes the place of the
+            As for `Matcher.identify`; a prior, from a gyroscope for example, replaces the
             prediction.
         time_s : float, optional
-            Time of the frame, later than that of the one before; frames without a time are
-            one after the other at equal intervals. Give it for every frame, or for none.
+            Time of the frame, later than the previous frame's. Frames without a time follow each
+            other at equal intervals. Give it for every frame, or for none.
 
         Returns
         -------
         MatchResult
-            ``origin`` says whether it was found near the prediction, ``tracking``, or in the
-            whole sky, ``lost_in_space``. The verification is the same.
+            ``origin`` is ``tracking`` if it was found near the prediction, and ``lost_in_space``
+            if it was found in the whole sky. The verification is the same.
 
         Raises
         ------
         ConfigError, ValueError
-            As `Matcher.identify`, or if the time is no later than the one before.
+            As `Matcher.identify`, or if the time is not later than the previous frame's.
         """
         found = self.attempt(
             centroids_px, camera, mag=mag, sigma_px=sigma_px, fov_error=fov_error,
@@ -143,7 +143,7 @@ class Tracker:
         prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
-        """Identify the stars of the next frame as `identify` does, and remember nothing.
+        """Identify the stars of the next frame as `identify` does, without recording the answer.
 
         A frame can be attempted several times, with other centroids or another ``fov_error``.
         `record` then ends the frame.
@@ -178,8 +178,8 @@ class Tracker:
             return
         x, y, z, w = found.q_body_from_icrs.tolist()
         is_new = found.origin == "lost_in_space"
-        # Beyond the prediction the motion is another one: the next attitude is expected to be
-        # the same, within the largest turn.
+        # An attitude beyond the prediction means a new motion: the next attitude is expected to
+        # be the same as this one, within the largest turn.
         self._motion = (
             _Motion((x, y, z, w), now)
             if is_new or self._motion is None
@@ -189,7 +189,7 @@ class Tracker:
         )
 
     def follow(self, frames: Iterable[FrameLike]) -> Iterator[MatchResult]:
-        """Identify frames one after the other, each when its answer is asked for.
+        """Identify the frames in turn, each when the next answer is requested.
 
         Parameters
         ----------
@@ -220,13 +220,13 @@ class Tracker:
     def _predicted(
         self, now: float, camera: Camera
     ) -> tuple[Quaternion, float] | tuple[None, None]:
-        """Return the attitude that is expected, and its largest error; None where none is."""
+        """Return the attitude that is expected, and its largest error; None if there is none."""
         motion = self._motion
         steps = math.inf if motion is None else (now - motion.time) / motion.step
         if motion is None or steps > MAX_STEPS:
             return None, None
         floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
-        # What is not a constant velocity grows with the square of the time.
+        # The error from a velocity that is not constant grows with the square of the time.
         error_deg = math.degrees(floor_rad + MARGIN * motion.change_rad * steps * steps)
         x, y, z = motion.turn
         expected = after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps))

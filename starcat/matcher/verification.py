@@ -42,38 +42,38 @@ FIRM_CHANCE = 1e-14
 determine all of it."""
 
 OTHER_SCALES = 0.05
-"""Largest relative error of the focal length that is looked for where an agreement's stars do not
+"""Largest relative error of the focal length that is looked for if an agreement's stars do not
 exclude it."""
 
 WIDER = (4.0, 2.0)
-"""Reaches of that second refinement, one after the other, in units of the final reach."""
+"""Reaches of that second refinement, in this order, in units of the final reach."""
 
 NARROWER = (0.5, 0.25, 0.125)
-"""Smaller reaches that are tried where an agreement is not certain, in units of the final reach."""
+"""Smaller reaches that are tried if an agreement is not certain, in units of the final reach."""
 
 OVER_CHANCE = 2.0
-"""Centroids within a smaller reach, over the number that its area would have by chance, from which
-it is tried."""
+"""A smaller reach is tried if it holds this many times the centroids that its area would have by
+chance."""
 
 MISSES = 0.45
-"""Largest number of near misses beside those of chance, over the number of matched stars."""
+"""Largest number of near misses beyond those due to chance, over the number of matched stars."""
 
 MISS_REACH = 8.0
-"""How near a star a centroid misses it; in units of the final reach."""
+"""Largest distance of a near miss from its star, in units of the final reach."""
 
 RIVAL_REACH = 4.0
-"""A centroid without a star that is this near to one that another centroid has may have more right
-to it; in units of the final reach."""
+"""A centroid without a star competes for a star of another centroid if it is this near to it; in
+units of the final reach."""
 
 ROUNDING = 1e-4
-"""Largest relative difference of probabilities that are the same but for rounding."""
+"""Largest relative difference of probabilities that differ only by rounding."""
 
 ROUGH = (2.0,)
-"""Reach of a first refinement where the focal length is fitted too, in units of the final reach:
-three stars leave more of an error in it than in the attitude."""
+"""Reach of a first refinement if the focal length is fitted too, in units of the final reach:
+three stars determine it less accurately than the attitude."""
 
 FOCAL_MARGIN = 0.02
-"""Margin around a frame whose focal length is fitted, where stars are looked for."""
+"""Margin around a frame whose focal length is fitted, in which stars are searched too."""
 
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
@@ -92,24 +92,24 @@ class Agreement:
     # Attitude refined on all matched stars, and the camera with the focal length that goes with
     # it.
     pose: Pose
-    star_index: NDArray[np.int32]  # row of each centroid's star, -1 where none; shape (N,)
-    # Root mean square separation of the matched centroids from their stars; NaN where fewer than
+    star_index: NDArray[np.int32]  # row of each centroid's star, -1 without one; shape (N,)
+    # Root mean square separation of the matched centroids from their stars; NaN if fewer than
     # `MIN_STARS` match.
     residual_rad: float
-    # Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS` match.
+    # Bound on the probability that chance agrees as well; 1 if fewer than `MIN_STARS` match.
     chance: float
-    # Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
+    # Share of the frame that it explains; 1 if chance explains it, as the share is not used then.
     share: float = 1.0
-    withheld: Withheld = None  # why it is no answer, however unlikely chance is
-    is_firm: bool = True  # whether its stars alone determine the whole frame
+    withheld: Withheld = None  # why it is not an answer, even if chance is unlikely
+    is_firm: bool = True  # its stars alone determine the whole frame
 
     @property
     def false_match_probability(self) -> float:
-        """Bound on the probability that it is due to chance; 1 where it is withheld."""
+        """Bound on the probability that it is due to chance; 1 if it is withheld."""
         return 1.0 if self.withheld else self.chance
 
     def is_better_than(self, other: Agreement | None) -> bool:
-        """Return whether chance explains it less, be it only among those that are withheld."""
+        """Return whether chance explains it less; withheld agreements are compared too."""
         if other is None:
             return True
         own = self.false_match_probability, self.chance
@@ -128,7 +128,7 @@ class Agreement:
 
 @dataclass
 class BestOf:
-    """The best of the agreements that a search has come to."""
+    """The best agreement that a search has found so far."""
 
     certain: float  # a false-match probability as low as this ends the search
     found: Agreement | None = None  # the agreement that chance explains least
@@ -159,8 +159,8 @@ def verify_candidates(
 ) -> None:
     """Work out the agreements of a batch of candidates until one is certain.
 
-    With ``in_order`` the first one is the likeliest, and is tried before the others are counted;
-    where the focal length is not known, there are too many for that.
+    With ``in_order`` the first candidate is the likeliest, and is tried before the others are
+    counted. If the focal length is not known, there are too many candidates for that.
     """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
@@ -217,7 +217,7 @@ def agree(
         # nearest to the star itself. The star's own spot then has no star, and fits better.
         for rival, centroid in _rivals(refined, observation):
             other = _with_rival(found, rival, centroid, observation, database)
-            # The fit may lead back to where it began, but for rounding.
+            # The fit can lead back to its start; a difference by rounding is not progress.
             if other.false_match_probability < (1.0 - ROUNDING) * found.false_match_probability:
                 found = other
                 break
@@ -228,7 +228,7 @@ def agree(
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
         wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
-        # Of an agreement of hundreds of stars the probability may be too small for a number.
+        # The probability of an agreement of hundreds of stars can be too small for a number.
         if (wider.false_match_probability, -wider.n_matched) < (
             found.false_match_probability, -found.n_matched,
         ):  # fmt: skip
@@ -255,10 +255,10 @@ def _within_less(
 ) -> Agreement:
     """Return the best agreement within smaller reaches.
 
-    They are tried where more centroids are near their stars than chance would bring there. The
-    tolerance is the largest error that is allowed. Where centroids are better than that, the
-    true stars of a crowded frame are outnumbered by those that chance puts within its reach. The
-    bound holds for every number of matched stars, so that it may be taken at the best one.
+    They are tried if more centroids are near their stars than chance would bring there. The
+    tolerance is the largest error that is allowed. If centroids are more accurate, chance puts
+    more false stars than true ones within its reach in a crowded frame. The bound holds for
+    every number of matched stars, so it can be taken at the best number.
     """
     square_px, count = refined.square_px[refined.matched], len(refined.matched)
     for k, factor in enumerate(NARROWER):
@@ -273,7 +273,7 @@ def _within_less(
 
 
 def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
-    """Return centroids without a star, each with the one that has the star nearest to it."""
+    """Return centroids without a star, each with the centroid that took its nearest star."""
     loose, matched = (refined.star < 0).nonzero()[0], refined.matched
     reach_px = RIVAL_REACH * REACH * observation.tolerance_px
     if not len(loose) or not len(matched) or refined.square_px[loose].min() >= reach_px * reach_px:
@@ -301,14 +301,14 @@ def _with_rival(
 
 @dataclass(frozen=True)
 class _Fit:
-    """A pose, the stars around its field and which of them the centroids are."""
+    """A pose, the stars around its field, and the star of each centroid."""
 
     pose: Pose
     near: Rows  # the stars around the field
     icrs: Directions
     compatible: Mask | None
-    predicted_px: Pixels  # where the pose puts those stars
-    star: Rows  # of each centroid a row of ``near``, -1 where none
+    predicted_px: Pixels  # the stars ``near`` as the pose puts them
+    star: Rows  # row of ``near`` for each centroid, -1 without a star
     matched: Rows  # centroids with a star
     square_px: Array
     last: float  # the last reach, in units of the final one
@@ -391,9 +391,9 @@ def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
 def _has_near_misses(refined: _Fit, within: Rows, observation: Observation) -> bool:
     """Return whether centroids without a star are close to stars without a centroid.
 
-    They are if they are more than `MISSES` of the matched ones, and twice what chance brings there.
-    Then the frame has another shape than the camera: stars match in a part of the frame, and
-    beside that part they miss.
+    They must exceed the share `MISSES` of the matched centroids plus twice the number by chance.
+    Then the frame has another shape than the camera: stars match in one part of the frame, and
+    miss next to that part.
     """
     loose = np.flatnonzero(refined.star < 0)
     free = np.setdiff1d(within, refined.star[refined.matched])
@@ -421,7 +421,7 @@ def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Row
 def _mutually_nearest(
     predicted_px: Array, observation: Observation, reach_px: float, compatible: Mask | None
 ) -> tuple[Rows, Array]:
-    """Return the star of each centroid, -1 where it has none, and the squared distances.
+    """Return the star of each centroid, -1 without a star, and the squared distances.
 
     A centroid has a star if each of the two is the nearest to the other, within reach, among
     those whose magnitudes are compatible.

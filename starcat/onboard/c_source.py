@@ -1,8 +1,8 @@
-"""An onboard image as C99 source, for who links it into a program.
+"""An onboard image as C99 source, for programs that link it in.
 
-The image is an array of 64-bit words, which a compiler aligns as the image has to be. The words
-are those that a machine of the image's byte order has to hold to have the bytes of the image, so
-the source is for such machines only; compilers that say their byte order refuse the other one.
+The image is an array of 64-bit words, so that a compiler gives it the right alignment. The words
+have the bytes of the image only on a machine of the image's byte order, so the source is only for
+such machines; compilers that define their byte order refuse the other one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _WORDS_A_LINE = 4
 
 
 def c_symbol(name: str) -> str:
-    """Return the name of the array: that of the database, with ``_`` for what C does not allow."""
+    """Return the name of the array: the database's name, with ``_`` for invalid characters."""
     return "starcat_" + re.sub("[^0-9a-z]", "_", name.lower())
 
 

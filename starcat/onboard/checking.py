@@ -1,6 +1,6 @@
-"""Checks of an onboard image: what its numbers say of each other, and what its database says.
+"""Checks of an onboard image: its numbers against each other, and against its database.
 
-Everything is computed again from directions and rows. Functions yield what is wrong, in words.
+Everything is computed again from directions and rows. Functions yield the faults in words.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from starcat.onboard.reading import OnboardImage
 from starcat.products.tiling import FieldStars
 
 MIN_STARS = 4
-"""Fewer stars in a field identify nothing."""
+"""Smallest number of stars in a field with which it can be identified."""
 
 
 @dataclass(frozen=True)
 class Shrunk:
-    """Contents that fit, and what it took."""
+    """Contents that fit, and the sizes before."""
 
     contents: Contents
-    stars_before: int  # of the database
-    features_before: int  # of the image without a limit
-    # The stars left are among so many brightest of a field; None where all are left.
+    stars_before: int  # stars of the database
+    features_before: int  # features of the image without a limit
+    # The stars left are among this many brightest of a field; None if all are left.
     stars_per_field: int | None
 
     @property
@@ -54,7 +54,7 @@ def shrink(
     max_bytes: int | None,
     profile: Profile = FULL,
 ) -> Shrunk:
-    """Leave out what a profile leaves out, and as little more as makes an image fit."""
+    """Leave out what a profile leaves out, and only as much more as needed for the image to fit."""
     limit = math.inf if max_bytes is None else max_bytes
     least = profile.least[contents.method]
     whole, weight = _by_use(contents, times_seen)
@@ -82,7 +82,7 @@ def shrink(
 def _by_use(
     contents: Contents, times_seen: NDArray[np.int32] | None
 ) -> tuple[Contents, NDArray[np.float64]]:
-    """Return the features, the most useful first, with what each adds to the use of all."""
+    """Return the features, the most useful first, and the use that each of them adds."""
     if times_seen is not None:
         order = np.argsort(-times_seen.astype(np.int64), kind="stable")
         weight = times_seen[order].astype(np.float64)
@@ -107,7 +107,7 @@ def _thinned(
     fields: Callable[[], FieldStars],
     stars_per_field: int | None,
 ) -> Iterator[tuple[int | None, Contents, NDArray[np.float64]]]:
-    """Yield the contents with all stars, or so many a field, then with ever fewer a field."""
+    """Yield the contents with all stars or ``stars_per_field``, then with fewer per field."""
     if stars_per_field is None:
         yield None, contents, weight
     stars = fields()
@@ -146,16 +146,16 @@ def _fewer_features(contents: Contents, max_bytes: float) -> Contents:
 
 
 VALUE_TOLERANCE = 1e-12
-"""What a machine may round otherwise than another one, square radians and radians."""
+"""Largest difference by rounding between two machines, square radians and radians."""
 
 RADIUS_TOLERANCE = 1e-6
-"""The same of circumradii, as a part of them."""
+"""Largest relative difference of circumradii by rounding."""
 
 MAX_PRODUCTS = 20_000_000
 
 
 def value_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where values, K-vector, circumradii and longest side are not those of the stars."""
+    """Yield where values, K-vector, circumradii and longest side contradict the stars."""
     values, radii, sides = feature_values(image.directions, image.features)
     if (np.diff(values) < -VALUE_TOLERANCE).any():
         yield f"section {FEATURES[image.method][0]}: not by ascending value"
@@ -188,7 +188,7 @@ def _fits_line(image: OnboardImage, values: Array) -> bool:
 
 
 def capacity_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where a circle about a star holds more stars than the header says one can."""
+    """Yield where a circle about a star holds more stars than the header allows."""
     u = image.directions
     if not len(u):
         return
@@ -204,7 +204,7 @@ def capacity_problems(image: OnboardImage) -> Iterator[str]:
 
 
 def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
-    """Yield where an image is not of a database."""
+    """Yield differences between an image and its database."""
     digest = contents.manifest_sha256.hex()
     if image.manifest_sha256 != digest:
         yield (
@@ -249,7 +249,7 @@ def _star_problems(
     far = ~(np.abs(ours - theirs) <= 0.5 / MAG_SCALE + 1e-9)
     far &= ~(np.isnan(ours) & ~np.isfinite(theirs)) & ~(np.abs(theirs) > 32.7)
     if far.any():
-        yield f"section magnitudes: {int(far.sum())} stars have another one in the database"
+        yield f"section magnitudes: {int(far.sum())} stars have other values in the database"
 
 
 def _in_rows(found: NDArray[np.int64], known: NDArray[np.int64], count: int) -> NDArray[np.bool_]:

@@ -18,23 +18,23 @@ from starcat.arrays import Array
 MAX_CELLS = 2**20
 
 BANDS_OF_A_FIELD = 8
-"""So many bands the circle of a camera should cross: fewer hold stars that are not near it."""
+"""Number of bands that the circle of a camera should cross: wider bands hold stars far from it."""
 
 FACE_CELLS = 2
 """Cells along a side of a cube's face when the search for the fullest circle begins."""
 
 FINENESS = 16
-"""Cells are halved until they reach from their centre by one in so many of the radius."""
+"""Cells are halved until their reach from the centre is the radius divided by this."""
 
 MAX_PRODUCTS = 300_000
-"""With more cells times stars than this, cells are gone through one by one, each with its stars."""
+"""With more cells times stars than this, cells are processed one by one, each with its stars."""
 
 SLACK_RAD = 1e-5
-"""The radius is so much larger, for who compares in single precision."""
+"""Margin of the radius, for readers that compare in single precision."""
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=2)))
 _FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(range(3), (1.0, -1.0))]
-"""Of each face of the cube the normal and the two axes in it, by rows."""
+"""The normal of each face of the cube, and the two axes in the face, by rows."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def quarter_turns(u: Array) -> Array:
 
 
 def grid_for(n_stars: int, radius_rad: float, stars_per_cell: int = 1) -> CellGrid:
-    """Return a grid with about so many stars per cell, but no finer than a camera has use for."""
+    """Return a grid with about ``stars_per_cell``, but not finer than is useful for a camera."""
     useful = math.ceil(BANDS_OF_A_FIELD / math.sin(min(radius_rad, 0.5 * math.pi)))
     largest = math.isqrt(MAX_CELLS // 2)
     bands = max(1, min(round(math.sqrt(n_stars / (2.0 * stars_per_cell))), useful, largest))
@@ -87,8 +87,8 @@ def most_near(u: Array, radius_rad: float) -> int:
     """Return an upper bound of the stars within a radius of any direction.
 
     The sphere is divided into cells, squares on the faces of a cube. No circle about a direction
-    of a cell holds more stars than the circle about its centre that is wider by what the cell
-    reaches from there. Cells that may hold more than is known of others are divided further.
+    of a cell holds more stars than the circle about its centre that is wider by the reach of the
+    cell. Cells that can hold more than the largest number found so far are divided further.
     """
     unit = u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
     half = 1.0 / FACE_CELLS
@@ -101,7 +101,7 @@ def most_near(u: Array, radius_rad: float) -> int:
         for n, (centre, least) in enumerate(zip(centres, wide, strict=True)):
             roots.append((face, squares[n : n + 1], np.flatnonzero(unit @ centre >= least)))
     most = 0
-    # The fullest first, as what is known of them settles the others.
+    # The fullest first, because their count rules out most of the others.
     for face, square, near in sorted(roots, key=lambda root: -len(root[2])):
         if len(near) > most:
             most = _most_in(face, square, half, unit[near], radius_rad, most)
@@ -111,7 +111,7 @@ def most_near(u: Array, radius_rad: float) -> int:
 def _most_in(
     face: Array, squares: Array, half: float, near: Array, radius_rad: float, most: int
 ) -> int:
-    """Return an upper bound for the directions of one cell, or that of the others if larger."""
+    """Return an upper bound for the directions near one cell, or ``most`` if that is larger."""
     inner = _cosines(np.array(radius_rad))
     while True:
         half *= 0.5

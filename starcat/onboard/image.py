@@ -1,7 +1,7 @@
 """Guide stars and their features to the bytes of an onboard image.
 
-Everything that is computed is computed from the directions as the image holds them, so that a
-reader that computes the same finds the same. The same contents give the same bytes.
+All values are computed from the directions as the image stores them, so that a reader that
+computes them again finds the same values. The same contents give the same bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SMALLEST_MARGIN = 1e-12
 
 @dataclass(frozen=True)
 class Contents:
-    """What an image is made of."""
+    """The contents of an image."""
 
     name: str  # ``<name>-<version>`` of the database
     epoch_jyear: float  # epoch of the directions, Julian year
@@ -43,8 +43,8 @@ class Contents:
     mag: Array  # magnitudes; NaN where unknown; shape (N,)
     method: str
     features: Rows  # rows of the stars of each triangle or pair, in any order
-    manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros where there is no manifest
-    stars_per_cell: int = 1  # of the grid, on average
+    manifest_sha256: bytes = bytes(32)  # 32 bytes; zeros without a manifest
+    stars_per_cell: int = 1  # average of the grid
 
     @property
     def grid(self) -> CellGrid:
@@ -54,7 +54,7 @@ class Contents:
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image and where its stars are from."""
+    """An image and the origin of its stars."""
 
     data: bytes
     star_rows: NDArray[np.int64]  # the row in the contents of each star of the image; shape (N,)

@@ -1,8 +1,8 @@
 """The layout of an onboard image: header, section table, kinds of sections, sizes, check blocks.
 
-``docs/onboard-format.md`` says the same in words. All types are here for one byte order, and
-`in_order` gives them for another. Which bytes are check blocks follows from the size of the image
-alone, so that a damaged header does not lead astray.
+``docs/onboard-format.md`` describes it in words. All types are here for one byte order, and
+`in_order` converts them to another. The places of check blocks follow from the size of the image
+alone, so that a damaged header cannot mislead a reader.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ NAME_BYTES = 96
 MAX_BYTES = 2**32 - 1
 
 DIRECTION_SCALE = 2147483647
-"""What a component of 1 is stored as."""
+"""The stored value of a component of 1."""
 MAG_SCALE = 1000
 MAG_UNKNOWN = -32768
 RADIUS_UNKNOWN = 65535
-"""Circumradii that are larger than any of use."""
+"""Value of circumradii that are too large to be useful."""
 RADIUS_STEPS = 65534
 RADIUS_RANGE = 2.5
-"""The largest circumradius that is told apart, in units of the camera's diagonal."""
+"""The largest circumradius that is stored, in units of the camera's diagonal."""
 
 FEATURES = {"triangle": ("triangles", ("i", "j", "k")), "pyramid": ("pairs", ("i", "j"))}
 """For each method of an image, the product that its features are from, and the columns of rows."""
@@ -88,7 +88,7 @@ SECTION = np.dtype([("kind", "u4"), ("offset", "u4"), ("bytes", "u4"), ("element
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the size of an image depends on."""
+    """The numbers that determine the size of an image."""
 
     method: str
     n_stars: int
@@ -181,7 +181,7 @@ def data_blocks(size_bytes: int) -> int:
 
 
 def crc_of(image: bytes, byte_order: ByteOrder) -> int:
-    """Return the CRC-32 of all data of an image, by which it is told from others."""
+    """Return the CRC-32 of all data of an image, which identifies the image."""
     at = len(image) - BLOCK_BYTES + _AT_WHOLE
     return int.from_bytes(image[at : at + 4], byte_order)
 
@@ -217,7 +217,7 @@ def _block_crcs(data: bytes) -> NDArray[np.uint32]:
 
 
 def _sound_checks(image: bytes) -> dict[int, ByteOrder | None]:
-    """Return the byte order of each check block, None where its own CRC does not fit."""
+    """Return the byte order of each check block, None if its own CRC does not fit."""
     checks: dict[int, ByteOrder | None] = {}
     for block in range(data_blocks(len(image)), len(image) // BLOCK_BYTES):
         part = image[block * BLOCK_BYTES : (block + 1) * BLOCK_BYTES]

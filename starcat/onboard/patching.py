@@ -1,8 +1,8 @@
-"""Patches: what flight software makes the next onboard image of, with the one that it has.
+"""Patches: flight software makes the next onboard image from its old image and a patch.
 
 ``docs/onboard-format.md`` describes every byte. A patch release leaves out a few stars of
-thousands; what stays is copied, the rows of stars in triangles and pairs are renumbered, and the
-K-vector's numbers are old ones and how they differ.
+thousands. The other stars are copied, the rows of stars in triangles and pairs are renumbered, and
+the numbers of the K-vector are stored as differences from the old ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ IMAGE_KIND = 9
 """Kind of the section."""
 
 IMAGE_PREFIX = b"starcat-image-1\0"
-"""What a signed message begins with, so that no signature can be taken for another."""
+"""Beginning of a signed message, so that no signature can be used for another purpose."""
 
 RECORD_BYTES = 96
 """A public key of 32 bytes and a signature of 64."""
@@ -37,7 +37,7 @@ RECORD_BYTES = 96
 MAX_SIGNATURES = 16
 
 MAX_ADDED_BYTES = 2 * layout.BLOCK_BYTES
-"""What signatures add to an image at most: a block of data, and one that checks it."""
+"""Largest number of bytes that signatures add to an image: a data block and its check block."""
 
 _MINOR_VERSION = 1
 
@@ -146,7 +146,7 @@ HEADER = np.dtype(
 )
 LITERAL, COPY, RENUMBER_16, RENUMBER_32, ADD_16, ADD_32, ZEROS = range(7)
 WIDTHS = (1, 1, 2, 4, 2, 4, 1)
-"""Bytes of what each kind of step counts."""
+"""Bytes of the unit that each kind of step counts."""
 
 _ZEROS = re.compile(rb"\0{8,}")
 
@@ -190,7 +190,7 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
 
 
 def _found(wanted: Rows, among: Rows) -> Rows:
-    """Return where each number is among others that do not repeat; -1: nowhere."""
+    """Return the place of each number among others that do not repeat; -1 if it is missing."""
     order = np.argsort(among, kind="stable")
     at = np.searchsorted(among[order], wanted)
     place = order[np.minimum(at, len(among) - 1)] if len(among) else np.zeros_like(wanted)
@@ -199,7 +199,7 @@ def _found(wanted: Rows, among: Rows) -> Rows:
 
 
 def _runs_of_rows(source: Rows) -> Rows:
-    """Return the first old row of each run of stars and what is added to its rows, shape (R, 2)."""
+    """Return the first old row of each run of stars and the shift of its rows, shape (R, 2)."""
     new_rows = np.flatnonzero(source >= 0)
     order = np.argsort(source[new_rows])
     old_rows, shift = source[new_rows][order], (new_rows - source[new_rows])[order]
@@ -236,7 +236,7 @@ def _difference(value: int) -> bytes:
 
 
 class _Steps:
-    """The steps of a patch, one after the other."""
+    """The steps of a patch, in order."""
 
     def __init__(self, old: OnboardImage, new: OnboardImage) -> None:
         self.old, self.new = old, new
@@ -254,7 +254,7 @@ class _Steps:
         self.made = until
 
     def rows(self, name: str, source: Rows, expected: NDArray[Any]) -> None:
-        """Write rows of a section: those of the old one by runs, where they are as expected."""
+        """Write rows of a section: runs of the old section if they are as expected."""
         made = self.new.sections[name]
         kind = COPY
         if name in ("triangles", "pairs"):
@@ -279,7 +279,7 @@ class _Steps:
                 )
 
     def add(self, name: str, source: Rows) -> None:
-        """Write numbers of a section by how they differ from those of the old one."""
+        """Write numbers of a section as differences from the old section."""
         before, made = self.old.sections[name], self.new.sections[name]
         kind = ADD_16 if made.itemsize == 2 else ADD_32
         source = np.where(source < len(before), source, -1)

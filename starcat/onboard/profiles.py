@@ -27,7 +27,7 @@ class Profile:
     most: float = 1.0  # the part that is kept if the image is not too large
     # Stars are kept if they are among this many brightest of any field; None: all stars.
     stars_per_field: int | None = None
-    stars_per_cell: int = 1  # of the grid, on average
+    stars_per_cell: int = 1  # average of the grid
 
     @property
     def methods(self) -> tuple[str, ...]:

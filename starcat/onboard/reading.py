@@ -1,7 +1,7 @@
 """Reading an onboard image: every size, place and row is checked before it is used.
 
-Images of both byte orders are read. This is no part of the onboard library and shares no code
-with it, so that each is a check of the other.
+Images of both byte orders are read. This module shares no code with the onboard library, so that
+each is a check of the other.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ class OnboardImage:
     camera: Camera  # the camera that it was built for
     header: Mapping[str, int | float]  # the numbers of the header by name
     sections: Mapping[str, NDArray[Any]]  # the sections by name, in the byte order of the image
-    offsets: Mapping[str, int]  # where each section begins
+    offsets: Mapping[str, int]  # start of each section
 
     def __repr__(self) -> str:
         return f"<OnboardImage {self.name}: {self.method}, {len(self.data):,} bytes>"
 
     @property
     def crc(self) -> int:
-        """CRC-32 of all data, by which the onboard library tells images apart."""
+        """CRC-32 of all data, by which the onboard library distinguishes images."""
         return layout.crc_of(self.data, self.byte_order)
 
     @property
@@ -107,7 +107,7 @@ def is_image(path: Path) -> bool:
         check_regular_file(path)
         with path.open("rb") as file:
             return file.read(len(layout.MAGIC)) == layout.MAGIC
-    except (OSError, SourceError):  # a folder, or no such file: others say so
+    except (OSError, SourceError):  # a folder, or no such file: the reader reports it
         return False
 
 
@@ -167,7 +167,7 @@ def _damaged(where: str, problem: str, path: Path | None) -> OnboardImageError:
 
 
 def _check_magic(data: bytes, where: str, path: Path | None) -> None:
-    """Refuse what is no image; one whose check blocks are whole is a damaged image."""
+    """Refuse bytes that are not an image; with whole check blocks they are a damaged image."""
     if data[: len(layout.MAGIC)] != layout.MAGIC and not (data and has_check_blocks(data)):
         raise OnboardImageError(
             f"{where}: not an onboard image: begins with {quoted(data[:8])}; expected "
@@ -231,7 +231,7 @@ def _sections(
 Numbers = Mapping[str, int | float]
 
 UNIT_TOLERANCE = 1e-8
-"""Directions are of length 1 but for the rounding of their components."""
+"""Directions have length 1 up to the rounding of their components."""
 
 
 def sizes_of(header: Numbers) -> Sizes:

@@ -1,1 +1,1 @@
-"""Planning: what a star sensor will see at attitudes of the future, and where it is blind."""
+"""Planning: the stars that a sensor will see at future attitudes, and the gaps without enough."""

@@ -20,14 +20,14 @@ from starcat.matcher.chance import MIN_STARS, largest_squares_px, place_informat
 from starcat.matcher.stars import ARCSEC, turns_per_px
 
 ENOUGH_STARS = 40
-"""So many detected stars or more count as this many; the limit is far behind."""
+"""More detected stars than this count as this many; far fewer are enough for an answer."""
 
 
 def detected_counts(probability: Array, group: Rows, count: int) -> Array:
     """Return the probabilities that 0, 1, ... stars of each group are detected.
 
-    ``probability`` of shape (P,) and ``group`` of shape (P,), ascending; the result has the shape
-    (count, ENOUGH_STARS + 1), and its last column is that of all larger numbers too.
+    ``probability`` and ``group``, ascending, have the shape (P,). The result has the shape
+    (count, ENOUGH_STARS + 1); its last column includes all larger numbers.
     """
     found = np.zeros((count, ENOUGH_STARS + 1))
     found[:, 0] = 1.0
@@ -62,10 +62,10 @@ def acquisition_probability(
     probability, group : ndarray, shape (P,)
         Probability that each star is detected, and its frame, 0 to K - 1, ascending.
     in_frame, n_false : ndarray of int, shape (K,)
-        Stars of the database in each frame, detected or not, and centroids that are no stars.
+        Stars of the database in each frame, detected or not, and centroids that are not stars.
     camera : Camera
     noise_px : float
-        Standard deviation of a centroid on each axis, which the matcher is told.
+        Standard deviation of a centroid on each axis, as given to the matcher.
     limit : float
         Largest false-match probability of an answer.
     """
@@ -100,8 +100,8 @@ def expected_errors_arcsec(
 ) -> Array:
     """Return the standard deviations of attitudes about the axes of the camera, shape (count, 3).
 
-    They are those of `attitude_covariance`, with every star weighted by its probability to be
-    detected; infinite where the stars determine no attitude.
+    They are computed as in `attitude_covariance`, with every star weighted by its probability to
+    be detected; infinite if the stars determine no attitude.
     """
     normal, torque = np.zeros((count, 3, 3)), np.zeros((count, 3, 3))
     for (i, j), term in information_terms(body).items():

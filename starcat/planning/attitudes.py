@@ -28,7 +28,7 @@ MAX_ATTITUDES = 100_000
 """Rows of a table of attitudes or of an orbit."""
 
 MAX_BYTES = 64 << 20
-"""Of a file of attitudes or of an orbit."""
+"""Largest size of a file of attitudes or of an orbit."""
 
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANGLES = ("ra_deg", "dec_deg", "roll_deg")
@@ -46,7 +46,7 @@ class PlannedAttitudes:
     """Attitudes in the order of their table."""
 
     matrices: Array  # camera from ICRS, shape (K, 3, 3)
-    times: tuple[datetime, ...] | None = None  # UTC; None where nothing states them
+    times: tuple[datetime, ...] | None = None  # UTC; None if not stated
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Orbit:
     """Positions and velocities at some times."""
 
     times: tuple[datetime, ...]  # UTC, ascending
-    position_km: Array  # from the middle of the Earth, ICRS axes, shape (T, 3)
+    position_km: Array  # relative to the middle of the Earth, ICRS axes, shape (T, 3)
     velocity_km_s: Array
 
     def observers(self, times: Sequence[datetime]) -> list[Observer]:
@@ -276,7 +276,7 @@ def _aem(name: str, lines: list[str]) -> dict[str, Any]:
         if (a in INERTIAL) == (b in INERTIAL):
             raise ConfigError(
                 f"{name}: the frames are {a or 'missing'} and {b or 'missing'}; expected one of "
-                f"{', '.join(INERTIAL[:4])} and that of the spacecraft"
+                f"{', '.join(INERTIAL[:4])} and the spacecraft's frame"
             )
         is_reversed = (b in INERTIAL) != (meta.get("ATTITUDE_DIR", "A2B") == "B2A")
         is_first = meta.get("QUATERNION_TYPE", "LAST") == "FIRST"

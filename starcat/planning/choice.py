@@ -1,4 +1,4 @@
-"""The choice of guide stars for one attitude: stages of limits, and a reason for each other star.
+"""The choice of guide stars for one attitude: stages of limits, and why other stars are left out.
 
 Each stage has limits that are looser than those of the previous one. Stars that meet the limits of
 a stage are taken in the order of brightness until there are enough, as proseco does for Chandra.
@@ -21,11 +21,11 @@ class StageOfLimits:
     """The limits of one stage; ends are included."""
 
     min_detection: float  # probability to be detected
-    max_contamination: float  # fraction of light from other stars, where it is known
-    max_offset_px: float  # shift of the centroid by other stars, where it is known
+    max_contamination: float  # fraction of light from other stars, if it is known
+    max_offset_px: float  # shift of the centroid by other stars, if it is known
     max_lookalikes: float  # stars of similar brightness in the window
-    min_edge_px: float  # from the edge of the detector
-    min_apart_fraction: float  # from stars that are taken, over the width of the detector
+    min_edge_px: float  # distance from the edge of the detector
+    min_apart_fraction: float  # distance from taken stars, over the width of the detector
 
 
 STAGES = (

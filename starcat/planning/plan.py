@@ -1,4 +1,4 @@
-"""Plans: the guide stars that a sensor will see at many attitudes, and what follows from them."""
+"""Plans: the guide stars that a sensor will see at many attitudes, and the resulting accuracy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from starcat.sky.observer import Observer, aberrated
 from starcat.stars.star_table import floats_of
 
 BLOCK = 2000
-"""Attitudes that are planned at once."""
+"""Number of attitudes that are planned at once."""
 
 MIN_DETECTION = 0.001
 """Stars that are less likely to be detected are not listed."""
@@ -42,7 +42,7 @@ NEAREST_RAD = np.radians(0.01)
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of the sensor, and asked of the plan.
+    """The expected properties of the sensor, and the requirements on the plan.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class Expected:
     limit_mag : float or None
         Fainter measured magnitudes are not detected; None if all guide stars are.
     drop_probability : float
-        Probability of any star to be missing for other reasons.
+        Probability that a star is missing for other reasons.
     false_stars : int
-        Centroids of each frame that are no stars.
+        Centroids of each frame that are not stars.
     window_arcsec, lookalike_mag : float
         Radius of the window in which a star is looked for, and the largest difference of the
         magnitude of a star that can be taken for it.
@@ -121,20 +121,20 @@ class Plan:
     Attributes
     ----------
     error_arcsec : ndarray of float64, shape (K, 3)
-        Standard deviations of the attitude about x, y and z of the camera; infinite where the
-        stars determine none.
+        Standard deviations of the attitude about x, y and z of the camera; infinite if the stars
+        determine no attitude.
     acquisition : ndarray of float64, shape (K,)
-        Probability that the frame is identified without a prior attitude, by a matcher that is
-        told ``noise_px``.
+        Probability that the frame is identified without a prior attitude, by a matcher with this
+        ``noise_px``.
     stars_expected : ndarray of float64, shape (K,)
         Mean number of detected guide stars.
     angles_deg : mapping of str to ndarray of float64, shape (K,)
-        From the boresight to the bodies of the solar system: the limb of the Earth (with an
-        orbit), the middles of the others. Empty without times.
+        Angles from the boresight to the bodies of the solar system: to the limb of the Earth (with
+        an orbit), to the middles of the others. Empty without times.
     bodies : tuple of tuple of dict
         The Sun, the Moon and planets in each frame: name, x_px, y_px, mag.
     stars : PlannedStars
-        The stars of all frames; `stars_of` has those of one with all that is known of them.
+        The stars of all frames; `stars_of` returns the stars of one frame with all their values.
     """
 
     database: Database
@@ -147,8 +147,8 @@ class Plan:
     angles_deg: Mapping[str, Array]
     bodies: tuple[tuple[dict[str, Any], ...], ...]
     stars: PlannedStars
-    # Of each star of the database: number of look-alikes, and what a build wrote of its blend, NaN
-    # where the spec states no window.
+    # For each star of the database: number of look-alikes, and the values of its blend from the
+    # build, NaN if the spec states no window.
     lookalikes: NDArray[np.int64]
     contamination: Array
     centroid_offset_px: Array
@@ -168,7 +168,7 @@ class Plan:
 
     @property
     def is_usable(self) -> Mask:
-        """Where acquisition is as likely as asked for and no body is too near, shape (K,)."""
+        """Attitudes with the required acquisition and no body too near, shape (K,)."""
         near = np.zeros(len(self), dtype=bool)
         for mask in self.violated.values():
             near |= mask
@@ -176,7 +176,7 @@ class Plan:
 
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
-        """The attitudes that are not usable, those in a row together."""
+        """The attitudes that are not usable; consecutive ones form one gap."""
         edges = np.flatnonzero(np.diff(np.concatenate([[True], self.is_usable, [True]])))
         found = []
         for first, end in edges.reshape(-1, 2).tolist():
@@ -215,7 +215,7 @@ class Plan:
         return [dict(zip(columns, cells, strict=True)) for cells in rows_of_cells]
 
     def attitude(self, row: int) -> dict[str, Any]:
-        """Return what is known of an attitude but its stars, as plain values."""
+        """Return all values of an attitude except its stars, as plain values."""
         matrix = self.attitudes.matrices[row]
         ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
         return {
@@ -399,7 +399,7 @@ def _surroundings(
 
 @dataclass(frozen=True, eq=False)
 class _Block(PlannedStars):
-    """The stars of some attitudes, and what follows from them."""
+    """The stars of some attitudes, and the resulting accuracy and acquisition."""
 
     error_arcsec: Array
     acquisition: Array

@@ -1,4 +1,4 @@
-"""Room 2: guide stars become the tables that a tracker looks things up in. Pure functions."""
+"""Products: the tables, made from guide stars, in which a tracker looks things up."""
 
 from starcat.rooms import lazy_names
 

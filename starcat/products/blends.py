@@ -1,9 +1,9 @@
 """Blends: where a centroid settles when other stars are in its window, and with how much light.
 
-Input are neighbours around stars as offsets and ratios of light, output are the offset of the
-centroid and the light that is measured with it, for Gaussian spots. The centroid is one in a
-Gaussian window or the centre of mass in a box of pixels. The widths of the window are those of our
-own centroiding (`starcat.images.centroiding`), which takes them from here.
+The input is the neighbours of stars, as offsets and ratios of light. The output is the offset of
+the centroid and the light that is measured with it, for Gaussian spots. The centroid is computed in
+a Gaussian window or as the centre of mass of a box of pixels. The widths of the window are defined
+here and used by our own centroiding (`starcat.images.centroiding`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 
 PIXEL_VARIANCE = 1.0 / 12.0
-"""What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise."""
+"""Variance that a square pixel adds to a spot, and that rounding to whole numbers adds to noise."""
 
 NARROWEST_WINDOW_PX = 1.0
 """A narrower window follows the pixel grid (docs/decisions.md)."""
@@ -25,28 +25,28 @@ NARROWEST_WINDOW_PX = 1.0
 APERTURE_SIGMA = 2.0
 """Radius of the circle that brightness is measured in, standard deviations of the spot."""
 
-_REACH = 6.0  # of a star 10 mag brighter at so many widths a thousandth of a width is left
+_REACH = 6.0  # widths; a star 10 mag brighter at this distance moves a spot by 0.001 widths
 _STEP = 1e-6  # widths; a shorter step is the last one
-_MAX_STEPS = 200  # only two equal stars that are just one spot need more
+_MAX_STEPS = 200  # only two equal stars that barely merge into a single spot need more
 
 
 _PHASES = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
 """Places of a peak in its pixel, in pixels from the middle, that a box is averaged over."""
 
 _PARTED = (2.75, 0.61)
-"""Two equal stars are found apart from so many widths of a smoothed spot on, and from so many more
-for each magnitude that one is fainter: measured of our own detection (docs/algorithms.md)."""
+"""Smallest distance at which two equal stars are detected as two, in widths of a smoothed spot, and
+its growth per magnitude of difference: measured with our own detection (docs/algorithms.md)."""
 
 
 @dataclass(frozen=True)
 class Widths:
     """Standard deviations of a spot and of the window around it; all in pixels or in an angle."""
 
-    spot: float  # of the spot as the pixels show it
-    window: float  # of the Gaussian that weights the pixels of a centroid
-    smoothed: float  # of the spot in the filtered image that stars are found in
+    spot: float  # the spot as the pixels show it
+    window: float  # the Gaussian that weights the pixels of a centroid
+    smoothed: float  # the spot in the filtered image in which stars are detected
     pixel: float = 1.0  # side of a pixel
-    box_px: int | None = None  # pixels on a side of a box; without one the window counts
+    box_px: int | None = None  # pixels on a side of a box; None for the Gaussian window
 
     @property
     def both(self) -> float:
@@ -55,7 +55,7 @@ class Widths:
 
     @property
     def reach(self) -> float:
-        """How far a star can be to count."""
+        """Largest distance of a star that is taken into account."""
         if self.box_px is not None:
             return _REACH * self.spot + 0.75 * (self.box_px + 1) * self.pixel
         return _REACH * self.both
@@ -71,7 +71,7 @@ class Widths:
 def widths_px(
     psf_sigma_px: float, window_px: float | None = None, box_px: int | None = None
 ) -> Widths:
-    """Return the widths for a spot that pixels sample; the window is that of our centroiding.
+    """Return the widths for a spot that pixels sample, with the window of our centroiding.
 
     With ``box_px`` the centroid is the centre of mass in a box of that many pixels on a side.
 
@@ -85,15 +85,13 @@ def widths_px(
 
 @dataclass(frozen=True)
 class Blends:
-    """What neighbours do to the spots of N stars."""
+    """The effect of neighbours on the spots of N stars."""
 
-    offset: Array  # shape (N, 2): of the centroid from the star, in the unit of the widths
-    # shape (N,): light in the aperture, or in the box, over that of the star alone
+    offset: Array  # shape (N, 2): centroid minus star, in the unit of the widths
+    # shape (N,): light in the aperture, or in the box, over the light of the star alone
     brightening: Array
-    contamination: Array  # shape (N,): share of that light which is of other stars
-    is_lost: (
-        Mask  # shape (N,): not found beside a brighter star, so that its centroid is that one's
-    )
+    contamination: Array  # shape (N,): share of that light that other stars contribute
+    is_lost: Mask  # shape (N,): not detected next to a brighter star, whose centroid it gets
 
 
 def blends(
@@ -102,17 +100,17 @@ def blends(
     """Return where the centroids of stars settle among their neighbours.
 
     A Gaussian spot at ``d`` from the middle of a Gaussian window has there the moment
-    ``f d exp(-d^2 / 2 (s^2 + w^2))``, but for a factor that is the same for all spots. The
-    centroid is where the moments of the star and its neighbours add up to nothing: at a maximum
-    of the image smoothed by the window. It is looked for uphill from the star itself, or from the
-    brightest neighbour that it is not told apart from, by steps to the mean of the places weighted
-    by ``f exp(...)``. The aperture's share of a spot is that of the noncentral chi-squared
+    ``f d exp(-d^2 / 2 (s^2 + w^2))``, up to a factor that is the same for all spots. At the
+    centroid the moments of the star and its neighbours add up to zero: it is a maximum of the image
+    smoothed by the window. The search goes uphill from the star itself, or from the brightest
+    neighbour that it is not separated from, by steps to the mean of the places weighted by
+    ``f exp(...)``. The aperture's share of a spot follows from the noncentral chi-squared
     distribution.
 
     With a box, `Widths.box_px`, the centroid is the centre of mass of the pixels in a box around
-    the brightest pixel, where the star's own maximum of light is or the maximum of the brightest
-    neighbour that it is not told apart from. Where that maximum is in its pixel is not known: all
-    places in the pixel are averaged.
+    the brightest pixel. This pixel contains the star's own maximum of light, or the maximum of the
+    brightest neighbour that the star is not separated from. The place of that maximum in its pixel
+    is not known: all places in the pixel are averaged.
 
     Parameters
     ----------
@@ -123,11 +121,11 @@ def blends(
     offset : ndarray of float64, shape (M, 2)
         Place of each neighbour from its star, in the unit of ``widths``.
     light : ndarray of float64, shape (M,)
-        Light of each neighbour over that of its star.
+        Light of each neighbour over the light of its star.
     is_brighter : ndarray of bool, shape (M,)
-        Whether the neighbour is the brighter of the two; of equal stars one is.
+        Whether the neighbour is the brighter of the two; for equal stars, one of them is.
     widths : Widths
-        Of the spots and of the window.
+        Widths of the spots and of the window.
 
     References
     ----------
@@ -218,7 +216,7 @@ def _in_pixels(away: Array, middle: Array, widths: Widths) -> tuple[Array, Array
 def _starts(
     count: int, star: Rows, offset: Array, light: Array, is_brighter: Mask, widths: Widths
 ) -> tuple[Array, Mask]:
-    """Return where the centroiding of each star begins, and whether that is at another star."""
+    """Return the start of the centroiding of each star, and whether that is another star."""
     start, is_lost = np.zeros((count, 2)), np.zeros(count, dtype=bool)
     equal, for_each_mag = _PARTED
     rows = np.flatnonzero(is_brighter)
@@ -241,7 +239,7 @@ def _with_the_stars(
 
 
 def _settled(start: Array, star: Rows, offset: Array, light: Array, width: float) -> Array:
-    """Return where steps uphill end."""
+    """Return the places where steps uphill end."""
     count, centroid = len(start), start.copy()
     moving = np.bincount(star, minlength=count) > 1
     rows = np.arange(len(star))

@@ -1,4 +1,4 @@
-"""Counting what a product will have, around some of the stars, without making it.
+"""Estimates of the size of a product, counted around some of the stars, without making it.
 
 Neighbours are counted, not found, and the triangles that several fields share are known from some
 of the triangles; so this takes a moment where making the products takes minutes.
@@ -14,14 +14,14 @@ from starcat.geometry.sphere import chord_from_separation
 from starcat.products.tiling import FieldStars
 
 SAMPLE = 2000
-"""Stars around which neighbours are counted, and triangles whose fields are."""
+"""Number of stars around which neighbours are counted, and of triangles whose fields are."""
 
 MAX_IN_TREE, MAX_MET = 500_000, 20_000_000
-"""Of more stars than these, and more neighbours of all that are looked at, only some are searched
-for neighbours; so many lose little."""
+"""Largest numbers of stars in the tree and of neighbours that are visited; if there are more, only
+some stars are searched, which loses little accuracy."""
 
 QUANTILES = 64
-"""Numbers of neighbours that stand for those of all stars, where a pattern's cells are counted."""
+"""Number of quantiles that represent the neighbours of all stars when cells are counted."""
 
 
 class Neighbourhoods:
@@ -51,7 +51,7 @@ class Neighbourhoods:
 
     def _count(self, radius_rad: float) -> Array:
         count, some = len(self._directions), self._some
-        # Wide circles hold so many stars that some of these tell of all.
+        # Wide circles hold so many stars that a sample of them is enough.
         share = 0.5 * (1.0 - np.cos(min(radius_rad, np.pi)))
         thinning = 1 + int(count * max(share * len(some) / MAX_MET, 1.0 / MAX_IN_TREE))
         if thinning not in self._trees:

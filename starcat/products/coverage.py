@@ -1,4 +1,4 @@
-"""Coverage: what each field of the tiling holds, and how far apart the fields lie.
+"""Coverage: the contents of each field of the tiling, and how far apart the fields lie.
 
 Counts come from the tiling of the guide stars; a summary is made for the report and the
 command line. Nothing here draws or writes.
@@ -19,12 +19,12 @@ from starcat.products.tiling import FieldStars
 Counts = NDArray[np.int64]
 
 MIN_GUIDE_STARS = 4
-"""Fewer than these cannot be identified by anything."""
+"""Smallest number of stars from which any method can identify a frame."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the field of each boresight holds."""
+    """The contents of the field of each boresight."""
 
     boresights: Directions
     stars: Counts  # shape (F,): guide stars in the field
@@ -53,7 +53,7 @@ class CoverageSummary:
     stars: Spread
     pairs: Spread
     triangles: Spread
-    # the field with the fewest stars; the first along the spiral where several have
+    # the field with the fewest stars; if several have as few, the first along the spiral
     worst_boresight: int
     worst_ra_deg: float
     worst_dec_deg: float
@@ -127,9 +127,9 @@ def _spread(counts: Counts) -> Spread:
 
 
 def tiling_gap(boresights: Directions, tile_radius_rad: float) -> TilingGap:
-    """Compare the gaps between boresights with what a field covers at any roll.
+    """Compare the gaps between boresights with the area that a field covers at any roll.
 
-    The radius is that of the largest circle inside a field, half of its narrower angle.
+    The radius is half of the narrower angle of a field: the largest circle inside a field.
 
     >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> tiling_gap(saff_kuijlaars(10_000), np.radians(6.0)).has_holes
@@ -145,13 +145,13 @@ def tiling_gap(boresights: Directions, tile_radius_rad: float) -> TilingGap:
 def covering_radius(directions: Directions) -> tuple[float, Array]:
     """Return how far a direction can be from the nearest of some directions.
 
-    Radians, and the unit vector that is so far away; of several the first by x, y and z.
+    Radians, and the unit vector at that distance; of several the first by x, y and z.
 
     The facets of the convex hull are the spherical Delaunay triangles, and the normal of a
-    facet is the centre of its circumcircle, which holds no other direction. Where the farthest
+    facet is the centre of its circumcircle, which holds no other direction. If the farthest
     of these centres is less than 90 deg away, it is the farthest direction of all. Otherwise all
-    directions lie in one half of the sphere, and the farthest one may also be opposite to the
-    middle of an edge of the hull.
+    directions lie in one half of the sphere, and the farthest direction can also be opposite to
+    the middle of an edge of the hull.
 
     >>> octahedron = np.concatenate([np.eye(3), -np.eye(3)])
     >>> round(float(np.degrees(covering_radius(octahedron)[0])), 3)
@@ -191,10 +191,10 @@ def _opposite_to_middle(u: Array, v: Array) -> Array:
 
 
 def _opposite_to_circle(directions: Directions) -> Array:
-    """Return where the farthest direction from those of one circle can be.
+    """Return where the farthest direction from the directions of one circle can be.
 
-    That is at a pole of the circle, or opposite to the middle of the directions at the ends of
-    its largest gap.
+    This is a pole of the circle, or the place opposite to the middle of the directions at the
+    ends of its largest gap.
     """
     apart = directions - directions.mean(axis=0)
     _, _, (along, across, normal) = np.linalg.svd(apart, full_matrices=len(directions) < 3)

@@ -92,7 +92,7 @@ def _as_type(
 
 
 def matched_rows(table: pa.Table) -> NDArray[np.intp]:
-    """Return the rows that name the counterpart of a star, be it ambiguous."""
+    """Return the rows that name the counterpart of a star, including ambiguous ones."""
     named = pc.is_in(table["verdict"], pa.array(["unique", "best", "ambiguous"]))
     return np.flatnonzero(named.to_numpy() & (table["rank"].to_numpy() == 1))
 
@@ -167,7 +167,7 @@ class Crossmatch(ProductSection):
         return self.catalogs if self.enabled else ()
 
     def check_agrees(self, facts: SpecFacts) -> None:
-        """Check that no catalog is that of the stars."""
+        """Check that the catalog of the stars is not among the catalogs."""
         if facts.catalog in self.catalogs:
             raise ValueError(
                 f"products.crossmatch.catalogs: {facts.catalog} is the catalog of the stars "
@@ -176,7 +176,7 @@ class Crossmatch(ProductSection):
 
 
 def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
-    """Yield where the crossmatch product contradicts itself or the stars."""
+    """Yield contradictions within the crossmatch product, and with the stars."""
     yield from _separation_problems(table, stars)
     yield from _rank_problems(table)
     unknown = set(pc.unique(table["verdict"]).to_pylist()) - set(VERDICTS)
@@ -187,7 +187,7 @@ def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
 def _separation_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     own = stars.take(table["star"].combine_chunks())
     epoch = floats_of(table, "compared_jyear")
-    # By the catalog's own way of moving stars, not by that which made the product.
+    # Move stars as the catalog itself does, not with the code that made the product.
     angle = separation(_moved_to(own, epoch), _moved_to(table, epoch))
     off = np.abs(np.degrees(angle) * 3600.0 - floats_of(table, "separation_arcsec"))
     for row in np.flatnonzero(~(off <= SEPARATION_TOLERANCE_ARCSEC))[:1]:

@@ -21,9 +21,9 @@ ARCSEC = float(np.degrees(1.0)) * 3600.0
 
 @dataclass(frozen=True)
 class ErrorSpread:
-    """How one error is spread over the fields; infinite where there is no attitude."""
+    """How one error is spread over the fields; infinite for a field without an attitude."""
 
-    # values that occur; 50 % and 99 % of the fields have no larger one than these
+    # errors that occur; 50 % and 99 % of the fields have at most these errors
     median: float
     one_percent: float
     worst: float
@@ -31,12 +31,12 @@ class ErrorSpread:
 
 @dataclass(frozen=True, eq=False)
 class Evenness:
-    """What the stars of the fields allow, in arcseconds for each pixel of a centroid's noise."""
+    """Errors that the stars of the fields allow, arcseconds per pixel of centroid noise."""
 
-    # standard deviations, shape (F,): infinite where the stars of a field determine no attitude
+    # standard deviations, shape (F,): infinite if the stars of a field determine no attitude
     across: Array  # across the boresight, root mean square of the two axes
     about: Array  # about the boresight
-    entropy: float  # of the distribution of the stars over cells; 1 where all hold as many
+    entropy: float  # entropy of the stars over cells; 1 if all cells hold as many
     cells: int
 
     @property
@@ -63,9 +63,9 @@ def evenness_of(
 
 
 def field_deviations(fields: FieldStars, directions: Directions) -> Array:
-    """Return the deviations of the attitude of each field for a noise of 1 of its stars.
+    """Return the deviations of the attitude of each field if its stars have a noise of 1.
 
-    Shape (F, 3), about x, y and z of the frame at roll 0; infinite where there is no attitude.
+    Shape (F, 3), about x, y and z of the frame at roll 0; infinite without an attitude.
     """
     seen = fields.seen(directions)
     return attitude_deviations(information_of_groups(seen, fields.field, len(fields.boresights)))

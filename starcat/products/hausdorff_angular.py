@@ -1,6 +1,6 @@
 """The product ``hausdorff_angular``: every star's neighbours by separation.
 
-Separations do not change as the camera turns. A row is one neighbour of one star.
+Separations do not change as the camera turns. Each row holds a neighbour of a star.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class HausdorffAngular(ProductSection):
     )
 
     def reach_rad(self, inputs: ProductInputs) -> float:
-        """Return how far a star of the set may be; S5 has 4/3 of the field's radius."""
+        """Return the largest separation of the set; S5 uses 4/3 of the field's radius."""
         return inputs.radius_rad(self.radius_deg, 4.0 / 3.0)
 
 

@@ -1,6 +1,6 @@
-"""The product ``hausdorff_l2``: every star's neighbours by planar distance over the smallest one.
+"""The product ``hausdorff_l2``: each star's neighbours by planar distance over the smallest one.
 
-Such ratios do not even depend on the camera's focal length. A row is one neighbour of one star.
+These ratios do not even depend on the camera's focal length. Each row holds a neighbour of a star.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class PlanarReferenceSets:
     neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
     # shape (M,): gnomonic distance over the star's smallest one, 1 or more, ascending within a star
     ratio: Array
-    # datasets ``star_offsets`` as above, and ``smallest_distance``, float64, shape (N,): what was
-    # divided by, in units of the focal length, NaN for a star without rows; ``radius_rad``
+    # datasets ``star_offsets`` as above, and ``smallest_distance``, float64, shape (N,): the
+    # divisor, in units of the focal length, NaN for a star without rows; ``radius_rad``
     index: Index
 
 

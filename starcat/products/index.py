@@ -1,8 +1,8 @@
-"""What a product is made of: columns named as its schema has them, and the matcher's indices.
+"""The parts of a product: columns with the names of its schema, and the matcher's indices.
 
 Every product function returns a frozen dataclass whose attributes carry the names of the
-schema's columns; a ragged column is a `Ragged`. What only a matcher needs (a K-vector, a
-look-up table, where each star's rows begin) is the attribute ``index``.
+schema's columns; a ragged column is a `Ragged`. Arrays that only a matcher needs (a K-vector, a
+look-up table, the first row of each star) are in the attribute ``index``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from starcat.geometry.kvector import KVector
 
 @dataclass(frozen=True)
 class Ragged:
-    """A list a row: that of row n is ``values[offsets[n]:offsets[n + 1]]``."""
+    """One list per row: row n has the list ``values[offsets[n]:offsets[n + 1]]``."""
 
     offsets: NDArray[np.int64]
     values: NDArray[Any]
@@ -26,10 +26,10 @@ class Ragged:
 
 @dataclass(frozen=True)
 class Index:
-    """Arrays and numbers beside a product's columns, kept in the HDF5 file alone."""
+    """Arrays and numbers in addition to a product's columns, stored only in the HDF5 file."""
 
     datasets: dict[str, NDArray[Any]] = field(default_factory=dict)
-    attributes: dict[str, float] = field(default_factory=dict)  # with units in the names
+    attributes: dict[str, float] = field(default_factory=dict)  # names include units
 
 
 def kvector_index(kvector: KVector) -> Index:

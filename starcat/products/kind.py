@@ -1,9 +1,9 @@
-"""What the module of a product says of it: one `ProductKind`, which all other rooms read.
+"""The description of a product by its module: one `ProductKind`, which all other packages read.
 
-A module of this room that defines ``POSITION`` and ``KIND`` is a product
-(`starcat.products.table`). Its schema says what the columns mean. Only what differs from the usual
-has to be given: a product that is made from the guide stars alone has a name, a section of the
-spec, a function that makes it and one that counts its rows.
+A module of this package that defines ``POSITION`` and ``KIND`` is a product
+(`starcat.products.table`). Its schema describes the columns. Only fields that differ from their
+defaults are given: a product that is made from the guide stars alone has a name, a section of the
+spec, a function that makes it and a function that counts its rows.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 HALF_FIELD = "default: half of the camera's narrower field"
-"""What the description of a radius says of its default."""
+"""Default of a radius, in words, for its description."""
 
 
 @dataclass(frozen=True)
 class SpecFacts:
-    """What the rest of a spec says that a section of a product has to agree with."""
+    """Facts of the rest of a spec with which the section of a product has to agree."""
 
     catalog: str  # name of the catalog of the stars
     camera: Camera
@@ -51,7 +51,7 @@ class ProductSection(Section):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the catalogs that the product is made from beside that of the stars."""
+        """Names of the catalogs that the product is made from, without the stars' own catalog."""
         return ()
 
     def widest_field_deg(self, own_deg: float) -> float:
@@ -68,10 +68,10 @@ class ProductSection(Section):
         """
 
     def check_fields(self, stars: int, boresights: int, size: FieldSize, max_stars: int) -> None:
-        """Check that a tiling of the product's own is not too large to be counted.
+        """Check that the product's own tiling, if it has one, is not too large to be counted.
 
         ``boresights`` and ``size`` are the number and the size of the database's own fields, and
-        ``max_stars`` is how many fields, and stars in them, are gone through at the most.
+        ``max_stars`` is the largest number of fields, and of stars in them, that are counted.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class ProductSection(Section):
 
 @dataclass(frozen=True)
 class ProductInputs:
-    """What every product is made from."""
+    """The inputs of every product."""
 
     directions: Directions  # shape (N, 3): guide stars, ICRS
     mag: Array  # shape (N,)
@@ -91,8 +91,8 @@ class ProductInputs:
     boresights: int  # number of the tiling's fields
     brightest: int  # stars of a field that make its triangles
     half_field_deg: float  # half of the camera's narrower full angle
-    diagonal_rad: float  # of the camera's field
-    wanted: Mapping[str, ProductSection]  # sections of the products that are asked for
+    diagonal_rad: float  # diagonal of the camera's field
+    wanted: Mapping[str, ProductSection]  # sections of the products that are requested
 
     def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
         """Return a radius of a spec; None is half of the field, times a factor."""
@@ -131,7 +131,7 @@ def one_row_a_star(inputs: ProductInputs, _: Any) -> Extent:
 
 @dataclass(frozen=True)
 class RowCost:
-    """What a row of a product costs."""
+    """The cost of a row of a product."""
 
     held_bytes: float  # while the other products are made and written
     working_bytes: float  # beside that, while it is made itself
@@ -139,7 +139,7 @@ class RowCost:
 
 
 USUAL_COST = RowCost(24.0, 60.0, 1.2)
-"""What a row costs of which nothing else was measured."""
+"""Cost of a row if it was not measured for the product."""
 
 STAR_ROW_IN_ORDER = 2.3
 """Bytes of a row of the star table in a Parquet file, ascending and each once."""
@@ -166,32 +166,32 @@ def rows_by_star_bytes(extent: Extent, stars: int, each: float) -> float:
 
 @dataclass(frozen=True)
 class ProductKind:
-    """Everything that is known of a product.
+    """The description of a product.
 
     The functions take the product's own section of the spec as their last argument. Sizes of
     Parquet files were measured on skies of 200 to 170,000 stars, costs with numpy 2 on products of
     0.5 to 6 million rows.
     """
 
-    name: str  # as in its schema, the spec and the database
+    name: str  # the name in its schema, the spec and the database
     # Makes the product: attributes are named as the columns of the schema, and ``index`` is an
-    # `Index`. None where the pipeline makes it from more than guide stars.
+    # `Index`. None if the pipeline makes it from more than guide stars.
     make: Callable[[ProductInputs, Any], Any] | None = None
-    section: type[ProductSection] | None = None  # None where every database has the product
+    section: type[ProductSection] | None = None  # None if every database has the product
     in_database: bool = True  # whether the matcher's HDF5 file has it
-    # Its indices. That of a product that the matcher opens is in `LAYOUTS`, with its columns.
+    # Its indices. If the matcher opens the product, its layout is in `LAYOUTS`, with its columns.
     own_layout: ProductLayout = field(default_factory=ProductLayout)
-    # Counts it without making it. None where guide stars do not tell.
+    # Counts it without making it. None if the rows cannot be counted from guide stars.
     count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
-    # What a row costs, or a neighbour or triangle that `Extent.reached` counts. None where the
+    # Cost of a row, or of a neighbour or triangle that `Extent.reached` counts. None if the
     # estimate leaves its memory and time out.
     cost: RowCost | None = USUAL_COST
-    # Bytes of its columns in a Parquet file, from the number of stars. None where values are
+    # Bytes of its columns in a Parquet file, from the number of stars. None if values are
     # written as they are.
     file_bytes: Callable[[Extent, int, Any], float] | None = None
-    # Yields what contradicts itself or the stars, from the tables of the product and of the stars.
+    # Yields contradictions in the tables of the product and of the stars.
     problems: Callable[[pa.Table, pa.Table], Iterator[str]] | None = None
-    # Counts the stars that the product has from a catalog, and what these stars have.
+    # Counts the stars for which the product uses a catalog; and what these stars have, in words.
     joined: tuple[Callable[[pa.Table, str], int], str] | None = None
 
     @property
@@ -201,12 +201,12 @@ class ProductKind:
 
     @property
     def layout(self) -> ProductLayout:
-        """Its indices, and its columns where the matcher opens it."""
+        """Its indices, and its columns if the matcher opens it."""
         return LAYOUTS.get(self.name, self.own_layout)
 
     @property
     def is_usual(self) -> bool:
-        """Whether a spec that does not speak of the product asks for it, and it can be left out."""
+        """Whether a database has the product by default, and a spec can leave it out."""
         return self.section is not None and self.section().enabled
 
     def is_wanted(self, inputs: ProductInputs) -> bool:
@@ -224,7 +224,7 @@ class ProductKind:
         )
 
     def index_bytes(self, extent: Extent, stars: int) -> float:
-        """Return how many bytes stand beside the columns in the database."""
+        """Return the bytes of the indices in the database, without the columns."""
         layout = self.layout
         total = 8.0 * stars * (layout.by_star + len(layout.per_star))
         total += 4.0 * extent.rows * layout.kvector

@@ -1,8 +1,8 @@
 """Layouts: the columns, indices, numbers and ranges of the products that the matcher opens.
 
-The matcher checks every dataset that it maps against them, and it runs where neither pydantic nor
-pyarrow is installed. This module therefore needs nothing, and the modules of the products take
-their layouts from it. Units and meanings are in the schemas.
+The matcher checks every dataset that it maps against them. It must run without pydantic and
+pyarrow, so this module imports nothing, and the modules of the products take their layouts from
+it. Units and meanings are in the schemas.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ LARGEST = 1e6
 """No angle, distance, magnitude or direction of a database is larger, in its own unit."""
 
 SMALLEST = 1e-9
-"""No radius, bin or number of bins is smaller: what is divided by it stays a number."""
+"""No radius, bin or number of bins is smaller, so that a division by it stays finite."""
 
 RANGES = {
     "ratio": (1.0, 1e20),
     "separation_rad": (0.0, pi),
     "smallest_distance": (0.0, LARGEST),
-    # Infinite where three stars are in a line.
+    # Infinite if three stars are in a line.
     "circumradius_rad": (0.0, inf),
     "fov_x_deg": (0.001, 179.0),
     "fov_y_deg": (0.001, 179.0),
@@ -31,7 +31,7 @@ RANGES = {
 """Narrower and wider ranges of some real numbers, ends included."""
 
 MAY_BE_UNKNOWN = ("mag", "smallest_distance")
-"""Real numbers that are NaN where a star has none."""
+"""Real numbers that are NaN for a star without a value."""
 
 
 @dataclass(frozen=True)
@@ -44,28 +44,28 @@ class ProductLayout:
     reals: tuple[str, ...] = ()
     # Rows of the stars.
     stars: tuple[str, ...] = ()
-    # List columns of integers, each with the number that they stay below, from the product's
+    # List columns of integers, each with the number that its values stay below, from the product's
     # numbers and the number of stars.
     lists: dict[str, Callable[[Numbers, int], float]] = field(default_factory=dict)
-    # Whether ``star_offsets`` says where the rows of each star begin.
+    # Whether there is ``star_offsets``, the first row of each star.
     by_star: bool = False
     # Whether there is a K-vector: ``kvector_counts`` and its line.
     kvector: bool = False
     # Look-up tables of rows, ``<name>_offsets`` and ``<name>_rows``, with the number of bins.
     bins: dict[str, Callable[[Numbers], float]] = field(default_factory=dict)
-    # Real numbers, one a star.
+    # Real numbers, one per star.
     per_star: tuple[str, ...] = ()
     # Attributes of at least `SMALLEST`.
     numbers: tuple[str, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Datasets with one value a row."""
+        """Datasets with one value per row."""
         return (*self.texts, *self.wholes, *self.reals, *self.stars)
 
     @property
     def indices(self) -> tuple[str, ...]:
-        """Datasets beside the columns of the schema."""
+        """Datasets in addition to the columns of the schema."""
         return (
             *(("star_offsets",) if self.by_star else ()),
             *(("kvector_counts",) if self.kvector else ()),

@@ -1,9 +1,9 @@
 """The product ``levels``: stars and triangles for fields wider than the camera's.
 
 A frame shows its brightest stars best, and which these are depends on how wide it is. A database
-for fields of 5 to 30 deg therefore has one set of stars and triangles for each of some widths
+for fields of 5 to 30 deg therefore has several sets of stars and triangles, for several widths
 between the two: the wider the field, the brighter and the fewer the stars. Each level is thinned
-from the one before.
+from the previous level.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ POSITION = 110
 
 Rows = NDArray[np.int32]
 
-# Boresights of a level, at the least: wide fields need few, and may have more for nothing.
+# Smallest number of boresights of a level: wide fields need fewer, but more cost nothing.
 MIN_BORESIGHTS = 1000
 
 
@@ -117,13 +117,13 @@ def level_fields(
 ) -> tuple[NominalField, ...]:
     """Return the fields of the levels.
 
-    The narrowest first, without level 0, the camera's own field, whose proportions all have.
-    The focal lengths of neighbours have the same ratio, ``max_ratio`` at most, and the widest
-    frames are wider than the last level's by that ratio too.
+    The narrowest field is first. Level 0, the camera's own field, is left out; all levels have its
+    proportions. The focal lengths of neighbouring levels have the same ratio, at most
+    ``max_ratio``, and the widest frames are wider than the last level by that ratio too.
 
-    A level serves frames that are as wide as its fields, or wider, up to those of the next level.
-    Such a frame holds fields of the level whole, so that their triangles are in it. In a frame
-    that is narrower than these by a sixth there may be no triangle at all.
+    A level serves frames that are as wide as its fields, or wider, up to the fields of the next
+    level. Such a frame contains whole fields of the level, and their triangles. A frame that is
+    narrower than the fields by a sixth can contain no triangle at all.
 
     >>> fields = level_fields(NominalField(10.0, 7.5), 30.0, 1.5)
     >>> [round(field.fov_x_deg, 2) for field in fields]
@@ -133,7 +133,7 @@ def level_fields(
         math.tan(math.radians(0.5 * angle)) for angle in (narrowest.fov_x_deg, narrowest.fov_y_deg)
     )
     whole = math.tan(math.radians(0.5 * widest_fov_x_deg)) / across
-    # A range of exactly so many ratios has no level more because of rounding.
+    # A range that is exactly a number of ratios gets no further level because of rounding.
     steps = max(2, math.ceil(math.log(whole) / math.log(max_ratio) - 1e-9))
     factors = [whole ** (step / steps) for step in range(1, steps)]
     return tuple(
@@ -157,9 +157,9 @@ def find_levels(
 ) -> LevelRows:
     """Find the stars and the triangles of each level.
 
-    ``boresights`` tile the sphere for the camera's field, fewer for a level. A star is kept
-    that is among the brightest ``stars_per_field`` of some field; the ``brightest`` of a field
-    make its triangles. Each level is thinned from the one before.
+    ``boresights`` tile the sphere for the camera's field; a level has fewer. A star is kept if it
+    is among the brightest ``stars_per_field`` of some field; the ``brightest`` stars of a field
+    make its triangles. Each level is thinned from the previous level.
     """
     stars, triangles = [], []
     for level in thin_levels(directions, mag, narrowest, fields, boresights, stars_per_field):
@@ -196,7 +196,7 @@ def thin_levels(
     boresights: int,
     stars_per_field: int,
 ) -> Iterator[Level]:
-    """Thin stars to those of each level, the narrowest first, each from those of the one before."""
+    """Thin stars for each level, the narrowest first; each level starts from the previous one."""
     rows = np.arange(len(directions), dtype=np.int32)
     for field in fields:
         count = boresights_of_level(boresights, narrowest, field)

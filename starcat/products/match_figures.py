@@ -1,4 +1,4 @@
-"""What the odds of a cross-identification need to know of two whole catalogs.
+"""Statistics of two whole catalogs that the odds of a cross-identification need.
 
 The density on the sky, the distribution of magnitudes, the errors, and how complete a catalog is,
 from counts and medians: the same bits whether a catalog is in one piece or read in parts, whose
@@ -24,7 +24,7 @@ ARCSEC = np.pi / (180.0 * 3600.0)  # rad
 
 TILES = 3072  # number of pieces of the sky, 13 square degrees each, in which stars are counted
 
-# The density of a tile is the mean over so many tiles around it, as one tile has few stars.
+# The density of a tile is the mean over this many tiles around it, as a tile has few stars.
 TILES_AVERAGED = 9
 
 # Step of the distribution of magnitudes, and standard deviation of the kernel that smooths it;
@@ -35,8 +35,8 @@ MIN_MEASURED = 20
 """Least number of sure pairs from which anything is measured."""
 
 MIN_ERROR_RAD = 0.01 * ARCSEC
-"""Least error of a position that is believed, radians: where measured errors are smaller, one
-catalog has copied the positions of the other."""
+"""Smallest credible error of a position, radians: if measured errors are smaller, one catalog has
+copied the positions of the other."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class MovingStars:
     error_rad: Array | None = None
 
     def at(self, rows: Rows, epoch_jyear: Array | float) -> Array:
-        """Return directions of some stars at an epoch; those without proper motion stay."""
+        """Return directions of some stars at an epoch; stars without proper motion stay."""
         years = np.broadcast_to(epoch_jyear, len(rows)) - self.epoch_jyear[rows]
         moved: Array = self.directions[rows] + self.velocities[rows] * years[:, None]
         moved /= np.sqrt(np.einsum("ij,ij->i", moved, moved))[:, None]
@@ -64,11 +64,11 @@ class MovingStars:
 class CandidatePairs:
     """Stars and candidate counterparts within a radius; arrays of shape (M,)."""
 
-    star: Rows  # of the first set
-    counterpart: Rows  # of the other set
+    star: Rows  # rows of the first set
+    counterpart: Rows  # rows of the other set
     separation_rad: Array  # radians, at ``epoch_jyear``
     epoch_jyear: Array  # Julian year at which the two were compared
-    unmoved_years: Array  # years between their positions where neither could be moved, else 0
+    unmoved_years: Array  # years between their positions if neither could be moved, else 0
 
     def take(self, rows: Rows | Mask) -> CandidatePairs:
         """Return some of the pairs."""
@@ -77,10 +77,10 @@ class CandidatePairs:
 
 @dataclass(frozen=True)
 class MagnitudeCounts:
-    """How many stars have which magnitude."""
+    """Numbers of stars by magnitude."""
 
     lowest: int  # number of the first bin; bin k begins at ``k * MAG_BIN``
-    counts: Rows  # shape (K,): stars of each bin; empty where no magnitude is known
+    counts: Rows  # shape (K,): stars of each bin; empty if no magnitude is known
 
     @classmethod
     def of(cls, mag: Array) -> MagnitudeCounts:
@@ -159,9 +159,9 @@ def _tiles() -> tuple[scipy.spatial.cKDTree, Rows]:
 
 @dataclass(frozen=True)
 class MatchModel:
-    """How far a star may be from its own counterpart, and what the verdicts ask for."""
+    """How far a star can be from its own counterpart, and the limits of the verdicts."""
 
-    # standard deviation of the difference of two positions of a star, each axis, where the catalogs
+    # standard deviation of the difference of two positions of a star, each axis, if the catalogs
     # state none; measured if not given
     position_error_rad: float | None = None
     # standard deviation of the proper motion of stars that have none in either catalog
@@ -169,26 +169,26 @@ class MatchModel:
     # share of stars that are off by more than their stated errors: double stars of which the
     # catalogs measured different parts, wrong proper motions
     outlier_share: float = 0.02
-    # magnitude of the counterpart minus that of the star, on average; measured if not given
+    # mean magnitude of the counterpart minus the star's; measured if not given
     expected_delta_mag: float | None = None
     # standard deviation of that difference: colours, variability, poor magnitudes
     colour_spread_mag: float = 1.0
     # share of the stars that have a counterpart at all; measured if not given
     completeness: float | None = None
-    # two candidates whose odds differ by this factor or less cannot be told apart
+    # two candidates whose odds differ by this factor or less are ambiguous
     ambiguous_odds: float = 10.0
-    # a star whose candidates together are less probable has but doubtful ones
+    # all candidates of a star are doubtful if together they are less probable than this
     min_probability: float = 0.5
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What all candidate pairs of two catalogs say of them."""
+    """Values measured from all candidate pairs of two catalogs."""
 
     with_candidates: int  # stars that have any
     sure: int  # pairs whose star and candidate have no other
-    sure_with_mag: int  # those of them with both magnitudes
-    median_separation_rad: float  # over these; NaN where there is none
+    sure_with_mag: int  # sure pairs with both magnitudes
+    median_separation_rad: float  # median over sure pairs; NaN if there are none
     median_delta_mag: float
 
 
@@ -201,7 +201,7 @@ def is_sure(star: Rows, counterpart: Rows) -> Mask:
 
 
 def measure(stars: MovingStars, counterparts: MovingStars, pairs: CandidatePairs) -> Measured:
-    """Return what the pairs of two whole catalogs say of them."""
+    """Return the values measured from the pairs of two whole catalogs."""
     sure = is_sure(pairs.star, pairs.counterpart)
     angle = pairs.separation_rad[sure]
     delta = counterparts.mag[pairs.counterpart[sure]] - stars.mag[pairs.star[sure]]
@@ -217,16 +217,16 @@ def measure(stars: MovingStars, counterparts: MovingStars, pairs: CandidatePairs
 
 @dataclass(frozen=True)
 class Figures:
-    """What all pairs of two catalogs have in common."""
+    """Values that all pairs of two catalogs share."""
 
     # standard deviation of the difference of two positions of a star, each axis, unless the
     # catalogs state their errors themselves
     position_error_rad: float
-    delta_mag: float  # magnitude of the counterpart minus that of the star, on average
+    delta_mag: float  # mean magnitude of the counterpart minus the star's
     completeness: float  # share of the stars that have a counterpart
     shared: float  # share of the counterparts that have a star
     density: Array  # shape (TILES,): counterparts per steradian around each tile of the sky
-    magnitudes: MagnitudeCounts  # of the counterparts
+    magnitudes: MagnitudeCounts  # magnitudes of the counterparts
 
 
 def figures_of(
@@ -267,9 +267,9 @@ def _offset(measured: Measured, model: MatchModel) -> float:
 def _completeness(stars: Census, measured: Measured, expected: Array, model: MatchModel) -> float:
     """Return the share of stars that have a counterpart.
 
-    It is one minus the share of stars without any candidate, over the share that would have
-    none at random places (Fleuren et al. 2012, MNRAS 423, 2407). The latter is a sum over tiles
-    that is rounded once, so that the order of the stars does not matter.
+    It is ``1 - a / b``: a is the share of stars without any candidate, b the share that would have
+    none at random places (Fleuren et al. 2012, MNRAS 423, 2407). b is a sum over tiles that is
+    rounded once, so that the order of the stars does not matter.
     """
     if model.completeness is not None:
         return model.completeness

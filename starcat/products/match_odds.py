@@ -1,11 +1,11 @@
 """How likely a candidate is the star's counterpart: likelihood ratios and reliabilities.
 
-The ratio weighs two explanations of a candidate: that it is the star, whose position and
-magnitude scatter around the star's own, and that it is one of the other stars thereabouts.
+The ratio weighs two explanations of a candidate: that it is the star, with a position and a
+magnitude that scatter around the star's own, and that it is another star of the neighbourhood.
 
-A star has one counterpart at most and a counterpart one star. The ratios of all pairs are weights
-of matchings, sets of pairs that share no star and no candidate; the probability of a pair is the
-share of the matchings that have it. Belief propagation finds it exactly where the pairs of a
+A star has at most one counterpart, and a counterpart at most one star. The ratios of all pairs are
+weights of matchings, sets of pairs that share no star and no candidate; the probability of a pair
+is the share of the matchings that contain it. Belief propagation finds it exactly if the pairs of a
 cluster close no ring; small clusters with a ring, such as two components of a double star in
 either catalog, are written out.
 """
@@ -35,7 +35,7 @@ ROUNDS = 60
 """Number of rounds of messages; pairs that are in no ring need far fewer."""
 
 MAX_WRITTEN_OUT = 12
-"""Most pairs of a cluster whose matchings are all listed; messages do for larger clusters."""
+"""Largest number of pairs of a cluster whose matchings are all listed; larger ones use messages."""
 
 MAX_WEIGHT = 50.0
 """Largest natural logarithm of the weight of a pair. It is as good as certain, and the product
@@ -47,10 +47,10 @@ class Odds:
     """The odds of pairs, arrays of shape (M,), and the figures behind them."""
 
     log_ratio: Array  # natural logarithm of the likelihood ratio
-    probability: Array  # that this candidate is the star
-    any_probability: Array  # that any candidate of the star is
+    probability: Array  # probability that this candidate is the star
+    any_probability: Array  # probability that any candidate of the star is
     error_rad: Array  # standard deviation of the difference of the two positions, each axis
-    position_error_rad: float  # as given or measured; NaN where the catalogs state their errors
+    position_error_rad: float  # given or measured; NaN if the catalogs state their errors
     delta_mag: float
     completeness: float
 
@@ -72,12 +72,12 @@ def match_odds(
     figures: Figures,
     model: MatchModel,
 ) -> Odds:
-    """Return how likely each candidate is the counterpart of its star, one row a pair.
+    """Return how likely each candidate is the counterpart of its star, one row per pair.
 
-    The stars may be parts of the two catalogs; the pairs are all candidates, by star.
+    The stars can be parts of the two catalogs; the pairs are all candidates, by star.
 
     ``L = Q q(dm) f(r) / n(m)``: f is the density of a star's own counterpart at the separation
-    r, q that of its magnitude, n the density of all others on the sky and in magnitude. Without
+    r, q its density in magnitude, n the density of all others on the sky and in magnitude. Without
     magnitudes ``q / n`` is one over the density on the sky.
 
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2. Without magnitudes and outliers L
@@ -104,7 +104,7 @@ def match_odds(
 
 
 def _stated_error(stars: MovingStars, counterparts: MovingStars, i: Rows, j: Rows) -> Array:
-    """Return the error of each pair from those that the catalogs state."""
+    """Return the error of each pair from the errors that the catalogs state."""
     if stars.error_rad is None or counterparts.error_rad is None:
         raise ValueError("error_rad is missing; both catalogs have to state their errors, or none")
     return np.asarray(np.hypot(stars.error_rad[i], counterparts.error_rad[j]))
@@ -126,7 +126,7 @@ def _log_place(angle: Array, error: Array, radius_rad: float, model: MatchModel)
 
 
 def _log_colour(delta: Array, mag: Array, figures: Figures, model: MatchModel) -> Array:
-    """Return the logarithm of q over the distribution of magnitudes; 0 where one is unknown."""
+    """Return the logarithm of q over the distribution of magnitudes; 0 if one is unknown."""
     known = ~np.isnan(delta)
     ratio = np.zeros(len(delta))
     if known.any():
@@ -139,19 +139,19 @@ def _log_colour(delta: Array, mag: Array, figures: Figures, model: MatchModel) -
 def pair_probabilities(
     star: Rows, candidate: Rows, log_ratio: Array, completeness: float, shared: float
 ) -> tuple[Array, Array]:
-    """Return two probabilities of each pair: of itself, and of any candidate of its star.
+    """Return two probabilities of each pair: for itself, and for any candidate of its star.
 
-    Of itself: that the candidate is the star, and neither is another's. Of any: that one of the
-    star's candidates is the star, whatever other stars claim. The stars ascend; the ratios are
+    The first: the candidate is the star, and neither belongs to another pair. The second: one of
+    the star's candidates is the star, whatever other stars claim. The stars ascend; the ratios are
     natural logarithms, shape (M,). Q is ``completeness``, the share of the stars that have a
     counterpart, S is ``shared``, the share of the counterparts that have a star.
 
-    A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars
-    thereabouts, of which a share S are the counterparts of others and have pairs of their own.
-    A pair without rivals has the probability ``w / (1 + w)``. Messages are those of the
+    A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars of the
+    neighbourhood, of which a share S are counterparts of other stars and have their own pairs.
+    A pair without competing pairs has the probability ``w / (1 + w)``. The messages follow the
     monomer-dimer model, ``x(i, j) = 1 / (1 + sum of w(i, k) x(k, i) over the other candidates k)``
-    and the same from the candidates' side, averaged with those before in their logarithms, or
-    they would swing to and fro.
+    and the same from the candidates' side. Their logarithms are averaged with the previous ones,
+    or they would oscillate.
 
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2, for one star. Heilmann and Lieb
     1972, Communications in Mathematical Physics 25, 190, for matchings as a model.
@@ -177,7 +177,7 @@ def _share(log_odds: Array) -> Array:
 
 
 def _in_clusters(star: Rows, candidate: Rows, weight: Array) -> Array:
-    """Return the probabilities of pairs that have rivals."""
+    """Return the probabilities of pairs that compete with other pairs."""
     stars, candidates = _Groups(star), _Groups(candidate)
     weight = np.minimum(weight, MAX_WEIGHT)
     from_candidate = np.zeros(len(star))

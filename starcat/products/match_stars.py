@@ -1,9 +1,9 @@
 """Counterparts: which entry of one catalog is which star of another, and how sure that is.
 
-Two sets of moving stars in; every pair of star and candidate counterpart within a radius out,
+Input: two sets of moving stars. Output: all pairs of a star and a candidate within a radius,
 with separation, magnitude difference, odds and a verdict in words. Separations are measured at
 one epoch of the pair: a star with proper motion is moved to its candidate's epoch, a candidate
-with proper motion to the epoch of a star without. Knows neither catalogs nor files.
+with proper motion to the epoch of a star without. This module does not depend on catalogs or files.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from starcat.products.match_odds import Odds, match_odds, runs
 Rows = NDArray[np.int64]
 
 VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
-"""What a candidate is to its star, in words; the numbers of `Matches.verdict` are places here."""
+"""Verdicts on a candidate, in words; the numbers of `Matches.verdict` are places here."""
 
 UNIQUE, BEST, AMBIGUOUS, TAKEN, DOUBTFUL, OTHER = range(len(VERDICTS))
 
@@ -43,17 +43,17 @@ CHUNK = 1 << 17
 class Matches:
     """Every candidate of every star, by star and rank; arrays of shape (M,)."""
 
-    star: Rows  # of the first set
-    counterpart: Rows  # of the other set
-    rank: Rows  # of the candidate among those of its star; 1 is the likeliest
-    star_rank: Rows  # of the star among those of its candidate
-    n_candidates: Rows  # of the star, within the radius
-    n_stars: Rows  # that the candidate is one of
+    star: Rows  # rows of the first set
+    counterpart: Rows  # rows of the other set
+    rank: Rows  # rank of the candidate among the candidates of its star; 1 is the likeliest
+    star_rank: Rows  # rank of the star among the stars of its candidate
+    n_candidates: Rows  # number of candidates of the star, within the radius
+    n_stars: Rows  # number of stars that have this candidate
     separation_rad: Array  # radians, at ``epoch_jyear``
-    # magnitude of the candidate minus that of the star; NaN where either is unknown
+    # magnitude of the candidate minus the star's; NaN if either is unknown
     delta_mag: Array
     epoch_jyear: Array  # Julian year at which the two were compared
-    odds: Odds  # how likely each pair is, and the model behind it
+    odds: Odds  # probability of each pair, and the model behind it
     verdict: Rows  # index into `VERDICTS`
 
     def count(self, verdict: str) -> int:
@@ -95,9 +95,9 @@ def judged(
 ) -> Matches:
     """Give every pair its odds, ranks and verdict, in order of (star, rank).
 
-    The figures are those of the whole catalogs. Where stars and counterparts are parts of them,
-    only pairs whose star and candidate have all their other pairs here are judged rightly, and
-    their probabilities are right where that is so of their whole cluster.
+    The figures are computed from the whole catalogs. If stars and counterparts are parts of them,
+    a verdict is right only if all other pairs of its star and its candidate are included, and a
+    probability is right if this holds for the whole cluster of the pair.
     """
     odds = match_odds(stars, counterparts, pairs, radius_rad, figures, model)
     i, j = pairs.star, pairs.counterpart
@@ -128,9 +128,9 @@ def candidate_pairs(
 
     In order of (star, counterpart); the radius is included.
 
-    Both are first compared at one epoch in the middle, where each query's radius is wider by
-    what its proper motion can add up to the farthest epoch on the other side: Barnard's star
-    needs 10 arcsec a year of it, most stars next to nothing.
+    Both are first compared at one epoch in the middle. There each query has a wider radius, by its
+    largest proper motion up to the farthest epoch of the other catalog: Barnard's star needs
+    10 arcsec per year, most stars next to nothing.
     """
     moving = np.flatnonzero(stars.has_motion)
     still = np.flatnonzero(~stars.has_motion)
@@ -144,8 +144,8 @@ def candidate_pairs(
         for near, found in _near(query, radius_rad + drift, counterparts.directions):
             parts.append(_trim(stars, counterparts, moving[near], found, radius_rad))
     if len(still) and len(everyone):
-        # These candidates move and these stars do not: each candidate looks for stars as far
-        # as its own motion may have taken it.
+        # These candidates move and these stars do not: search for stars around each candidate as
+        # far as its own motion can have taken it.
         middle, reach = _middle(stars.epoch_jyear[still])
         drift = _speed(counterparts, everyone) * reach
         query = counterparts.at(everyone, middle)
@@ -200,7 +200,7 @@ def _chord(separation_rad: float) -> float:
 def _trim(
     stars: MovingStars, counterparts: MovingStars, i: Rows, j: Rows, radius_rad: float
 ) -> CandidatePairs:
-    """Return those of some pairs that are within the radius at their epoch."""
+    """Return the pairs that are within the radius at their epoch."""
     star_moves, other_moves = stars.has_motion[i], counterparts.has_motion[j]
     epoch_i, epoch_j = stars.epoch_jyear[i], counterparts.epoch_jyear[j]
     epoch = np.where(star_moves | ~other_moves, epoch_j, epoch_i)

@@ -1,6 +1,6 @@
-"""The product ``motions``: where the proper motion of each guide star is from.
+"""The product ``motions``: the origin of the proper motion of each guide star.
 
-The pipeline makes it where a spec joins motions of other catalogs (`starcat.pipeline.supply`).
+The pipeline makes it if a spec joins motions of other catalogs (`starcat.pipeline.supply`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ POSITION = 120
 JOINED, OWN_MOTION, NO_CANDIDATE, NO_MOTION = "joined", "own_motion", "no_candidate", "no_motion"
 
 OUTCOMES = (JOINED, OWN_MOTION, NO_CANDIDATE, "ambiguous", "taken", "doubtful", NO_MOTION)
-"""What may be said of a star in the product ``motions``; the schema says what each means."""
+"""Outcomes for a star in the product ``motions``; the schema describes each of them."""
 
 WAY_TOLERANCE_ARCSEC = 1e-6
 """The way between two directions and the way at a speed differ by less."""

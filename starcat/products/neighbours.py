@@ -1,7 +1,7 @@
 """The product ``neighbours``: every star's neighbours by position angle.
 
 The angle from one neighbour to the next, with the separation, is looked up in a table that leads
-to the rows that may be meant. A row is one neighbour of one star.
+to the possible rows. Each row holds a neighbour of a star.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from starcat.sections import SmallDeg
 POSITION = 60
 
 MAX_BINS = 10_000_000
-"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
+"""Largest number of bins of a look-up table; each takes 8 bytes, and more are of no use."""
 
 
 class Neighbours(ProductSection):
@@ -130,8 +130,8 @@ def position_angles(
     """Return the position angles of neighbours at stars.
 
     Radians in [0, 2 pi), from north through east: counter-clockwise on the sky as seen from
-    inside. 0 where the two are at the same place; at a pole the star's own right ascension says
-    which way east is.
+    inside. 0 where the two are at the same place; at a pole the star's own right ascension
+    determines the direction of east.
 
     >>> u = np.eye(3)
     >>> position_angles(u, np.array([0, 0]), np.array([2, 1])) * 2.0 / np.pi

@@ -99,7 +99,7 @@ def _count(inputs: ProductInputs, wanted: Pairs) -> Extent:
 
 
 def _file_bytes(extent: Extent, stars: int, wanted: Pairs) -> float:
-    separation = 5.2  # of a float64 of a table that is sorted by it
+    separation = 5.2  # bytes of a float64 in a table that is sorted by it
     return extent.rows * (2.0 * star_row_bytes(stars) + separation)
 
 

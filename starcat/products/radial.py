@@ -50,7 +50,7 @@ class RadialPatterns:
     rings: Ragged  # occupied rings as `ring_of` numbers them, ascending, each once
     # shape (N,): a bit per occupied sector, the smallest of the cyclic shifts; 0 without neighbours
     sector_pattern: NDArray[np.int32]
-    index: Index  # datasets ``ring_offsets`` and ``ring_rows``, as those of the cells
+    index: Index  # datasets ``ring_offsets`` and ``ring_rows``, like those of the cells
 
 
 def radial_patterns(
@@ -58,10 +58,10 @@ def radial_patterns(
 ) -> RadialPatterns:
     """Find the radial and the cyclic pattern of every star.
 
-    1 to 31 sectors; ValueError for what is out of range.
+    1 to 31 sectors; ValueError for a value that is out of range.
 
-    Sectors are counted counter-clockwise from the nearest neighbour, of equally near ones the
-    first. A star at the same place is in ring 0 and, having no position angle, in no sector.
+    Sectors are counted counter-clockwise from the nearest neighbour, the first of several equally
+    near ones. A star at the same place is in ring 0 and, without a position angle, in no sector.
 
     Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
     cyclic features of star pattern", Image and Vision Computing 26, 891.

@@ -1,4 +1,4 @@
-"""The product ``rejected``: records that are no guide stars, which reading and selection make."""
+"""The product ``rejected``: records that reading and selection reject as guide stars."""
 
 from __future__ import annotations
 

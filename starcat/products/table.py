@@ -1,4 +1,4 @@
-"""The table of products: every module of this room that defines ``POSITION``, in its order.
+"""The table of products: every module of this package with a ``POSITION``, in that order.
 
 The order decides the bytes of a manifest. The section ``[products]`` of a spec, the recipes, the
 estimate, the checks of a database and the forms of the service are views of this table: a new
@@ -40,7 +40,7 @@ class ProductSections(Section):
 
     @property
     def wanted(self) -> dict[str, ProductSection]:
-        """The sections of the products that are asked for."""
+        """The sections of the products that are requested."""
         return {name: section for name, section in self.sections.items() if section.enabled}
 
 

@@ -1,4 +1,4 @@
-"""Thinning: which stars of a number of them to keep so that the sky is even.
+"""Thinning: which stars to keep so that they cover the sky evenly.
 
 Rows are in order of preference, the brightest star first: of two stars that are worth the same, the
 later one goes. A star's worth grows with its light, because a faint star that makes the sky even is
@@ -19,23 +19,23 @@ from starcat.geometry.attitude import information_terms
 from starcat.products.tiling import FieldStars
 
 BATCH = 0.1
-"""Share of the stars, those with the smallest cells, of which a round drops some."""
+"""Share of the stars, by the smallest cells, from which a round can drop stars."""
 
 PRIOR = 1e-2
-"""Information on each axis before any star, that of a star being 1, so that a field without stars
+"""Information on each axis before any star, in units of a star's, so that a field without stars
 has an error too: ten times the noise of a star."""
 
 POWER = 4
-"""Power of the variances that are added up. So high a one is nearly the variance of the worst
-fields, and still tells the others apart."""
+"""Power of the variances that are added up. With this high power the sum nearly equals the variance
+of the worst fields, and still distinguishes the others."""
 
 
 def thin_by_cells(directions: Directions, mag: Array, count: int) -> NDArray[np.int64]:
-    """Return the stars that stay when those with small cells for their brightness go.
+    """Return the stars that stay when stars with small cells for their brightness are dropped.
 
-    The cell of a star is the part of the sphere that is nearer to it than to any other. In each
-    round the cells are made anew, and stars go whose cell times light is the smallest, but no two
-    that are neighbours.
+    The cell of a star is the part of the sphere that is nearer to it than to any other. Each round
+    computes the cells again and drops the stars with the smallest cell times light, but never two
+    neighbours.
 
     Parameters
     ----------
@@ -77,8 +77,8 @@ def cell_areas(directions: Directions) -> tuple[Array, NDArray[np.int64]]:
     """Return the areas of the cells of Voronoi's diagram, and the triangles of neighbours.
 
     The areas have shape (N,), the rows of the triangles' corners shape (T, 3). Of stars at the same
-    place one alone has a cell. Where the directions span no volume, all have the same area and
-    no neighbours.
+    place only one has a cell. If the directions span no volume, all have the same area and no
+    neighbours.
 
     A facet of the convex hull is a triangle of neighbours, and its normal the corner that their
     cells share. It makes an isosceles triangle with each side, whose halves belong to the ends.
@@ -107,10 +107,10 @@ def cell_areas(directions: Directions) -> tuple[Array, NDArray[np.int64]]:
 def thin_by_information(
     fields: FieldStars, directions: Directions, mag: Array, reach_rad: float, count: int
 ) -> NDArray[np.int64]:
-    """Return the stars that stay when those go whose loss harms the worst fields least.
+    """Return the stars that stay when stars are dropped whose loss harms the worst fields least.
 
-    The harm is how much the sum of the fourth power of the variance across the boresight grows
-    over all fields, times the star's light. Stars go one after the other.
+    The harm is the growth of the sum, over all fields, of the fourth power of the variance across
+    the boresight, times the star's light. Stars are dropped one at a time.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def thin_by_information(
     heapq.heapify(heap)
     kept = np.ones(len(directions), dtype=bool)
     for _ in range(len(directions) - count):
-        # Harm grows while others go: only that of the first star has to be known anew.
+        # Harm grows while other stars are dropped: compute it again only for the first star.
         while (worth := precision.harm(-heap[0][1]) * light[-heap[0][1]]) > heap[0][0]:
             heapq.heapreplace(heap, (worth, heap[0][1]))
         _, gone = heapq.heappop(heap)
@@ -148,7 +148,7 @@ def thin_by_information(
 
 @dataclass(frozen=True, eq=False)
 class _Precision:
-    """What the stars that are left tell of the attitude of each field."""
+    """Information that the remaining stars give on the attitude of each field."""
 
     total: Array  # (F, 6): entries of the information matrix as `information_terms` has them
     cost: Array  # (F,): fourth power of the variance across the boresight
@@ -158,7 +158,7 @@ class _Precision:
 
     @classmethod
     def of(cls, fields: FieldStars, directions: Directions, reach_rad: float) -> _Precision:
-        """Return that of all stars."""
+        """Return the precision with all stars."""
         by_star = np.argsort(fields.star_index, kind="stable")
         entries = information_terms(fields.seen(directions)).items()
         # The turn about the boresight counts in units of the reach: no entry is small in a narrow

@@ -74,7 +74,7 @@ class FieldStars:
         return int(self.boresights.nbytes + self.offsets.nbytes + self.star_index.nbytes)
 
     def brightest(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Return offsets and rows of the brightest stars of each field, at most so many."""
+        """Return offsets and rows of the ``most`` brightest stars of each field."""
         rank = np.arange(len(self.star_index)) - np.repeat(self.offsets[:-1], self.count)
         offsets = np.concatenate([[0], np.cumsum(np.minimum(self.count, most))])
         return offsets, self.star_index[rank < most]

@@ -1,4 +1,4 @@
-"""The product ``triangles``: those of the brightest stars of each field, by area, with a K-vector.
+"""The product ``triangles``: of the brightest stars of each field, by area, with a K-vector.
 
 The sides of a triangle are great-circle separations and the triangle is the plane one with those
 sides, so that its features do not depend on where in a frame it lies.
@@ -36,7 +36,7 @@ class Triangles(ProductSection):
     """Triangles of the brightest stars of each boresight's field (S4)."""
 
 
-_PACKED_BITS = 21  # three row numbers of so many bits fit into one int64
+_PACKED_BITS = 21  # three row numbers of this many bits fit into one int64
 AT_ONCE = 1 << 19  # number of triangles whose features are computed together
 
 
@@ -120,7 +120,7 @@ def distinct_triangles(
 
 
 def _triples(fields: FieldStars, brightest: int) -> Iterator[NDArray[np.int64]]:
-    """Yield the triangles of all fields, rows i < j < k, those of one number of stars at a time."""
+    """Yield the triangles of all fields, rows i < j < k, for fields of 3, 4, ... stars in turn."""
     offsets, star_index = fields.brightest(brightest)
     size = np.diff(offsets)
     yield np.empty((0, 3), dtype=np.int64)
@@ -159,7 +159,7 @@ def _count(inputs: ProductInputs, wanted: Triangles) -> Extent:
 
 
 def _file_bytes(extent: Extent, stars: int, wanted: Triangles) -> float:
-    shape = 9.0  # of area, sides, angles and how many fields have it
+    shape = 9.0  # bytes of area, sides, angles and number of fields
     return extent.rows * (3.0 * star_row_bytes(stars) + shape)
 
 

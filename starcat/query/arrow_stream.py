@@ -17,13 +17,13 @@ import pyarrow.compute as pc
 from starcat.workers.messages import malformed
 
 BATCH_ROWS = 1 << 16
-"""Rows that DuckDB is asked to put into a batch."""
+"""Number of rows that DuckDB puts into a batch."""
 
 BATCH_BYTES = 8 << 20
 """About how large a batch is sent at most; a single row may be larger."""
 
 MAX_DICTIONARY_BYTES = 1 << 30
-"""What the values of a dictionary may take when they are written out for every row."""
+"""Largest size of the values of a dictionary when they are written out for every row."""
 
 _PLAIN_TYPES = {
     pa.lib.Type_NA, pa.lib.Type_BOOL, pa.lib.Type_INT8, pa.lib.Type_UINT8, pa.lib.Type_INT16,
@@ -187,7 +187,7 @@ def _check_messages(content: bytes | bytearray) -> None:
 
 
 def _table(data: bytes, at: int, number: int) -> int:
-    """Return where a table begins that is a field of another one, in a FlatBuffer."""
+    """Return the start of a table that is a field of another table, in a FlatBuffer."""
     if at == 0:
         [at] = struct.unpack_from("<I", data, 0)
     place = _field(data, at, number)
@@ -197,7 +197,7 @@ def _table(data: bytes, at: int, number: int) -> int:
 
 
 def _field(data: bytes, at: int, number: int) -> int:
-    """Return where a field of a table is, 0 if the table does not have it."""
+    """Return the place of a field of a table, 0 if the table does not have it."""
     fields = at - struct.unpack_from("<i", data, at)[0]
     if fields < 0:
         raise ValueError("a message has a wrong table")

@@ -1,7 +1,7 @@
 """The process that runs the queries of a session, as the session sees it.
 
-It is started once and asked many times. One that takes too long is killed, and so is one whose
-question was dropped halfway; the next question starts another.
+It is started once and runs many queries. It is killed if a query takes too long, or if the caller
+drops a query halfway; the next query starts a new process.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from starcat.workers.messages import (
 from starcat.workers.process import WorkerProcess
 
 MAX_MESSAGE_BYTES = 1 << 30  # size of a message of the process
-OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
-ENDING_S = 1.0  # how long a process whose pipe is closed may take to end
+OPENING_S = 60.0  # seconds that a process may take to open the targets
+ENDING_S = 1.0  # seconds that a process may take to end after its pipe is closed
 _FUNCTION = "starcat.query.worker:serve_queries"
 
 
@@ -46,7 +46,7 @@ _FUNCTION = "starcat.query.worker:serve_queries"
 class Allowance:
     """The time that all queries together may take; only waiting for the answer counts.
 
-    Its process leaves the processors to others when it has taken ``patient_after_s`` of them.
+    After ``patient_after_s`` of processor time the process gets a low priority.
     """
 
     total_s: float
@@ -57,7 +57,7 @@ class Allowance:
 
 
 _waiting: list[WorkerProcess] = []
-"""A process that was started before it is known what for."""
+"""Processes that were started in advance."""
 
 
 def warm_up(count: int = 1) -> None:
@@ -77,7 +77,7 @@ def _end_waiting() -> None:
 
 
 class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
-    """A process that ended by itself while it was asked, with what is known of why."""
+    """A process ended by itself during a query; the message has the reason if it is known."""
 
 
 class Engine:
@@ -97,9 +97,9 @@ class Engine:
         self._process = self._started()
 
     def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
-        """Make views and macros by SQL; from here on the process reads nothing but some files.
+        """Make views and macros by SQL; from then on the process reads only ``files``.
 
-        The SQL names them from a folder on; ``macros`` are those that stand after FROM.
+        The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM.
         """
         opened = sql, folder, files, sorted(macros)
         self.ask("open", *opened)
@@ -113,10 +113,10 @@ class Engine:
         progress: Progress = no_progress,
         max_bytes: int | None = None,
     ) -> list[Any]:
-        """Ask the process for something, and wait for the answer.
+        """Send a request to the process, and wait for the answer.
 
-        The last item is the answer: plain values as JSON has them, or the bytes of an Arrow stream.
-        Those before it are rows, in parts. `AnswerTooLarge` if there are more than ``max_bytes``.
+        The last item is the answer: plain values for JSON, or the bytes of an Arrow stream. The
+        items before are rows, in parts. `AnswerTooLarge` if they exceed ``max_bytes``.
         """
         with self._asking:
             if not self.is_running:
@@ -145,7 +145,7 @@ class Engine:
             process = _spawned()
         self.is_patient = False
         process.max_bytes = self._opening.message_bytes
-        with suppress(OSError):  # that it ended is found out when it is asked
+        with suppress(OSError):  # the next query finds out that it ended
             process.send(asdict(self._opening))
         return process
 
@@ -159,7 +159,7 @@ class Engine:
     ) -> list[Any]:
         try:
             given = [encoded(argument) for argument in arguments]
-        except Exception as error:  # whatever somebody's own class does
+        except Exception as error:  # a user's own class can raise anything
             raise QueryError(f"a value of the query cannot be passed on: {error}") from error
         parts: list[Any] = []
         is_over = False
@@ -185,7 +185,7 @@ class Engine:
         finally:
             allowance.left_s -= time.monotonic() - begun_s
             allowance.used_s += max(0.0, self._process.used_s() - used_s)
-            # A question that was dropped halfway, as by Ctrl-C, would be answered to the next.
+            # If a request is dropped halfway, as by Ctrl-C, the next would get its answer.
             if not is_over:
                 self.close()
         return parts
@@ -193,7 +193,7 @@ class Engine:
     def _replies(
         self, allowance: Allowance, begun_s: float, used_s: float, max_bytes: int | None
     ) -> Iterator[tuple[str, bytes | bytearray]]:
-        """Give what the process sends until it is at an end; TimeoutError if it takes too long."""
+        """Yield the messages of the process up to the last; TimeoutError if it takes too long."""
         until_s, kind, size = begun_s + allowance.left_s, "", 0
         while kind not in ENDINGS:
             left_s = until_s - time.monotonic()
@@ -217,7 +217,7 @@ class Engine:
             yield kind, content
 
     def _error(self, error: Exception) -> QueryError:
-        """Return what to say of an error that the process has sent."""
+        """Return the exception for an error that the process has sent."""
         if isinstance(error, MemoryError):
             return QueryLimitError(
                 f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
@@ -228,7 +228,7 @@ class Engine:
         return error if isinstance(error, QueryError) else QueryError(str(error))
 
     def _ended(self, allowance: Allowance) -> QueryError:
-        """Return what to say of a process that ended before it answered."""
+        """Return the exception for a process that ended before it answered."""
         # The pipe is closed a moment before the process is gone.
         self._process.wait(ENDING_S)
         self._process.kill()

@@ -1,9 +1,9 @@
 """Named queries and macros: one SQL file each, with its help in the comments above.
 
-The comments above a named query say what it finds, how many targets it needs where that is not one
+The comments above a named query describe what it finds, how many targets it needs if not one
 (``-- Targets: 2``), and its values with their defaults (``-- count = 10: how many``).
 
-The file of a macro holds ``CREATE MACRO`` of the name of the file, after those of helpers whose
+The file of a macro holds ``CREATE MACRO`` with the name of the file, after the helper macros, whose
 names begin with ``_``. A table macro is made once for every schema; ``{places}`` in its text is the
 schema of its target's views with places (`starcat.query.spatial_macros`).
 """
@@ -119,7 +119,7 @@ class Macro:
     is_table: Annotated[bool, Field(description="Whether it is a table macro, used after FROM.")]
     help: str
     example: Annotated[str, Field(description="A query that shows it and runs on any database.")]
-    # The SQL that makes it, with {places} where that schema has to be named.
+    # The SQL that makes it, with {places} for the name of that schema.
     text: Annotated[str, Field(exclude=True)]
 
     def statement(self, schema: str, places: str) -> str:

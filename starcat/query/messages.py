@@ -1,4 +1,4 @@
-"""What a session and the process that runs its queries tell each other beside values and rows.
+"""Messages between a session and the process that runs its queries, without values and rows.
 
 A request is the name of a method of `starcat.query.worker.QueryWorker`, a time and its arguments.
 """
@@ -14,13 +14,13 @@ from starcat.workers.messages import MalformedMessage
 
 @dataclass(frozen=True)
 class Opening:
-    """What a process is told before it starts DuckDB."""
+    """The settings of a process, sent before it starts DuckDB."""
 
-    spill: str  # folder for what does not fit into the memory; the only one it may write in
-    # Gigabytes that DuckDB may take of each.
+    spill: str  # folder for data that do not fit into memory; the only folder it may write in
+    # Gigabytes of memory and of disk that DuckDB may take.
     memory_gb: float
     disk_gb: float
-    parent: int  # number of the process that asks; the worker ends when that one does
+    parent: int  # number of the parent process; the worker ends when the parent does
     message_bytes: int  # size of a message at most
 
 
@@ -28,17 +28,17 @@ class Opening:
 class Statement:
     """A query that may run."""
 
-    # SQL that DuckDB wrote from the syntax tree that was checked, with EXPLAIN before it where that
-    # was asked for. Nothing else of the text that was given runs.
+    # SQL that DuckDB wrote from the checked syntax tree, after EXPLAIN if the user wrote that.
+    # Nothing else of the user's text runs.
     text: str
-    is_description: bool = False  # whether it is a DESCRIBE, whose rows are columns
-    # Schema and name of the view that a DESCRIBE is about; the schema is empty where it has none.
+    is_description: bool = False  # true for a DESCRIBE, whose rows are columns
+    # Schema and name of the view of a DESCRIBE; the schema is empty if it is not given.
     view: tuple[str, str] | None = None
     parameters: tuple[str, ...] = ()  # names of the $name in it
 
     @classmethod
     def from_json(cls, found: Any) -> Statement:
-        """Return the statement that a process sent as JSON; MalformedMessage if it is none."""
+        """Return the statement that a process sent as JSON, or raise MalformedMessage."""
         try:
             view = found["view"]
             return cls(
@@ -52,7 +52,7 @@ class Statement:
 
 
 def too_large(max_bytes: int) -> AnswerTooLarge:
-    """Return the error for an answer of more bytes than wanted."""
+    """Return the error for an answer of more than ``max_bytes``."""
     return AnswerTooLarge(
         f"the answer has more than {max_bytes / 1e6:,.0f} MB; ask for fewer rows or columns"
     )

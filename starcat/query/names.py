@@ -28,8 +28,8 @@ xmlroot xmlserialize xmltable
 """
 
 SQL_WORDS = frozenset(_WORDS.split())
-"""Words that DuckDB takes for no name of a table. Listed here, so that a name does not depend on
-the version of DuckDB."""
+"""Words that DuckDB does not accept as the name of a table. They are listed here, so that a name
+does not depend on the version of DuckDB."""
 
 CATALOGS = frozenset({"main", "memory", "temp", "system", "information_schema", "pg_catalog"})
 """Schemas and catalogs that every DuckDB has."""
@@ -56,7 +56,7 @@ def short_names(many: int) -> list[str]:
 
 
 def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
-    """Return names that differ from each other and from those that are taken.
+    """Return names that differ from each other and from the names that are taken.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Where on the sky the partitions of a store are, as the macros of SQL compare it with places.
+"""The areas of the sky that the partitions of a store cover, for the macros of SQL.
 
-From pixels to circles and boxes around them. No package for HEALPix is loaded: four corners and a
-centre are what is wanted, and loading one takes longer than a query.
+Pixels become circles and boxes around them. No package for HEALPix is loaded: only four corners and
+a centre are needed, and loading a package takes longer than a query.
 
 References
 ----------
@@ -20,7 +20,7 @@ from starcat.geometry.sphere import separation
 from starcat.store.layout import Pixel
 
 MARGIN_DEG = 1e-6
-"""By how much circles and boxes are wider than the corners need, for what rounding takes."""
+"""Margin by which circles and boxes are wider than their corners, for rounding errors."""
 
 _RING_OF_FACE = np.array([2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4])
 _EIGHTH_OF_FACE = np.array([1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7])
@@ -29,8 +29,8 @@ _CORNERS = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))
 
 EXTENT = ("x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to")
 """The direction of the middle of a circle, cosine and sine of its radius and the radius, the sides
-of a box. Angles are in degrees; ``ra_from`` is from 0 to 360, ``ra_to`` is larger, also than 360
-where the box goes through 0."""
+of a box. Angles are in degrees; ``ra_from`` is from 0 to 360, ``ra_to`` is larger, and above 360
+if the box goes through 0."""
 
 
 def extents(pixels: Sequence[Pixel]) -> Array:
@@ -40,7 +40,7 @@ def extents(pixels: Sequence[Pixel]) -> Array:
     centre, middle, _ = _place(order, number, 0.5, 0.5)
     corners = [_place(order, number, *corner) for corner in _CORNERS]
     reach = np.max([separation(centre, corner) for corner, _, _ in corners], axis=0)
-    # The pole has no right ascension; the corners beside it have those of the sides.
+    # The pole has no right ascension; the neighbouring corners have the range of the sides.
     east = np.array([np.where(is_pole, 0.0, _turned(ra - middle)) for _, ra, is_pole in corners])
     dec = np.degrees([np.arcsin(corner[:, 2]) for corner, _, _ in corners])
     first = middle + east.min(axis=0) - MARGIN_DEG

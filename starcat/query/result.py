@@ -49,13 +49,13 @@ UNIT_SUFFIXES = {
 
 
 Facts = Mapping[str, str]
-"""Unit, description and UCD of a column, where there are any."""
+"""Unit, description and UCD of a column, if it has them."""
 
 
 def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
-    """Return what is known of columns by their name.
+    """Return the facts of columns by their name.
 
-    Where views disagree on what a name means, only the unit is kept, if they agree on that.
+    If views disagree on the meaning of a name, only the unit is kept, if they agree on it.
     """
     found: dict[str, Facts] = {}
     for view in views:
@@ -90,7 +90,7 @@ class ResultColumn:
 
 
 def result_column(name: str, kind: str, known: Mapping[str, Facts]) -> ResultColumn:
-    """Return a column with what is known of it."""
+    """Return a column with its known facts."""
     facts = column_facts(name, known)
     return ResultColumn(name, kind, facts.get("unit", ""), facts.get("description", ""))
 
@@ -113,7 +113,7 @@ class ResultTable:
         return cls(columns, found["rows"], found["is_cut"])
 
     def with_json_values(self) -> ResultTable:
-        """Return the same with values that JSON has."""
+        """Return the same table with values that JSON supports."""
         return replace(self, rows=[[json_value(value) for value in row] for row in self.rows])
 
     def as_json(self) -> dict[str, Any]:
@@ -178,7 +178,7 @@ class QueryResult:
             If pandas is not installed.
         """
         try:
-            import pandas  # noqa: F401 - pyarrow says less clearly that it is missing
+            import pandas  # noqa: F401 - the error of pyarrow is less clear if it is missing
         except ImportError:
             raise ConfigError("to_pandas needs pandas: python -m pip install pandas") from None
         return self._found.to_pandas()
@@ -213,9 +213,9 @@ class QueryResult:
 
 
 class RunningQuery:
-    """A query of a session; nothing runs before rows or columns are wanted.
+    """A query of a session; nothing runs before rows or columns are requested.
 
-    What is wrong with the query, QueryError or QueryLimitError, is raised while it runs.
+    Errors of the query, QueryError or QueryLimitError, are raised while it runs.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class RunningQuery:
         progress: Progress = no_progress,
         max_bytes: int | None = None,
     ) -> None:
-        self._max_bytes = max_bytes  # of the rows that `rows` returns
+        self._max_bytes = max_bytes  # limit of the rows that `rows` returns
         self._ask = partial(engine.ask, allowance=allowance, progress=progress)
         self._text = text
         self._values = values
@@ -241,7 +241,7 @@ class RunningQuery:
         return _names_and_types(found)
 
     def table(self, count: int) -> ResultTable:
-        """Return the first rows with what is known of their columns."""
+        """Return the first rows with the facts of their columns."""
         rows = self.rows(count + 1)
         columns = tuple(result_column(name, kind, self._known) for name, kind in self.columns)
         return ResultTable(columns, rows[:count], len(rows) > count)

@@ -1,8 +1,8 @@
 """A session: queries about the views of some targets, and about nothing else.
 
-They run in a process of their own (`starcat.query.engine`), which sees the views and macros only.
-What a query may not do is refused before it runs (`starcat.query.statement`); what takes too long
-or too much memory is ended.
+They run in a process of their own (`starcat.query.engine`), which sees only the views and macros.
+Forbidden queries are refused before they run (`starcat.query.statement`); queries that take too
+long or too much memory are ended.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from starcat.storage.atomic import locked
 
 SCRATCH_PREFIX = "starcat-sql-"
 ABANDONED_S = 60.0
-"""Age from which a folder that no process has locked was left by one that was killed."""
+"""A folder older than this that no process has locked was left by a process that was killed."""
 PREAMBLE_GB = 1.0  # memory for looking into the footers of Parquet files
-MAX_COLUMNS = 100_000  # how many columns a DESCRIBE tells of at most
+MAX_COLUMNS = 100_000  # largest number of columns that a DESCRIBE returns
 MAX_CHECKED = 200
-"""Queries that are remembered as checked; those that were asked longest ago are forgotten."""
+"""Number of checked queries that are kept; the least recently used ones are dropped."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a query may take."""
+    """The limits of a query."""
 
     time_s: float = 60.0  # seconds until it is stopped
     memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
     disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
-    message_bytes: int = MAX_MESSAGE_BYTES  # size of a row, and of what is sent at once
+    message_bytes: int = MAX_MESSAGE_BYTES  # largest size of a row, and of a message
     rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
 
 
@@ -63,7 +63,7 @@ class Session:
     limits: Limits
     _engine: Engine = field(repr=False)
     _checked: dict[str, Statement] = field(default_factory=dict, repr=False)
-    # What all queries together may take; None where each has the time of the limits.
+    # Time that all queries together may take; None if each has the time of the limits.
     allowance: Allowance | None = field(default=None, repr=False)
 
     @property
@@ -123,7 +123,7 @@ class Session:
     def _described(
         self, statement: Statement, values: dict[str, Any] | None, allowance: Allowance
     ) -> str:
-        """Return a query for what DESCRIBE gives, and what the columns mean."""
+        """Return a query for the result of DESCRIBE, with the meanings of the columns."""
         asked = f"SELECT column_name, column_type FROM ({statement.text})"
         found = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
         known = facts_by_name(self._view_of(statement) or self.views)
@@ -149,8 +149,8 @@ def open_session(
 ) -> Iterator[Session]:
     """Open a session about some targets.
 
-    What does not fit into the memory is written to a folder ``within`` another one, or within the
-    system's folder for temporary files.
+    Data that do not fit into memory are written to a new folder in ``within``, or in the system's
+    folder for temporary files.
     """
     allowed = limits or Limits()
     with _scratch_folder(within) as scratch:
@@ -226,9 +226,9 @@ def preamble(targets: Sequence[Target]) -> str:
 
 
 def _named_views(targets: Sequence[Target]) -> dict[str, tuple[str, View]]:
-    """Return views by the names that ``crossmatch`` takes, each with its schema of places.
+    """Return views by the names that ``crossmatch`` accepts, each with its schema of places.
 
-    ``a.stars`` is also ``a``, and ``stars`` where there is one target.
+    ``a.stars`` is also ``a``, and ``stars`` if there is only one target.
     """
     found: dict[str, tuple[str, View]] = {}
     for schema, target in schemas_of(targets).items():
@@ -278,7 +278,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     files = [file for view in views for file in view.files]
     names = frozenset(macro.name for macro in macros() if macro.is_table)
     folder = _common_folder(files)
-    # Files are named from there on: DuckDB tells of a view, and not where it lies on the machine.
+    # Files are named relative to it: DuckDB shows the text of a view, but not its folder.
     text = preamble(targets)
     text = text.replace(sql_quoted(folder + os.sep)[:-1], "'") if folder else text
     try:
@@ -289,12 +289,12 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)
         raise ProductError(
             f"{where}: a table cannot be opened ({str(error).splitlines()[0]}); 'starcat verify' "
-            "says what is wrong with a database"
+            "checks a database and shows its damage"
         ) from error
 
 
 def _common_folder(files: Sequence[str]) -> str:
-    """Return the folder that all files are in; empty where that is the root, or none."""
+    """Return the folder that all files are in; empty for the root, or if there is none."""
     try:
         return os.path.commonpath([os.path.dirname(file) for file in files]).rstrip(os.sep)
     except ValueError:  # no files, or files of several drives

@@ -1,11 +1,11 @@
-"""Views with the places of rows, which the macros ``cone``, ``box`` and ``field`` look at.
+"""Views with the places of rows, which the macros ``cone``, ``box`` and ``field`` use.
 
-Each target has a schema of them beside its own, which SHOW TABLES leaves out. A view there is the
-table with ``_place_ra_deg`` and ``_place_dec_deg``, whatever these columns are called in it, and
-with the file of a row in ``_place_file`` where the table is spread over the sky in many files. What
-is known of these files is a variable of the view's name. A macro compares it with a constant place
-once, before DuckDB opens a file. ``crossmatch`` looks at tables of several targets, by names in one
-schema.
+Each target has a schema of them in addition to its own; SHOW TABLES leaves it out. A view there is
+the table with ``_place_ra_deg`` and ``_place_dec_deg``, whatever the names of these columns, and
+with the file of a row in ``_place_file`` if the table is spread over the sky in many files. A
+variable with the view's name holds the areas of these files. A macro compares it with a constant
+place once, before DuckDB opens a file. ``crossmatch`` uses tables of several targets, by names in
+one schema.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _IN_FILES = {
     "AND _is_wanted(file, _files_near(known, ra, dec, radius))",
     _BETWEEN: "_is_wanted(file, _files_between(known, ra_min, ra_max, dec_min, dec_max))",
 }
-"""What a row of a store is asked first; of other targets nothing, which takes less time."""
+"""First conditions for rows of a store; other targets have none, which takes less time."""
 
 
 def place_macros() -> str:
@@ -83,8 +83,8 @@ def place_statements(target: Target) -> Iterator[str]:
 def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
     """Give the SQL that makes the views which ``crossmatch`` reads, by their names in it.
 
-    Each is a view with places of a schema, with the unit vectors of its rows and their change in a
-    year, which is 0 where no motion or no epoch is known.
+    Each is a view with places of a schema, with the unit vectors of its rows and their change per
+    year, which is 0 if no motion or no epoch is known.
     """
     yield "CREATE SCHEMA IF NOT EXISTS _moving;"
     for name, (schema, view) in views.items():
@@ -114,7 +114,7 @@ def _position(view: View) -> tuple[str, str]:
     ra, dec = (quoted_name(by_lower[name.lower()]) for name in view.position)
     if view.position == POSITION:
         return ra, dec
-    # Of a catalog of others it is not known whether right ascensions are from 0 or from -180 on.
+    # In other catalogs right ascensions can begin at 0 or at -180.
     return f"({ra}::DOUBLE - 360 * floor({ra}::DOUBLE / 360))", f"{dec}::DOUBLE"
 
 

@@ -1,10 +1,10 @@
-"""What a query may say: one statement that only reads, and only what was named.
+"""Check of a query: one statement that only reads, and only the tables of its session.
 
-DuckDB is told to open no other file (`starcat.query.worker`), but it would let a COPY overwrite a
-file that it may read, and it takes a COPY in a WITH for a SELECT. So DuckDB parses the text, every
-part of the syntax tree has to be of a kind that reads, and DuckDB writes the text that runs from
-that tree. The text that was given never runs: where starcat and DuckDB should disagree on where a
-comment ends, nothing comes of it.
+DuckDB may open no other file (`starcat.query.worker`), but it would let a COPY overwrite a file
+that it may read, and it treats a COPY in a WITH as a SELECT. So DuckDB parses the text, every part
+of the syntax tree must be of a kind that reads, and DuckDB writes the text that runs from that
+tree. The user's text never runs: it does no harm if starcat and DuckDB disagree on where a comment
+ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from duckdb import DuckDBPyConnection, StatementType
 from starcat.errors import QueryError
 from starcat.query.messages import Statement
 
-POINTED_CHARACTERS = 200  # how much of a line with an error is shown
+POINTED_CHARACTERS = 200  # characters of a line with an error that are shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 """Nodes of DuckDB's syntax tree that read; COPY_QUERY_NODE and the like write."""
 
@@ -49,7 +49,7 @@ TABLE_FUNCTIONS = {
     "parquet_schema",
     "pragma_version",
 }
-"""Functions of DuckDB that make rows or tell about tables; they read no file but those of views."""
+"""Functions of DuckDB that make rows or describe tables; they read only the files of views."""
 
 REFUSED_FUNCTIONS = {
     "sleep_ms": "it only waits",
@@ -67,7 +67,7 @@ REFUSED_FUNCTIONS = {
 """Functions that only take time, or change or show the session, and why each is refused."""
 
 REFUSED_TABLES = {"pg_settings", "pragma_database_list", "duckdb_databases", "duckdb_logs"}
-"""Tables of DuckDB that tell of the machine and not of the targets."""
+"""Tables of DuckDB that describe the machine and not the targets."""
 
 EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "mermaid"}
 
@@ -75,7 +75,7 @@ EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "merma
 def check_statement(
     text: str, connection: DuckDBPyConnection, macros: frozenset[str] = frozenset()
 ) -> Statement:
-    """Check that a text is one statement that reads, and write that statement anew."""
+    """Check that a text is a single statement that reads, and return it as DuckDB rewrites it."""
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -85,7 +85,7 @@ def check_statement(
     explain, read = _explained(text)
     tree = _checked_tree(read, connection, macros)
     [(written,)] = connection.execute("SELECT json_deserialize_sql(?)", [tree]).fetchall()
-    # What runs is what was checked, even if DuckDB should read its own words in another way.
+    # Check the rewritten text too, in case DuckDB parses it differently.
     _checked_tree(written, connection, macros)
     runs = explain + written
     kind = StatementType.EXPLAIN if explain else StatementType.SELECT
@@ -182,7 +182,7 @@ def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
 
 
 def _refusal(text: str) -> str:
-    """Return why a statement that is no SELECT is refused."""
+    """Return the reason why a statement other than SELECT is refused."""
     words = [word for _, word in _words(text)]
     word = words[0][:24].upper()
     if word in PIVOTING or (word in ALLOWED and "pivot" in words):

@@ -1,4 +1,4 @@
-"""What a query is about: databases, star tables, stores, archive files, and the views on them."""
+"""Targets of a query: databases, star tables, stores, archive files, and the views on them."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class View:
     # The schema of the product, with units and meanings of its columns.
     schema: ProductSchema | None = None
     position: tuple[str, str] = POSITION  # columns with right ascension and declination
-    # For each file the part of the sky that its rows are in; empty where that is not known.
+    # For each file the part of the sky that its rows are in; empty if not known.
     pixels: tuple[Pixel, ...] = ()
 
     @property
     def described(self) -> tuple[SchemaColumn, ...]:
-        """What is known of its columns; nothing of tables that starcat did not write."""
+        """Descriptions of its columns; empty for tables that starcat did not write."""
         return self.schema.columns if self.schema else ()
 
     @cached_property
@@ -48,7 +48,7 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """Something that a query is about."""
+    """A target of a query."""
 
     # The schema of its views: ``name_1_2_3`` for a database, else the name of the source or the
     # file. It stays the same, whatever other targets there are.
@@ -67,7 +67,7 @@ class Target:
 def open_targets(
     given: Sequence[str], scratch: Path, engine: Engine, progress: Progress = no_progress
 ) -> tuple[Target, ...]:
-    """Find the tables of what was named."""
+    """Find the tables of the named targets."""
     targets = [
         _open_target(text, scratch / str(k), engine, progress) for k, text in enumerate(given)
     ]
@@ -107,12 +107,12 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     source, inputs = _source_of(text, path)
     if source is None:
         is_there = path.exists()
-        what = "cannot tell what it is" if is_there else "no such database, file or source"
+        what = "its kind is unknown" if is_there else "no such database, file or source"
         if is_there and path.suffix.lower() in (".csv", ".tsv", ".fits", ".ecsv", ".vot", ".xml"):
             what = f"a table is read through a map: 'starcat sources --draft {text}' proposes one"
         raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of a database or a HATS catalog, a Parquet file, an "
-            "archive file (SOURCE=PATH where its name is not the archive's), or a source that "
+            "archive file (SOURCE=PATH if its name is not the archive's), or a source that "
             "'starcat sources' lists"
         )
     return _archive(source, inputs, scratch, progress)
@@ -127,8 +127,8 @@ def _artifact(folder: Path) -> Target:
         # A manifest names files of its own folder, and nothing else may be read.
         if path.parent != folder or path.is_symlink() or not product.isidentifier():
             raise ProductError(
-                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is no "
-                "file of the database; fetch or build it again",
+                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is not "
+                "a file of the database; fetch or build it again",
                 product=product,
                 path=folder,
             )
@@ -155,7 +155,7 @@ def _check_file(path: Path) -> None:
 
 
 def _tables(path: Path, engine: Engine) -> Target:
-    """Return a Parquet file, with the rejected rows beside it where there are any."""
+    """Return a Parquet file, with the rejected rows next to it if there are any."""
     from starcat.stars.verdict import rejected_path
 
     files = [path, *filter(Path.is_file, [rejected_path(path)])]
@@ -180,7 +180,7 @@ def _store_in(folder: Path) -> Store | None:
 
 
 def _store(store: Store, engine: Engine) -> Target:
-    """Return a store: the stars in many files, each a part of the sky, and what was left out."""
+    """Return a store: the stars in many files, one per part of the sky, and the rejected rows."""
     from starcat.store.layout import REJECTED, REPEATED
 
     parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]

@@ -19,7 +19,7 @@ from starcat.workers.messages import MalformedMessage, from_json, json_content, 
 
 _PLAIN = {bool, int, float, str, type(None)}
 _BETWEEN = "\n"
-"""Between the texts of a column that have none in them. It is short in JSON and rare in columns."""
+"""Separator of texts in a column, if none contains it. It is short in JSON and rare in columns."""
 _INTEGERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "UTINYINT", "USMALLINT", "UINTEGER")
 _CODES = {"DOUBLE": "d", "FLOAT": "d", "BOOLEAN": "?", **dict.fromkeys(_INTEGERS, "q")}
 """How `struct` packs the values of a column, by DuckDB's type."""
@@ -45,7 +45,7 @@ def encoded(value: Any) -> Any:
 
 
 def decoded(value: Any) -> Any:
-    """Return the value that `encoded` was given; MalformedMessage if it is none."""
+    """Return the value that `encoded` was given, or raise MalformedMessage."""
     if type(value) in _PLAIN:
         return value
     try:
@@ -165,4 +165,4 @@ _TYPES: dict[str, tuple[tuple[type, ...], Callable[[Any], Iterable[Any]], Callab
     ),
     "uuid": ((uuid.UUID,), lambda value: (value.hex,), uuid.UUID),
 }
-"""Types beside those of JSON: the classes, what is written of a value, and how it is read again."""
+"""Types that JSON lacks: their classes, how a value is written, and how it is read again."""

@@ -1,8 +1,8 @@
 """The process that runs queries: a DuckDB in memory behind two pipes, with hard limits.
 
 `starcat.query.engine` starts it, writes requests to its standard input and reads replies from its
-standard output. It opens no file but those of the views, loads no extension, and its settings are
-locked before the first query. What it may take of the machine is limited by the operating system
+standard output. It opens only the files of the views, loads no extension, and its settings are
+locked before the first query. The operating system limits the resources that it takes
 (`starcat.workers.confinement`), so that a single call of a function cannot take more either.
 """
 
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 ROWS_AT_ONCE = 1 << 12
 
-WATCH_S = 0.2  # how often a running query is looked at
-NESTED_CALLS = 10_000  # how deep a syntax tree may be for Python to read it
-BESIDE_BYTES = 512 << 20  # what Python, Arrow and the stacks of threads may take beside DuckDB
+WATCH_S = 0.2  # seconds between checks of a running query
+NESTED_CALLS = 10_000  # recursion limit with which Python reads a syntax tree
+BESIDE_BYTES = 512 << 20  # memory for Python, Arrow and the stacks of threads, without DuckDB
 SCHEMA_KEY = "starcat.schema"
 
 _ZONED = re.compile(r"TIMESTAMP\w* WITH TIME ZONE")
 _ODD = re.compile(rf"{_ZONED.pattern}|\bINTERVAL\b")
-"""Types of which the Python client of DuckDB makes other values, or none."""
+"""Types that the Python client of DuckDB converts to other values, or cannot convert."""
 
 
 def serve_queries() -> None:
@@ -59,14 +59,14 @@ def serve_queries() -> None:
 
 
 class QueryWorker:
-    """A DuckDB and what it is asked."""
+    """A DuckDB with the methods that a session calls."""
 
     def __init__(self, opening: Opening, channel: Channel) -> None:
         self._opening = opening
         self._channel = channel
         self._is_running = False
         self._reader: pa.RecordBatchReader | None = None
-        self._streams: Iterator[bytes] = iter(())  # what is left of a batch of the reader
+        self._streams: Iterator[bytes] = iter(())  # the rest of a batch of the reader
         self._macros: frozenset[str] = frozenset()
         # Before DuckDB starts its threads.
         forbid_writing(except_in=Path(opening.spill))
@@ -90,7 +90,7 @@ class QueryWorker:
             self._channel.send(kind, found)
 
     def footer(self, path: str) -> tuple[str, tuple[str, ...]]:
-        """Return the schema's name, or nothing, and the columns that a Parquet file tells."""
+        """Return the schema's name, or nothing, and the columns from a Parquet file's footer."""
         # DuckDB fails in the middle of an answer where the name of a column is not UTF-8.
         self._connection.execute("SELECT max(name) FROM parquet_schema($path)", {"path": path})
         asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
@@ -116,7 +116,7 @@ class QueryWorker:
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
         self._macros = frozenset(macros)
-        # Progress is kept, and printed by who asks for it. Times have the zone UTC everywhere.
+        # DuckDB keeps the progress, and the caller prints it. Times have the zone UTC everywhere.
         self._connection.execute(
             "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
             "SET TimeZone = 'UTC'"
@@ -126,14 +126,14 @@ class QueryWorker:
         self._connection.execute("SET lock_configuration = true")
 
     def statements(self, text: str) -> list[str]:
-        """Return the queries of a text; a text that is no SQL is one."""
+        """Return the queries of a text; a text that is not SQL counts as a single query."""
         try:
             return [statement.query for statement in self._connection.extract_statements(text)]
         except duckdb.Error:
             return [text]
 
     def check(self, text: str) -> dict[str, Any]:
-        """Return what may run of a text, for `Statement.from_json`."""
+        """Return the checked statement of a text, for `Statement.from_json`."""
         return asdict(check_statement(text, self._connection, self._macros))
 
     def columns(self, text: str, values: dict[str, Any] | None) -> list[tuple[str, str]]:
@@ -200,14 +200,14 @@ class QueryWorker:
         return None
 
     def _let_go(self) -> None:
-        """Drop what is left of an answer, which DuckDB keeps open otherwise."""
+        """Drop the rest of an answer, which DuckDB keeps open otherwise."""
         if self._reader is not None:
             self._reader.close()
             self._reader, self._streams = None, iter(())
         self._connection.abort()
 
     def _watch(self) -> None:
-        """Tell how far a query is; end this process when the one that asks is gone."""
+        """Send the progress of a query; end this process when its parent is gone."""
         while True:
             time.sleep(WATCH_S)
             if os.name == "posix" and os.getppid() != self._opening.parent:
@@ -217,7 +217,7 @@ class QueryWorker:
                 if percent >= 0.0:
                     try:
                         self._channel.send(PROGRESS, int(percent))
-                    except OSError:  # the one that asks has gone since it was looked for
+                    except OSError:  # the parent has ended since the check
                         os._exit(1)
 
 
@@ -259,7 +259,7 @@ def _without_odd_types(text: str, columns: list[tuple[str, str]]) -> str:
 
 
 def _in_utc(rows: list[tuple[Any, ...]], zoned: list[int]) -> list[tuple[Any, ...]]:
-    """Give times their zone; what is no time, as infinity, stays."""
+    """Give times their zone; values that are not times, such as infinity, stay."""
     given = set(zoned)
     return [
         tuple(

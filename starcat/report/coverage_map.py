@@ -75,7 +75,7 @@ def nearest_raster(boresights: Array, values: Array | Counts, width: int) -> Arr
 
 
 MERIDIANS_DEG = (0, 60, 120, 240, 300)
-"""Right ascensions of the lines of a map; that of the edge is drawn as such."""
+"""Right ascensions of the lines of a map, without the meridian at its edge."""
 
 
 def parallels() -> Iterator[tuple[float, float, str]]:
@@ -157,7 +157,7 @@ class Bin:
 
 
 def colour_bins(stars: Counts) -> tuple[Bin, ...]:
-    """Return the colours for fields with so many stars."""
+    """Return the colours for fields, by their number of stars."""
     least = int(stars.min())
     first = max(least, MIN_STARS)
     most = int(np.quantile(stars, 0.995, method="inverted_cdf"))
@@ -171,7 +171,7 @@ def colour_bins(stars: Counts) -> tuple[Bin, ...]:
 
 
 FIXED_EDGES = (MIN_STARS, 6, 8, 10, 15, 20, 30, 50, 100)
-"""Least stars of the colours of `FIXED_BINS`, after that of too few."""
+"""Smallest numbers of stars of the colours of `FIXED_BINS`, after the colour for too few."""
 
 FIXED_BINS = tuple(
     Bin(f"m{k}", low, above - 1 if above else None)

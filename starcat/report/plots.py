@@ -206,7 +206,7 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
         left = np.arange(len(fields)) * width - 0.5
         axes.bar(left, fields, width * 0.92, align="edge", color=_BLUE)
         top = float(fields.max())
-        # Each mark ends at its own label, below the label of the one before.
+        # Each mark ends at its own label, below the label of the previous mark.
         for step, (name, value) in enumerate(marks.items()):
             height = top * (1.22 - 0.08 * step)
             axes.vlines(value, 0.0, height, color=_RED, lw=1.2)

@@ -1,6 +1,6 @@
-"""The report of a build: what went in, what came out, and how good it is.
+"""The report of a build: its inputs, its results, and their quality.
 
-All of it is plain data of the stages before; the files hold neither clock nor host nor path.
+All of it is plain data from the earlier stages; the files hold neither clock nor host nor path.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ DECIMALS = 6
 
 @dataclass(frozen=True)
 class CoverageReport:
-    """What a report says about coverage."""
+    """The coverage in a report."""
 
     coverage: Coverage  # stars, pairs and triangles by boresight
     summary: CoverageSummary  # the coverage in a few numbers
@@ -92,7 +92,7 @@ class CoverageReport:
 
 
 def _finite(error_arcsec: float) -> float | None:
-    """Return an error as JSON holds it: null where there is no attitude."""
+    """Return an error for JSON: null without an attitude."""
     return round(error_arcsec, DECIMALS) if np.isfinite(error_arcsec) else None
 
 
@@ -118,7 +118,7 @@ BLIND_SHARE = 0.001
 
 
 def coverage_warnings(summary: CoverageSummary, gap: TilingGap | None) -> tuple[str, ...]:
-    """Return what to say about holes of a tiling and about fields with too few stars."""
+    """Return warnings about holes of a tiling and about fields with too few stars."""
     told = [] if gap is None or not gap.has_holes else [_holes(gap)]
     blind = int(summary.histogram[:MIN_GUIDE_STARS].sum())
     if blind > BLIND_SHARE * summary.fields:
@@ -142,7 +142,7 @@ def coverage_csv(coverage: Coverage) -> bytes:
 
 
 def attitude_error_csv(coverage: Coverage, evenness: Evenness) -> bytes:
-    """Return the attitude errors by boresight as CSV; empty where there is no attitude."""
+    """Return the attitude errors by boresight as CSV; empty without an attitude."""
     ra_deg, dec_deg = radec_from_directions(coverage.boresights)
     columns = (ra_deg, dec_deg, coverage.stars, evenness.across, evenness.about)
     rows = enumerate(zip(*(column.tolist() for column in columns), strict=True))
@@ -208,7 +208,7 @@ def write_report(
     coverage: CoverageReport,
     in_band: InBand | None = None,
 ) -> None:
-    """Write all files of a report; ``content`` is that of report.json."""
+    """Write all files of a report; ``content`` is the content of report.json."""
     title, counts = f"{content['name']}-{content['version']}", content["magnitudes"]
     write_coverage(folder, title, coverage)
     names = ("from_mag", "to_mag", "guide_stars", "rejected")

@@ -1,4 +1,4 @@
-"""What a report says of the band of the sensor: response, relation, and limits in catalog bands."""
+"""The band of the sensor in a report: response, relation, and limits in catalog bands."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TYPES = ("b3v", "a0v", "f5v", "g2v", "k2iii", "m0iii", "m4iii")
-"""Types of stars that limits are given for."""
+"""Types of stars for which limits are given."""
 
 _COLOURS = ("#d1495b", "#b9c4cc", "#8a97a0", "#5b6770")
 
 
 def band_content(made: InBand, selection: Selection) -> dict[str, Any]:
-    """Return what report.json says of the band."""
+    """Return the part of report.json on the band."""
     response, base = made.response, shipped(made.band)
     difference = (synthetic_magnitudes(response) - synthetic_magnitudes(base))[0]
     rows = [library().types.index(name) for name in TYPES]

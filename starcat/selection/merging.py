@@ -1,4 +1,4 @@
-"""Close stars that become one: what both rules that merge stars share."""
+"""Close stars that become one: the functions that both merging rules share."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from starcat.stars.verdict import Quality
 MERGED = RuleReason("merged", "merged into the brighter star of a close group")
 
 MAX_PAIRS = 10_000_000
-"""Pairs of close stars that a rule looks at; they take up to a gigabyte, and the stars of no camera
-have a tenth as many."""
+"""Largest number of pairs of close stars for a rule; they take up to a gigabyte, and the stars of
+any real camera have less than a tenth of them."""
 
 
 def combined_magnitude(mags: Array) -> float:

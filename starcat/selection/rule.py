@@ -1,4 +1,4 @@
-"""What rules of selection are made of: reasons, rejections, the context, fields of a form."""
+"""Parts of the rules of selection: reasons, rejections, the context, fields of a form."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from starcat.stars.verdict import Verdicts
 class RuleReason:
     """Why a rule rejects a star."""
 
-    name: str  # as the column ``reason`` of the product ``rejected`` has it
-    value: str  # the same in words, for pages and reports
+    name: str  # the value of the column ``reason`` of the product ``rejected``
+    value: str  # the reason in words, for pages and reports
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Rejection:
 
 @dataclass
 class Context:
-    """What rules see and change while they are run one after another."""
+    """The data that rules read and change while they run in turn."""
 
     catalog: pa.Table  # the star table as it was read
     stars: pa.Table  # the same rows, as the rules that combine stars have changed them

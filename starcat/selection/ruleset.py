@@ -1,4 +1,4 @@
-"""The rules of selection in their order, and what is made of them: keys of a spec and reasons."""
+"""The rules of selection in their order, and the keys of a spec and the reasons they define."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from starcat.selection.rules.variables import Variables
 
 RULES = plugin_modules("starcat.selection.rules")
-"""The rules in their order; `starcat.selection.rules` says what a rule defines."""
+"""The rules in their order; `starcat.selection.rules` describes what a rule defines."""
 
 
 def table_of_rule(rule: ModuleType) -> str:
@@ -49,7 +49,7 @@ _WITH_KEYS = sorted((rule for rule in RULES if hasattr(rule, "KEYS")), key=_keys
 _BESIDE = [rule.KEYS for rule in _WITH_KEYS if not table_of_rule(rule)]
 
 if TYPE_CHECKING:
-    # A type checker reads no folder: it knows the keys that modules outside the rules use.
+    # A type checker does not load the rules: list the keys that other modules use here.
     class _KeysOfRules(Thinning, DriftLimit, StarCounts, MagnitudeLimits):
         doubles: Doubles = Doubles()
         neighbours: NeighbourRule = NeighbourRule()
@@ -92,8 +92,8 @@ ALL_REASONS: dict[str, str] = {
     **{reason.name: reason.value for reason in Reason},
     **{reason.name: reason.value for rule in RULES for reason in rule.REASONS},
 }
-"""What each reason of a rejected record means: those of archives, then those of rules, in the order
-in which they are tried."""
+"""Meaning of each reason of a rejected record: reasons of archives, then reasons of rules, in the
+order in which they are tried."""
 
 
 def form_fields() -> dict[str, FormField]:

@@ -23,7 +23,7 @@ from starcat.storage.schema import product_schema
 class Step:
     """The stars that are left after one filter."""
 
-    name: str  # what was filtered
+    name: str  # name of the filter
     directions: Array  # ICRS, shape (N, 3)
 
 
@@ -31,9 +31,9 @@ class Step:
 class Selected:
     """Guide stars, and every other star with its reason."""
 
-    guide_stars: pa.Table  # of the stars schema, by star_id
-    rejected: pa.Table  # of the rejected schema, by star_id
-    steps: tuple[Step, ...]  # what was left after each filter, in order
+    guide_stars: pa.Table  # in the stars schema, by star_id
+    rejected: pa.Table  # in the rejected schema, by star_id
+    steps: tuple[Step, ...]  # the stars that were left after each filter, in order
     neighbours: NeighbourTally | None = None  # if the spec has [selection.neighbours]
 
 
@@ -84,7 +84,7 @@ def select_guide_stars(
 def reject_dense(
     selected: Selected, kept: NDArray[np.integer], reason: RuleReason = DENSITY
 ) -> Selected:
-    """Thin the guide stars to those that a tiling asks for, by row."""
+    """Thin the guide stars to the rows that a tiling keeps."""
     (step,) = (rule.STEP for rule in RULES if reason in rule.REASONS)
     verdicts = Verdicts(len(selected.guide_stars))
     verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), reason)

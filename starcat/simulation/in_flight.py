@@ -1,4 +1,4 @@
-"""What an onboard image identifies in flight: the C library with its default options and limits.
+"""Identification rates of an onboard image in flight: the C library with its default limits.
 
 The simulated frames show all stars of the database that the image was made from, so they also show
 stars that the image does not have.
@@ -35,7 +35,7 @@ KINDS: Mapping[str, Noise] = MappingProxyType(
 )
 
 FRAMES = 200
-"""Frames of each kind that an image is tried with when it is written."""
+"""Number of frames of each kind with which an image is tested when it is written."""
 
 SEED = 86_028_121
 
@@ -45,12 +45,12 @@ MAX_ERROR_DEG = 0.5
 
 @dataclass(frozen=True)
 class FlightRates:
-    """How simulated frames of one kind fared with an onboard image."""
+    """Results of simulated frames of one kind with an onboard image."""
 
     kind: str  # ``clean`` or ``hard``
-    votes: bool  # whether the library had the table of neighbours
+    votes: bool  # true if the library had the table of neighbours
     frames: int
-    identified: int  # rightly
+    identified: int  # frames that were identified correctly
     wrong: int  # answered with a wrong attitude
     mean_steps: int
     most_steps: int
@@ -85,7 +85,7 @@ def flight_rates(
     made = make_image(contents, sys.byteorder)
     if not is_compiled() or made.most_near > FLIGHT_STARS:
         return ()
-    of_sky = sky.camera  # an image tells flight software nothing of the lens
+    of_sky = sky.camera  # an image does not contain the distortion of the lens
     camera = Camera(of_sky.width_px, of_sky.height_px, of_sky.focal_length_px)
     database = Database(
         contents.name,

@@ -1,4 +1,4 @@
-"""The self-test: a database identifies fields simulated from its own stars, or it is no good."""
+"""The self-test: a usable database must identify fields simulated from its own stars."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_MAG = 0.2
-"""Standard deviation of a magnitude that a camera measures of a star, unless a spec says another:
-the colour of a star alone makes so much of a difference between two bands."""
+"""Standard deviation of a measured magnitude, unless a spec sets another: the colour of a star
+alone makes a difference of this size between two bands."""
 
 HARD = {"drop_probability": 0.1, "false_stars": 3}
-"""What the harder half of the self-test adds to the noise of the spec."""
+"""Additions of the harder half of the self-test to the noise of the spec."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """How a number of frames fared."""
+    """Results of a number of frames."""
 
-    name: str  # which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given
-    noise_px: float  # what they suffered, as the next two
+    name: str  # kind of frames: ``clean`` or ``hard``, and ``, no magnitudes`` without them
+    noise_px: float  # noise of the frames, with the next two
     drop_probability: float
     false_stars: int
-    noise_mag: float | None  # standard deviation of the magnitudes; None where none were given
+    noise_mag: float | None  # standard deviation of the magnitudes; None without magnitudes
     frames: int
     identifiable: int  # frames with at least 4 stars
-    identified: int  # rightly
+    identified: int  # frames that were identified correctly
     wrong: int  # answered with a wrong star or attitude
-    median_residual_arcsec: float  # median over the identified frames; 0 where there are none
-    # Stars in each of the identifiable frames that were not identified rightly.
+    median_residual_arcsec: float  # median over the identified frames; 0 if there are none
+    # Stars in each of the identifiable frames that were not identified correctly.
     missed: tuple[int, ...] = ()
 
     @property
     def identified_share(self) -> float:
-        """Share of all pointings that are identified; 0 where none was tried."""
+        """Share of all pointings that are identified; 0 if none was tried."""
         return self.identified / self.frames if self.frames else 0.0
 
     @property
     def share_of_identifiable(self) -> float:
-        """Share of the frames with at least 4 stars; 0 where there are none."""
+        """Share of the frames with at least 4 stars that are identified; 0 if there are none."""
         return self.identified / self.identifiable if self.identifiable else 0.0
 
     @property
@@ -71,7 +71,7 @@ class Rates:
 
 
 def rates_of(content: Mapping[str, Any]) -> Rates:
-    """Return the rates that a report tells."""
+    """Return the rates that a report contains."""
     told = {f.name: content[f.name] for f in fields(Rates) if f.name in content}
     return Rates(**{"noise_mag": None, **told})  # version 0.1.0 gave no magnitudes
 
@@ -112,11 +112,11 @@ def self_test(
 
 
 class _Outcome(NamedTuple):
-    """What came of one frame."""
+    """The result of one frame."""
 
     n_stars: int
     is_right: bool
-    residual_arcsec: float | None  # None where it was not identified
+    residual_arcsec: float | None  # None if it was not identified
 
 
 def _outcome(matcher: Matcher, frame: SimulatedFrame, mag: Array | None) -> _Outcome:

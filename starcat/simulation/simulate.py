@@ -24,7 +24,7 @@ class SimulatedFrame:
     # Row of each centroid's guide star; -1 for another star and for a false one; shape (N,).
     star_index: NDArray[np.int64]
     mag: Array  # measured magnitudes; shape (N,)
-    is_false: NDArray[np.bool_]  # which centroids are no stars at all; shape (N,)
+    is_false: NDArray[np.bool_]  # true for centroids that are not stars at all; shape (N,)
 
     @property
     def n_stars(self) -> int:
@@ -34,17 +34,17 @@ class SimulatedFrame:
 
 @dataclass(frozen=True)
 class Noise:
-    """What a frame suffers."""
+    """The noise of a frame."""
 
     noise_px: float = 0.0  # standard deviation of a centroid, each axis
     drop_probability: float = 0.0  # chance of a star to be missing
     false_stars: int = 0  # spots at random places, with the magnitudes of stars drawn from the sky
-    # Further such spots, so many that they are this share of all centroids; below 1.
+    # Share of further such spots in all centroids; below 1.
     false_share: float = 0.0
-    # Standard deviation of a magnitude, before the limit decides what is seen.
+    # Standard deviation of a magnitude, added before the limit is applied.
     noise_mag: float = 0.0
-    limit_mag: float = float("inf")  # fainter ones are not seen
-    # Whether the true magnitude decides what is seen, not the measured one: then the noise of
+    limit_mag: float = float("inf")  # fainter stars are not seen
+    # Whether the limit is applied to the true magnitude, not the measured one: then the noise of
     # magnitudes neither hides a star nor lifts a fainter one over the limit.
     is_limit_true: bool = False
 
@@ -66,7 +66,7 @@ def simulate_frames(
 def simulate_sequence(
     sky: Sky, camera: Camera, count: int, noise: Noise, seed: int
 ) -> Iterator[SimulatedFrame]:
-    """Simulate frames one after the other: each is the same however many follow it."""
+    """Simulate frames in turn; a frame does not depend on the number of frames after it."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
         [matrix] = random_attitudes(1, generator)
@@ -116,7 +116,7 @@ class Sky:
 
     directions: Array  # ICRS unit vectors; shape (N, 3)
     mag: Array  # magnitudes; shape (N,)
-    # Row of the guide star in the database, -1 for what is none; shape (N,).
+    # Row of the guide star in the database, -1 for other points; shape (N,).
     star_index: NDArray[np.int32]
 
     def __len__(self) -> int:

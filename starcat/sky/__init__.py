@@ -1,4 +1,4 @@
-"""The real sky: where its bodies are, how motion turns starlight, what its stars are called."""
+"""The real sky: places of its bodies, aberration of starlight, and names of its stars."""
 
 from starcat.rooms import lazy_names
 

@@ -1,7 +1,7 @@
 """The Sun, the Moon and the planets: where an observer sees them, and how bright they are.
 
-By ERFA's ``epv00``, ``moon98`` and ``plan94``, which are what astropy calls its built-in
-ephemeris. Nothing is read and nothing is downloaded. Magnitudes of planets are after Mallama and
+Places are from ERFA's ``epv00``, ``moon98`` and ``plan94``, astropy's built-in ephemeris. Nothing
+is read and nothing is downloaded. Magnitudes of planets are after Mallama and
 Hilton 2018, "Computing apparent planetary magnitudes for The Astronomical Almanac", Astronomy and
 Computing 25, 10, V band; without the rotation of Mars (0.06 mag). The Sun and the Moon are after
 Allen's Astrophysical Quantities (4th ed., 2000, sections 14.2 and 12.9).
@@ -44,7 +44,7 @@ _PLANETS = {
     "Uranus": (7, 86.3),
     "Neptune": (8, 11.2),
 }
-_MOON_ERROR_ARCSEC = 20.0  # of ``moon98``, with a second of unknown leap seconds
+_MOON_ERROR_ARCSEC = 20.0  # error of ``moon98``, plus a second of unknown leap seconds
 
 # How far from the middle of the Earth an observer without a position may be.
 _WITHIN_ORBIT_KM = 7000.0
@@ -56,7 +56,7 @@ _AU_DAY = LIGHT_KM_S * DAY_S / AU_KM  # speed of light, au per day
 class Bodies:
     """The bodies of the solar system, as they are seen at a time."""
 
-    # ``Sun``, ``Moon``, the planets; ``Earth`` where the observer's position is known
+    # ``Sun``, ``Moon``, the planets; ``Earth`` if the observer's position is known
     names: tuple[str, ...]
     # shape (B, 3): apparent directions of their middles, ICRS axes: light time and aberration are
     # in them
@@ -64,8 +64,8 @@ class Bodies:
     distance_au: Array  # shape (B,): from the observer
     radius_rad: Array  # shape (B,): half of what they subtend
     mag: Array  # shape (B,): magnitudes, V
-    # shape (B,): largest error of the directions, that of an unknown position within 7,000 km of
-    # the middle of the Earth included
+    # shape (B,): largest error of the directions, including the error from an unknown position
+    # within 7,000 km of the middle of the Earth
     error_rad: Array
 
     def row(self, name: str) -> int:
@@ -98,7 +98,7 @@ def bodies_seen(observer: Observer) -> Bodies:
 
 
 def _light_time_corrected(name: str, observer: Observer) -> Array:
-    """Return where a body was when its light left, from the observer, au."""
+    """Return the place of a body when its light left, relative to the observer, au."""
     days, seen = 0.0, np.zeros(3)
     for _ in range(3):  # the light time changes by 1e-4 of itself in each
         seen = _barycentric_au(name, observer, days) - observer.position_au

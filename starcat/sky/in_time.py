@@ -33,7 +33,7 @@ FAINTER_MAG = 1.0
 
 # A body that is larger, as the Earth is from an orbit, has no spot.
 LARGEST_SPOT_RAD = np.radians(1.0)
-BRIGHTEST = 3  # so many of the brightest spots may be planets that a frame was not identified for
+BRIGHTEST = 3  # number of brightest spots that are tried as planets in an unidentified frame
 
 
 def identify_in_time(
@@ -47,7 +47,7 @@ def identify_in_time(
     tolerance_px: float = TOLERANCE_PX,
     max_false_match_probability: float = CERTAIN,
 ) -> MatchResult:
-    """Identify a frame in which planets may be.
+    """Identify a frame that can contain planets.
 
     Parameters
     ----------
@@ -60,14 +60,14 @@ def identify_in_time(
     camera : Camera
         The camera that took the frame; a focal length that the answer has found counts instead.
     tolerance_px, max_false_match_probability : float
-        As of `Matcher`; a spot may be off its planet by the error of the ephemeris too.
+        As of `Matcher`; the error of the ephemeris is added to the tolerance of planets.
 
     Returns
     -------
     MatchResult
         Spots of planets are in ``dropped``, by the planet's name in small letters. A frame that is
-        not identified is asked again without one or two of its three brightest spots; such an
-        answer counts if planets are there, with the probability of all these questions.
+        not identified is tried again without one or two of its three brightest spots; such an
+        answer counts if planets are there, with the probability of all these searches.
     """
     if not callable(identify):
         raise wrong_type("identify", identify, "a function, such as Matcher.identify")
@@ -117,10 +117,10 @@ def planets_among(
     """Return which centroids are planets, the Moon or the Sun.
 
     The matrix is of apparent directions; ``star_mag`` are magnitudes of the stars that were
-    found for the centroids, NaN where none. Returned is the name of the body in small letters
-    by row of the centroid. Of several centroids within reach of one body the brightest is its
-    spot, or the nearest without magnitudes. A spot stays its star's if the star is brighter
-    than the planet, or where the body is the Sun or the Moon and shows a disc.
+    found for the centroids, NaN without a star. The result maps the row of a centroid to the
+    name of the body in small letters. Of several centroids within reach of a body the brightest
+    is its spot, or the nearest without magnitudes. A centroid keeps its star if the star is
+    brighter than the planet, or if the body is the Sun or the Moon and shows a disc.
     """
     rows: dict[int, str] = {}
     places = camera.pixels_from_directions(seen.directions @ matrix.T)
@@ -169,7 +169,7 @@ def _unset(frame: Array, rows: tuple[int, ...]) -> Array:
 def _without(
     identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
 ) -> MatchResult:
-    """Identify a frame without the spots of planets, and say what they were."""
+    """Identify a frame without the spots of planets, and name the planets in the answer."""
     found = identify(_unset(frame, tuple(names)), mag=mag)
     dropped = tuple((row, names.get(row, reason)) for row, reason in found.dropped)
     return replace(found, dropped=dropped)
@@ -184,15 +184,15 @@ class BodyInFrame:
     name : str
         Such as ``Jupiter``.
     x_px, y_px : float
-        Where its middle is in the frame.
+        Place of its middle in the frame.
     mag : float
         Magnitude, V.
     radius_arcsec : float
-        Half of what it subtends.
+        Half of its angular diameter.
     from_boresight_deg : float
         Angle from the boresight.
     row : int or None
-        Row of the centroid that is its spot; None where there is none.
+        Row of the centroid that is its spot; None if no centroid is.
     """
 
     name: str
@@ -206,7 +206,7 @@ class BodyInFrame:
 
 @dataclass(frozen=True, eq=False)
 class SkyInTime:
-    """What a time adds to the answer to a frame.
+    """Results for a frame that need its time.
 
     Attributes
     ----------
@@ -218,17 +218,17 @@ class SkyInTime:
     boresight_ra_deg, boresight_dec_deg, roll_deg : float
         The same as angles.
     correction_arcsec : float
-        Angle of the rotation between this attitude and that of the answer.
+        Angle of the rotation between this attitude and the answer's attitude.
     residual_arcsec : float
         Root mean square angle between the centroids and the apparent stars.
     bodies : tuple of BodyInFrame
-        Those in the frame, brightest first.
+        Bodies in the frame, brightest first.
     sun_angle_deg, moon_angle_deg : float
-        From the boresight to their middles. Without a position of the observer that of the Moon
-        is good to 1 deg.
+        Angles from the boresight to their middles. Without a position of the observer the angle
+        of the Moon is good to 1 deg.
     earth_limb_angle_deg : float or None
-        From the boresight to the limb of the Earth, a sphere of 6378.137 km without atmosphere;
-        negative where the boresight points at the Earth. None without a position.
+        Angle from the boresight to the limb of the Earth, a sphere of 6378.137 km without
+        atmosphere; negative if the boresight points at the Earth. None without a position.
     """
 
     time: str
@@ -244,7 +244,7 @@ class SkyInTime:
     earth_limb_angle_deg: float | None
 
     def content(self) -> dict[str, Any]:
-        """Return it as JSON has it, under the key ``in_time`` of an answer."""
+        """Return the values for JSON, under the key ``in_time`` of an answer."""
         return {**asdict(self), "q_body_from_icrs": self.q_body_from_icrs.tolist()}
 
 
@@ -257,7 +257,7 @@ def sky_in_time(
     *,
     parallax_mas: ArrayLike | None = None,
 ) -> SkyInTime | None:
-    """Return what the time adds to the answer to a frame.
+    """Return the results for a frame that need its time.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""The names that people know stars by, and the lines that make constellations of them.
+"""The common names of stars, and the lines of constellations.
 
 ``star_names.csv`` has the stars to V = 6.6 with the IAU's proper names and Bayer letters,
-``constellation_lines.csv`` the lines between them; both say where they come from. A star of any
-catalog is found in it by its Hipparcos number where its designation is one, else by its place.
+``constellation_lines.csv`` the lines between them; both files state their sources. A star of any
+catalog is found by its Hipparcos number if its designation is one, else by its place.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class NamedStars:
         return np.asarray(moved / np.sqrt(np.einsum("ij,ij->i", moved, moved))[:, None])
 
     def rows_of(self, hips: Iterable[int]) -> list[int]:
-        """Return the rows of Hipparcos numbers; KeyError where there is none."""
+        """Return the rows of Hipparcos numbers; KeyError for an unknown number."""
         return [self._row_of[hip] for hip in hips]
 
     def label_of(self, designation: str) -> str | None:

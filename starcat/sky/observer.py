@@ -1,10 +1,10 @@
-"""The observer: when and where he looks and how fast he moves, and where he sees stars.
+"""The observer: time, place and velocity, and the apparent directions of stars.
 
-The Earth and the Sun are by ERFA's ``epv00``, which astropy calls its built-in ephemeris: the
-velocity of the Earth is good to 5 mm/s, 4 microarcseconds of aberration. Nothing is downloaded:
-leap seconds are those of the installed ERFA.
+The Earth and the Sun are from ERFA's ``epv00``, astropy's built-in ephemeris: the velocity of the
+Earth is good to 5 mm/s, 4 microarcseconds of aberration. Nothing is downloaded: leap seconds are
+from the installed ERFA.
 
-A catalog says where a star is seen from the middle of the solar system, at rest. An observer
+A catalog gives the direction of a star from the middle of the solar system, at rest. An observer
 elsewhere sees it shifted by parallax (at most 0.8 arcsec), bent by the Sun (4 mas at 90 deg from
 it, 1.75 arcsec at its limb) and displaced in the direction of his own motion (20.5 arcsec for the
 Earth, 5 arcsec more in a low orbit). Directions are unit vectors in ICRS axes, in and out.
@@ -115,13 +115,13 @@ class Observer:
         Parameters
         ----------
         time : str or datetime
-            UTC, such as ``2026-11-22T10:00:00``; a time zone in it is heeded.
+            UTC, such as ``2026-11-22T10:00:00``; a time zone in it is used.
         position_km, velocity_km_s : array_like of float64, shape (3,), optional
             Relative to the origin, km and km/s (quantities with another unit of length and
-            velocity are converted), ICRS axes (of the Earth: GCRS, for which J2000
-            axes will do; not those of a two-line element set); those of the Earth by default.
+            velocity are converted), in ICRS axes (for the Earth GCRS, or J2000, but not the axes
+            of a two-line element set); by default the Earth's own.
         origin : {"earth", "barycentre"}
-            What both are relative to; relative to the barycentre both have to be given.
+            Origin of both; with the barycentre both have to be given.
 
         Returns
         -------
@@ -176,7 +176,7 @@ class Observer:
 
 
 def observer_numbers(name: str, text: str, count: int) -> list[float]:
-    """Return so many numbers of a text such as ``1.5,-7.2,0``, or raise ConfigError."""
+    """Return the ``count`` numbers of a text such as ``1.5,-7.2,0``, or raise ConfigError."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -201,10 +201,10 @@ def _three(name: str, given: ArrayLike) -> Array:
 
 
 def _utc(time: str | datetime) -> datetime:
-    """Return a time with its zone, which is UTC where none is stated."""
+    """Return a time with its zone, which is UTC if none is stated."""
     moment = time if isinstance(time, datetime) else None
     if moment is None:
-        # A date alone would be a time too, by Python's rules: midnight, which nobody meant.
+        # Python reads a date alone as midnight, which the user hardly meant: refuse it.
         try:
             moment = datetime.fromisoformat(str(time).strip()) if _has_hours(time) else None
         except ValueError:
@@ -233,11 +233,11 @@ def _has_hours(time: object) -> bool:
 
 
 def _terrestrial(moment: datetime) -> tuple[float, float]:
-    """Return a time as Terrestrial Time, with the leap seconds that ERFA knows of."""
+    """Return a time as Terrestrial Time, with the leap seconds of ERFA."""
     second = moment.second + moment.microsecond / 1e6
     with warnings.catch_warnings():
-        # "Dubious year" is said before 1960 and where later leap seconds may be unknown: the
-        # error is seconds, in which the Moon moves by half an arcsecond each.
+        # ERFA warns of a "dubious year" before 1960 and if later leap seconds can be unknown: the
+        # error is seconds, and the Moon moves by half an arcsecond per second.
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         utc = erfa.dtf2d(
             "UTC", moment.year, moment.month, moment.day, moment.hour, moment.minute, second

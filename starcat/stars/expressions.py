@@ -1,7 +1,7 @@
 """Expressions of the columns of a table, checked and computed by DuckDB.
 
-An expression is one scalar expression of SQL: arithmetic, comparisons, CASE, and the functions
-of `FUNCTIONS`. It cannot hold a query, an aggregate, or what differs from run to run.
+An expression is a single scalar expression of SQL: arithmetic, comparisons, CASE, and the functions
+of `FUNCTIONS`. It cannot hold a query, an aggregate, or a function that varies between runs.
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ def _query(text: str) -> str:
 
 def _refused(key: str, text: str, why: str, where: str) -> ConfigError:
     return ConfigError(
-        f"{key}: {text!r} is no column of {where} and no expression: {why}. Name a column, or "
-        'write an expression such as "a - b" or "flag = \'D\'"',
+        f"{key}: {text!r} is neither a column of {where} nor an expression: {why}. Name a column, "
+        'or write an expression such as "a - b" or "flag = \'D\'"',
         key=key,
         value=text,
     )

@@ -49,8 +49,8 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     elapsed = np.asarray(years, dtype=np.float64)
     ra, dec = np.radians(motion.ra_deg), np.radians(motion.dec_deg)
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
-    # The velocity along east (-sin ra, cos ra, 0) and north (-sin dec cos ra, ...), a component
-    # at a time: on millions of stars that is several times faster than rows of vectors.
+    # The velocity along east (-sin ra, cos ra, 0) and north (-sin dec cos ra, ...), each component
+    # separately: for millions of stars this is several times faster than rows of vectors.
     inward = -pm_dec * sin_dec
     vx = inward * cos_ra - pm_ra * sin_ra
     vy = inward * sin_ra + pm_ra * cos_ra
@@ -68,13 +68,13 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     ra_deg = np.where(moved & (ra_deg < 0.0), ra_deg + 360.0, ra_deg)
     ra_deg = np.where(moved & (ra_deg >= 360.0), 0.0, ra_deg)
     dec_deg = np.where(moved, np.degrees(np.arctan2(z, ground)), motion.dec_deg)
-    # East is (-y, x, 0) / ground at the end. At a pole, where that is 0 / 0, the right ascension
-    # at the start says which way east is.
+    # East at the end is (-y, x, 0) / ground. At a pole, where this is 0 / 0, the right ascension
+    # at the start determines the direction of east.
     off_pole = ground > 0.0
     cos_end = np.divide(x, ground, out=cos_ra, where=off_pole)
     sin_end = np.divide(y, ground, out=sin_ra, where=off_pole)
     # The derivative of p / |p| along east and north at the end: as the star moves away on its
-    # straight line, the same speed is a smaller angle a year.
+    # straight line, the same speed is a smaller angle per year.
     pm_ra_end = (vy * cos_end - vx * sin_end) / (length * MAS)
     pm_dec_end = (vz * ground - (vx * cos_end + vy * sin_end) * z) / (length * MAS)
     end = Motion(
@@ -89,10 +89,10 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
 def propagate_in_space(
     motion: Motion, parallax_mas: Array, velocity_km_s: Array, from_jyear: Array, to_jyear: Array
 ) -> tuple[Motion, Array]:
-    """Move positions, those of stars with a parallax in space, and return the directions too.
+    """Move positions, in space for stars with a parallax, and return the directions too.
 
-    The radial velocity is 0 where it is not known. Without a parallax above 0 a star moves as
-    `propagate` has it.
+    An unknown radial velocity counts as 0. Without a parallax above 0 a star moves as with
+    `propagate`.
 
     References
     ----------
@@ -106,7 +106,7 @@ def propagate_in_space(
         return moved, u
     ra, dec = np.radians(motion.ra_deg[rows]), np.radians(motion.dec_deg[rows])
     begin, end = (np.broadcast_to(year, len(u))[rows] for year in (from_jyear, to_jyear))
-    with warnings.catch_warnings():  # of stars whose parallax is too small for their motion
+    with warnings.catch_warnings():  # for stars whose parallax is too small for their motion
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         ra, dec, pm_ra, pm_dec, _, _ = erfa.pmsafe(
             ra,
@@ -131,8 +131,8 @@ def central_error(
 ) -> tuple[Array, Array]:
     """Return the position error of an axis at its central epoch, and that epoch.
 
-    There position and proper motion are independent, so that years later the variance of the
-    position is that of the centre and the years squared times that of the motion. Where one of
+    There position and proper motion are independent: years later the variance of the position is
+    the variance at that epoch plus the years squared times the variance of the motion. If one of
     the three arrays, of shape (N,), has no value, the error stays at its own epoch.
     """
     shift = -correlation * error_mas / pm_error_mas_yr

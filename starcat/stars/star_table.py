@@ -1,7 +1,7 @@
-"""The star table: one row a catalog record, columns as ``schemas/stars-*.json`` says.
+"""The star table: one row per catalog record, with the columns of ``schemas/stars-*.json``.
 
 A catalog module fills in the columns that its archive has; this module adds the rest, moves
-positions to the epoch of the build and parts the rejected records from the stars.
+positions to the epoch of the build and separates the rejected records from the stars.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Columns: TypeAlias = dict[str, Values]
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
     """Return the columns with positions at an epoch, and their directions.
 
-    A star without proper motion stays where and when its archive has it, and its quality flags
-    say so; where the epoch is None, every star stays.
+    A star without proper motion stays at the place and epoch of its archive, and its quality flags
+    show this. If the epoch is None, every star stays.
     """
     ra = np.asarray(columns["ra_deg"], dtype=np.float64)
     dec = np.asarray(columns["dec_deg"], dtype=np.float64)
@@ -68,7 +68,7 @@ def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> C
 
 
 def table_from_columns(product: str, columns: Mapping[str, Values], count: int) -> pa.Table:
-    """Return columns as a table of a product's schema, null where none was given."""
+    """Return columns as a table of a product's schema; columns that are not given are null."""
     schema = product_schema(product).arrow_schema
     unknown = set(columns) - set(schema.names)
     if unknown:
@@ -165,9 +165,9 @@ def text_column(values: NDArray[Any]) -> pa.Array:
 
 
 def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]]) -> pa.Array:
-    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``; null without any.
+    """Return the archive's codes as one text per star, such as ``Rem=1;m_HD=2``; null without any.
 
-    Each label comes with where its code applies and the text of the code (None: the label alone).
+    Each label has a mask of the stars with its code, and the text of the code (None: no text).
     """
     is_flagged = np.logical_or.reduce([where for where, _ in parts.values()])
     rows = np.flatnonzero(is_flagged)
@@ -186,7 +186,7 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
 
 
 def known(errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return standard errors with NaN for those that are 0, by which archives mean none."""
+    """Return standard errors with NaN in place of 0, which in archives means unknown."""
     return np.where(errors > 0.0, errors, np.nan)
 
 

@@ -19,9 +19,9 @@ from starcat.arrays import Mask
 
 
 class Reason(Enum):
-    """Why the record of an archive cannot be used; the value of a member says it in words.
+    """Why the record of an archive cannot be used; the value of a member is the reason in words.
 
-    They stand in the order in which they are tried; the first that applies is the verdict.
+    The members are in the order in which they are tried; the first that applies is the verdict.
     """
 
     malformed_record = "the record does not follow the archive's layout"
@@ -46,7 +46,7 @@ class NamedReason(Protocol):
 
     @property
     def name(self) -> str:
-        """What the product ``rejected`` calls it."""
+        """The name of the reason in the product ``rejected``."""
 
 
 class Verdicts:
@@ -80,11 +80,11 @@ class Verdicts:
 
     @property
     def details(self) -> pa.Array:
-        """Details of the verdicts on the rejected records, in order; null where there is none."""
+        """Details of the verdicts on the rejected records, in order; null without details."""
         return self._of_rejected([detail for _, detail in self._verdicts])
 
     def _of_rejected(self, texts: Sequence[str | None]) -> pa.Array:
-        # Made here: the first array of a list imports pandas, where that is installed.
+        # Made only here: the first array from a list imports pandas, if that is installed.
         return pa.array(texts, pa.string()).take(pa.array(self._code[self._code != 0] - 1))
 
 

@@ -1,1 +1,1 @@
-"""Methods: one module a way to propose which spot is which star."""
+"""Methods: each module is a way to propose which spot is which star."""

@@ -1,12 +1,12 @@
 """Reference stars, and consensus: which names of single centroids agree with each other.
 
 Several methods compare the neighbourhood of one centroid, the reference star, with that of
-every star. The centroid nearest to the centre of the frame is tried first, because most of its
+each star. The centroid nearest to the centre of the frame is tried first, because most of its
 neighbours are in the frame.
 
-Some methods rank stars for every centroid on its own; a name is one such star for one centroid.
-Two names can both be right only if the two stars are as far apart as the two centroids. The
-names that agree with the most others in this way come first.
+Some methods rank stars for every centroid on its own; a name is a pair of a centroid and one of
+these stars. Two names can both be right only if the two stars are as far apart as the two
+centroids. The names that agree with the most other names come first.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
 
 MAX_NAMES = 2048
-"""Largest number of names that are compared; where there are more, low ranks are left out."""
+"""Largest number of names that are compared; if there are more, low ranks are left out."""
 
 
 def consistent_candidates(
@@ -38,13 +38,13 @@ def consistent_candidates(
     """Propose the names of centroids that agree with each other, at most ``most`` pairs.
 
     ``ranked`` has rows of the database's stars for every centroid, shape (N, K), the best first;
-    -1 where there is none. The first candidate is one correspondence: the pair with the highest
+    -1 if there are fewer. The first candidate is one correspondence: the pair with the highest
     support and all names that agree with both and with each other. Then every pair follows by
-    falling support, and among equal ones by falling separation.
+    falling support, and pairs of equal support by falling separation.
 
     The support of a name is the number of other centroids with a name that agrees with it. True
-    names agree with each other and false ones rarely do, however many there are. The support
-    of a pair is the sum of the support of both names.
+    names agree with each other; false names rarely do, even if there are many. The support of a
+    pair is the sum of the support of both names.
     """
     centroid, star = _names(ranked)
     fits = consistent(centroid, star, observation, database)
@@ -100,7 +100,7 @@ def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
 
 
 def _all_agreeing(pair: Rows, fits: Mask, count: NDArray[np.int64]) -> Rows:
-    """Return a pair and what agrees with it and each other, the best supported first."""
+    """Return a pair and the names that agree with it and each other, the best supported first."""
     chosen = list(pair)
     left = fits[pair[0]] & fits[pair[1]]
     while left.any():
@@ -119,7 +119,7 @@ def neighbour_candidates(
 ) -> Candidates:
     """Return the stars that a reference star may be, with two neighbours that agree.
 
-    ``stars`` are what the reference star may be, none twice, and ``product`` lists the neighbours
+    ``stars`` are the stars that it can be, without repeats, and ``product`` lists the neighbours
     of every star in ``star_offsets`` and ``neighbour``. There is at most one candidate for each
     star, the best supported first. It names three centroids: the reference star, and two whose
     stars are neighbours of the star at the same separations from it and from each other.
@@ -171,7 +171,7 @@ def _named_by_neighbours(
     observation: Observation,
     database: Database,
 ) -> tuple[Rows, Rows, Rows]:
-    """Return whose neighbours are as far from it as which centroids from the reference star."""
+    """Return the stars with neighbours as far away as centroids are from the reference star."""
     offsets = product["star_offsets"]
     owner, row = rows_between(offsets[stars], offsets[stars + 1])
     star = product["neighbour"][row].astype(np.intp)
@@ -234,9 +234,9 @@ def by_reference(
     """Propose the best of every reference star, then the next ranks of all of them together.
 
     Each of ``proposals`` returns the candidates of a reference star, given its row, the best first;
-    the second is asked when all reference stars have been asked the first. The papers stop at the
-    best star of the reference star nearest to the centre. Here another reference star decides where
-    that one is a false star, or has lost its neighbours.
+    the second one is called after the first was called for all reference stars. The papers stop at
+    the best star of the reference star nearest to the centre. Here another reference star decides
+    if that one is a false star, or has lost its neighbours.
     """
     found: list[Candidates] = []
     for propose in proposals:

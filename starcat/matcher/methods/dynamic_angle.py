@@ -4,10 +4,10 @@ The angle from one neighbour of a reference star to the next, and that neighbour
 lead to stars that have the same. With the two neighbours laid upon each other, the neighbours
 that agree in angle and separation are counted. Needs the product ``neighbours``.
 
-That needs a star whose neighbours are mostly in the frame and mostly guide stars. Where a camera
-misses stars and sees others, few fields have one. Where no reference star leads to an answer, every
-pair of the frame is therefore a base: it is laid upon every two stars that are as far apart, and
-the other centroids are looked up in the sky. A field of four known stars is found like this,
+That needs a star whose neighbours are mostly in the frame and mostly guide stars. If a camera
+misses stars and sees others, few fields have such a star. So if no reference star leads to an
+answer, every pair of the frame is a base: it is laid upon every two stars that are as far apart,
+and the other centroids are looked up in the sky. A field of four known stars is found like this,
 whatever is missing and whatever else is seen. It takes ten times as long as a neighbourhood.
 """
 
@@ -29,8 +29,8 @@ from starcat.matcher.star_cells import cells_for, rows_between
 _TURN = 2.0 * np.pi
 
 PASSED_OVER = (2, 3, 4)
-"""When the angles to the next neighbour lead nowhere, those to the ones after it: of the
-centroids between, some may be no guide stars."""
+"""Steps to later neighbours that are tried if the angles to the next neighbour lead nowhere: some
+of the centroids between them may not be guide stars."""
 
 
 def angle_tolerance_rad(tolerance_rad: float, one: Array, other: Array) -> Array:
@@ -59,7 +59,7 @@ def rank_stars(
     """Return the stars that a reference star may be, the best first, and their scores.
 
     Each comes with the farthest neighbour that agrees: the baseline of the attitude. A score is
-    S2's S (eq. 9), the share of the observed neighbours that agree; of equal stars those with
+    S2's S (eq. 9), the share of the observed neighbours that agree; at equal scores stars with
     fewer neighbours come first. S2's answer is the best star of the first of `references`.
     """
     product, tolerance_rad = database.products["neighbours"], observation.side_tolerance_rad
@@ -91,8 +91,8 @@ def _look_up(
 ) -> tuple[Rows, Rows]:
     """Return neighbours of a reference star and the product's rows that they may be.
 
-    Separation and angle to the neighbour so many steps on agree; the bins that the tolerance
-    touches are read. Neighbours are given by their place in the surroundings.
+    The separation, and the angle to the neighbour ``steps`` further on, agree. The bins that the
+    tolerance touches are read. Neighbours are given by their place in the surroundings.
     """
     order = np.argsort(around.position_angle_rad, kind="stable")
     angle, apart = around.position_angle_rad[order], around.separation_rad[order]
@@ -147,7 +147,7 @@ MIN_OTHERS = 2
 
 REACH = 3.0
 """Largest distance of another centroid from its star, in units of the tolerance. It is larger than
-that of an agreement, as two stars leave more of an error in an attitude."""
+for an agreement, because an attitude from two stars has a larger error."""
 
 MAX_PLACES = 2**20
 """Largest number of places in the sky that a frame is looked up at: some tenths of a second."""
@@ -156,9 +156,9 @@ MAX_PLACES = 2**20
 def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what two centroids and a third one are, a batch for each pair of the frame.
 
-    At least one further centroid is near a star then. The pairs are those up to the radius of the
-    product ``neighbours``, of the first centroids of the observation first: these are the brightest
-    ones where magnitudes are known.
+    At least one further centroid is near a star then. All pairs up to the radius of the product
+    ``neighbours`` are tried, the first centroids of the observation first. These are the brightest
+    centroids if magnitudes are known.
     """
     order, apart_rad = database.cached(_by_separation)
     if not len(order):

@@ -46,17 +46,17 @@ FIRST_ROUND = (16, 5)
 """Number of the first centroids that take part, and number of names that each of them gets."""
 
 SECOND_ROUND = (64, 100)
-"""The same two numbers of a second round, where the names of the first one do not agree."""
+"""The same two numbers for a second round, if the names of the first round do not agree."""
 
 DIVISOR_ROUNDS = ((1, 30), (2, 30), (3, 400))
-"""How many of the nearest, of the frame and of a star, are tried as divisors, and how many of
-the best stars of each pair of divisors become candidates, one round after the other."""
+"""Rounds: number of nearest distances, of the frame and of a star, that are tried as divisors,
+and number of best stars of each pair of divisors that become candidates."""
 
 STARS_BY_POINTS = 30
 """Number of the best stars of a reference star that become candidates."""
 
 _AT_ONCE = 1 << 22
-"""Numbers held at the same time while observed separations are compared with all stars."""
+"""Largest number of values in memory while observed separations are compared with all stars."""
 
 _UP = np.array([0.0, -1.0, 0.0])
 
@@ -64,10 +64,10 @@ _UP = np.array([0.0, -1.0, 0.0])
 def angular_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose names of several centroids that agree with each other.
 
-    Then follow, for each centroid and many more names, those whose neighbours agree.
+    Then, for each centroid and many more names, the names follow whose neighbours agree.
 
     The paper counts every difference in full, so that one false or missing star outweighs all
-    that agree. Here a difference counts as ``side_tolerance_rad`` at the most.
+    stars that agree. Here a difference counts at most as ``side_tolerance_rad``.
 
     Rotation-invariant feature with modified Hausdorff distance (S5).
     """
@@ -96,11 +96,11 @@ def rank_by_separations(
 ) -> tuple[Rows, Array]:
     """Rank the stars for every centroid by the directed, averaged Hausdorff distance.
 
-    A difference counts as ``cap_rad`` at the most; only the ``first`` centroids take part. Rows of
-    stars of shape (N, count), the nearest set first, -1 where there are no more; and scores, the
-    mean of the smallest differences from a member of the set, over those separations of the
-    centroid that lie within the radius of the reference sets; radians, ``inf`` where there are no
-    more. A centroid without such separations has no stars.
+    A difference counts at most as ``cap_rad``; only the ``first`` centroids take part. Return rows
+    of stars, shape (N, count), the nearest set first, -1 after the last star, and their scores in
+    radians, ``inf`` after the last star. A score is the mean, over the separations of the centroid
+    within the radius of the reference sets, of the smallest difference from a member of the set.
+    A centroid without such separations has no stars.
     """
     product = database.products["hausdorff_angular"]
     sets = database.cached(_separation_sets)
@@ -136,10 +136,10 @@ def _separation_sets(database: Database) -> ReferenceSets:
 def ratio_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are.
 
-    The paper divides by the smallest distance and takes the best star. Here the best of
-    many become candidates, and later rounds divide by the second and third smallest too, of
-    the frame as of the star, so that the nearest may err, be false or be missing. Differences
-    of ratios count in units of what they may err, and 1 at the most.
+    The paper divides by the smallest distance and takes the best star. Here the best of many
+    stars become candidates. Later rounds also divide by the second and third smallest distance,
+    of the frame and of the star, in case the nearest neighbour is false, missing or inaccurate.
+    Differences of ratios count in units of their largest error, and at most 1.
 
     Wang et al. 2020 (S1).
     """
@@ -159,11 +159,11 @@ def likely_stars(
 ) -> Rows:
     """Return the stars that a reference star is likely to be, ascending.
 
-    ``divisors`` says how many of the nearest, of the frame and of each star, are divided by, 3 at
-    the most; ``count`` how many stars there are for each pair of divisors.
+    ``divisors`` is the number of nearest distances, of the frame and of each star, that serve as
+    divisors, at most 3; ``count`` is the number of stars for each pair of divisors.
 
-    Distances d err by e each, so d/d' errs by ``e/d' sqrt(1 + (d/d')^2)``: that is where a
-    difference ceases to count for more.
+    Distances d err by e each, so d/d' errs by ``e/d' sqrt(1 + (d/d')^2)``: a difference counts at
+    most as this error.
     """
     distance = distances_around(observation, database, reference)
     error = observation.side_tolerance_rad
@@ -211,7 +211,7 @@ def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
 def point_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are, if the roll is 0.
 
-    Wang et al. 2020 (S1), whose baseline it is.
+    This is the baseline of Wang et al. 2020 (S1).
     """
     product = database.products["hausdorff_l2"]
 
@@ -227,12 +227,12 @@ def rank_by_points(
 ) -> tuple[Rows, Array]:
     """Rank the stars for a reference star, the nearest to the centre of the frame by default.
 
-    Rows of stars, shape (count,), the best first, -1 where there are no more; and scores, the mean
-    over the centroids around it, within the radius of the reference sets, of the smallest L1
-    distance to a neighbour of the star, in units of the focal length; ``inf`` where no more.
+    Return rows of stars, shape (count,), the best first, -1 after the last; and scores, ``inf``
+    after the last. A score is the mean, over the centroids within the radius of the reference
+    sets, of the smallest L1 distance to a neighbour of the star, in units of the focal length.
 
-    The image's up is taken for north at the reference star. That is exact in its centre;
-    elsewhere the meridians converge, the more the nearer to a pole. Every centroid is compared
+    The image's up is taken for north at the reference star. This is exact in the centre of the
+    image; elsewhere the meridians converge, more so near a pole. Every centroid is compared
     with the neighbours of all stars, so the time grows with the product of the two numbers.
 
     Wang et al. 2020 (S1), eq. 6; Dubuisson and Jain 1994, "A modified Hausdorff distance for
@@ -280,8 +280,8 @@ class ReferenceSets:
     offsets: NDArray[np.int64]
     value: Array  # the members of all stars, ascending; shape (M,)
     star: Rows  # the star that each member of ``value`` belongs to
-    # Each member of ``value`` is the nearest of its star's members to all numbers from ``low`` up
-    # to ``high``, the latter excluded; shape (M,).
+    # Each member of ``value`` is the nearest of its star's members to all numbers x with
+    # ``low <= x < high``; shape (M,).
     low: Array
     high: Array
 
@@ -306,10 +306,10 @@ def reference_sets(values: Array, offsets: NDArray[np.int64]) -> ReferenceSets:
 def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) -> Array:
     """Return, for every star, the mean of the observed elements' smallest differences from it.
 
-    The differences are the caller's, so elements need not be numbers: they may be points, for
-    example, with distances as the differences. There is one array for every observed element: its
-    difference from each member, sorted by star. The mean is ``inf`` where the star has no members,
-    and where nothing was observed.
+    The caller computes the differences, so elements can be points, for example, with distances as
+    differences. ``differences`` has one array per observed element: its difference from each
+    member, sorted by star. The mean is ``inf`` for a star without members, and for all stars if
+    nothing was observed.
     """
     # For an empty interval, reduceat would return the member that follows it.
     filled = np.flatnonzero(np.diff(offsets))
@@ -327,9 +327,9 @@ def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) ->
 def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Rows, Rows, Array]:
     """Return the stars whose sets come nearer to observed numbers than the reach of each.
 
-    Of each find the row of the number, ascending, of the star, and its gain: the reach less the
-    smallest difference from a member; 0 where the entry's member is not its star's nearest, so
-    that gains may be summed.
+    Each result has the row of the number, ascending, the row of the star, and a gain: the reach
+    minus the smallest difference from a member, or 0 if the entry's member is not the nearest of
+    its star, so that gains can be summed.
     """
     start = np.searchsorted(sets.value, numbers - reach, side="left")
     stop = np.searchsorted(sets.value, numbers + reach, side="right")
@@ -343,8 +343,8 @@ def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Row
 def lowest(scores: Array, count: int) -> tuple[Rows, Array]:
     """Return the stars of the lowest scores and these scores, shape (N, count), the lowest first.
 
-    ``scores`` has a row for each centroid, a column for each star; ``inf`` or NaN where the star is
-    out of the question. Where there are no more, the star is -1 and the score ``inf``.
+    ``scores`` has one row per centroid and one column per star, and ``inf`` or NaN for a star that
+    is excluded. If there are fewer than ``count``, the other stars are -1 and their scores ``inf``.
     """
     scores = np.where(np.isnan(scores), np.inf, scores)
     if scores.shape[1] < count:

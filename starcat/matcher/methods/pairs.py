@@ -21,11 +21,11 @@ from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES
 from starcat.matcher.star_cells import rows_between
 
 JOINED_A_STEP = 50
-"""Pairs of stars that are joined with others in the time of a step."""
+"""Number of pairs of stars that are joined with others in the time of a step."""
 
 
 def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
-    """Propose triangles of stars, one batch an observed triangle.
+    """Propose triangles of stars, one batch per observed triangle.
 
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
     """
@@ -34,7 +34,7 @@ def pair_candidates(observation: Observation, database: Database) -> Iterator[Ca
 
 
 def pyramid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
-    """Propose pyramids, four stars each, with the first centroid that makes one of a triangle.
+    """Propose pyramids of four stars: a triangle and the first centroid that completes it.
 
     Mortari, Samaan, Bruccoleri and Junkins 2004, "The pyramid star identification technique",
     Navigation 51, 171.
@@ -82,7 +82,7 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
 def _with_the_same_star(
     stars: Rows, ascending: Rows, observation: Observation
 ) -> tuple[Rows, Rows]:
-    """Return where each star is in others that ascend, which takes steps by how often it is."""
+    """Return the places of each star in ``ascending`` rows; every place found costs steps."""
     low = np.searchsorted(ascending, stars, side="left")
     high = np.searchsorted(ascending, stars, side="right")
     joined = len(stars) + len(ascending) + int((high - low).sum())
@@ -93,7 +93,7 @@ def _with_the_same_star(
 def directed_pairs(
     database: Database, separation_rad: float, tolerance_rad: float
 ) -> tuple[Rows, Rows]:
-    """Return the first and second stars of the pairs of about a separation, in both directions."""
+    """Return the first and second stars of pairs with about this separation, in both orders."""
     product = database.products["pairs"]
     index = product.kvector("separation_rad")
     rows = index.exact(separation_rad - tolerance_rad, separation_rad + tolerance_rad)

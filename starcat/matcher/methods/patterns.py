@@ -5,10 +5,10 @@ that touches the sphere at it, and turned so that the nearest one beyond a buffe
 neighbour, lies on the +x axis. Every occupied cell is a vote for the stars whose pattern has it.
 Needs the product ``grid``.
 
-Radial and cyclic (Zhang et al. 2008): the rings around a centroid that have a neighbour in are
-compared with those of every star, then the sectors, as a cycle without a beginning. That names
-single stars and tells no direction: which names agree with each other, consensus says. Needs the
-product ``radial``.
+Radial and cyclic (Zhang et al. 2008): the rings around a centroid that contain a neighbour are
+compared with the rings of every star, then the sectors, as a cycle without a beginning. The result
+is a name for a single centroid, without a direction; the module `consensus` finds which names agree
+with each other. Needs the product ``radial``.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from starcat.matcher.settings import LOOKUP
 from starcat.matcher.star_cells import rows_between
 
 ALIGNMENTS = 2
-"""How many neighbours are tried as the alignment neighbour: the nearest may be a false star."""
+"""Number of neighbours that are tried as the alignment neighbour: the nearest can be false."""
 
 MAX_STARS = 64
-"""Stars of most votes whose alignment star is looked at."""
+"""Number of stars, by most votes, whose alignment star is checked."""
 
 _TOUCHES = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]])
-"""A centroid may be anywhere in a square: its middle and corners, along and across."""
+"""A centroid can be anywhere in a square: offsets of its middle and corners, along and across."""
 
 
 def grid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -106,34 +106,34 @@ def _occupied(
     across = np.broadcast_to(_TOUCHES[:, 1:] * tolerance_rad, along.shape)
     x = along * np.cos(turn) - across * np.sin(turn)
     y = along * np.sin(turn) + across * np.cos(turn)
-    # The alignment star is on the axis by definition, which may be an edge between cells: what
-    # the tolerance touches beyond it is not meant.
+    # The alignment star is on the axis by definition. The axis can be an edge between cells: the
+    # cells that the tolerance touches beyond it do not count.
     y[:, alignment] = 0.0
     side = int(product.numbers["cells_per_side"])
     return np.unique(cell_of(x, y, product.numbers["radius_rad"], side))
 
 
 ROUNDS = ((3, 16), (12, 32), (48, 64))
-"""How many centroids are compared, from the centre, and how many names each of them gets."""
+"""Number of centroids that are compared, from the centre, and of names that each of them gets."""
 
 MAX_PAIRS = 200
-"""Pairs of names proposed in a round at the most."""
+"""Largest number of pairs of names that are proposed in one round."""
 
 COMPARED = 2
-"""Sectors are compared for this many times as many stars as are wanted."""
+"""Number of stars whose sectors are compared, over the number of stars that are needed."""
 
 TOUCHED = 0.5
 """Weight of a ring without a centroid that a centroid's tolerance touches."""
 
 SECTORS = 0.2
-"""Weight of the sectors beside the rings."""
+"""Weight of the sectors relative to the rings."""
 
 
 def radial_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose names of centroids that agree with each other.
 
-    First of the few centroids nearest to the centre of the frame and their best names, then of more
-    centroids and names.
+    The first round uses a few centroids nearest to the centre of the frame and their best names,
+    the next more centroids and names.
 
     Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
     cyclic features of star pattern", Image and Vision Computing 26, 891.
@@ -195,7 +195,7 @@ def _rings_in_common(around: Surroundings, tolerance_rad: float, product: Produc
 
 
 def sector_pattern(position_angle_rad: Array, sectors: int) -> int:
-    """Return the sectors around a star that have a neighbour in: bit s for sector s.
+    """Return the sectors around a star that contain a neighbour: bit s for sector s.
 
     Angles run counter-clockwise, the nearest neighbour first; sectors are counted from it.
 

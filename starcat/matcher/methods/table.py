@@ -18,12 +18,12 @@ from starcat.matcher.observation import Candidates, Observation
 class Method:
     """A way to identify stars."""
 
-    # Yields batches of candidates for an observation, the most promising first. What a method is
-    # told beside the frame are the settings of the observation.
+    # Yields batches of candidates for an observation, the most promising first. A method gets the
+    # frame and, in the settings of the observation, everything else.
     propose: Callable[[Observation, Database], Iterator[Candidates]]
     products: tuple[str, ...]  # products that it needs beside the stars
     description: str = ""
-    optional: tuple[str, ...] = ()  # products that it can use where they are there
+    optional: tuple[str, ...] = ()  # products that it uses if the database has them
 
 
 METHODS: dict[str, Method] = {

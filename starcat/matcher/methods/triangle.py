@@ -1,14 +1,14 @@
 """Identification by triangles (S4): area in the K-vector, circumradius as the filter.
 
-The order in which triangles of centroids are looked up is that of three methods. Triangles of the
-brightest stars are first where magnitudes are known, as in S3; otherwise the most compact ones are,
-which in a crowded frame are taken from all over it. The order of S4, by the radius of the inscribed
-circle, can be chosen. Triangles with a short side or a narrow angle are left out, because the two
-centroids of a double star, or three centroids in a line, identify little.
+The order in which triangles of centroids are looked up follows three methods. If magnitudes are
+known, triangles of the brightest stars come first, as in S3; otherwise the most compact triangles
+do, which in a crowded frame are taken from all over it. The order of S4, by the radius of the
+inscribed circle, can be chosen. Triangles with a short side or a narrow angle are left out, because
+the two centroids of a double star, or three centroids in a line, identify little.
 
-Where the focal length is not known, triangles are looked up by shape, the area over the squared
+If the focal length is not known, triangles are looked up by shape, the area over the squared
 circumradius, which is the same for similar triangles, and then by a range of areas. The method
-needs the product ``triangles``, in order of area; that of shape is made when first needed. The
+needs the product ``triangles``, in order of area; the order by shape is made when first needed. The
 first batches of observed triangles are small, because the first few triangles decide most frames.
 """
 
@@ -36,7 +36,7 @@ NEIGHBOURS = 20
 """Number of the nearest centroids that a centroid makes triangles with in the order ``spread``."""
 
 SPREAD_CENTROIDS = 400
-"""Largest number of centroids of that order; more would take seconds to put in order."""
+"""Largest number of centroids of that order; sorting more would take seconds."""
 
 
 def select_triangles(observation: Observation) -> NDArray[np.intp]:
@@ -70,8 +70,8 @@ def select_triangles(observation: Observation) -> NDArray[np.intp]:
 def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.intp]:
     """Return triangles of near centroids from all over a frame.
 
-    Every centroid's two nearest neighbours come first, then of every centroid the first and third
-    nearest, the second and third, and so on; a triangle of several centroids once.
+    Every centroid's two nearest neighbours come first, then its first and third nearest, its
+    second and third, and so on; each triangle occurs once.
 
     A database holds the triangles of the brightest stars of its fields. In a crowded frame most
     stars are fainter, and the compact triangles of one place are often of the same few stars: if
@@ -135,18 +135,18 @@ MANY = 200
 into the order of the observed ones."""
 
 ROUNDING_RAD = 1e-7
-"""More than the sides of all triangles lose where they are kept as 32 bits, radians."""
+"""Radians. More than the sides of all triangles lose if they are stored in 32 bits."""
 
 CURVATURE = 2.0 / 3.0
 """How much less than the focal length the angle theta off the axis scales, over theta squared:
 ``theta = atan(r / f)`` shrinks by ``sin(theta) cos(theta)`` of a relative change of f."""
 
 AT_ONCE = 2**16
-"""Triangles whose sides are worked out together."""
+"""Number of triangles whose sides are computed together."""
 
 ANY_ORDER = 1.1
-"""Tolerance of sides in order of their length, in units of that of the true order: the scale that
-fits best differs a little between the two."""
+"""Tolerance of sides in order of their length, in units of the tolerance in their true order: the
+scale that fits best differs a little between the two orders."""
 
 _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
@@ -201,7 +201,7 @@ def _with_sides(
 ) -> tuple[Rows, Rows]:
     """Return the triangles of stars whose sides, by length, are as long as those observed.
 
-    Where they are not by length, they are not in any other order.
+    Triangles whose sides do not agree in order of length do not agree in any other order either.
     """
     known, seen = database.cached(sides_by_length), np.sort(sides, axis=1).T
     for length in (2, 1, 0):
@@ -244,8 +244,8 @@ def features(
 ) -> tuple[float, float, float, float]:
     """Return area, its error, circumradius and its error of a plane triangle that is not flat.
 
-    Sides and their common error in radians. The errors are of first order and treat those of the
-    three sides as independent.
+    Sides and their common error in radians. The results are of first order and treat the errors of
+    the three sides as independent.
     """
     area, slopes = area_and_slopes(a, b, c)
     radius = a * b * c / (4.0 * area)
@@ -273,9 +273,9 @@ def scale_free(
 ) -> tuple[float, float, float, float]:
     """Return shape, its error, area and its error of a plane triangle that is not flat.
 
-    Sides and their common error in radians. The errors treat those of the three sides as
-    independent. That of the shape has a term of second order, since the shape is largest, and
-    stationary, where the sides are equal.
+    Sides and their common error in radians. The errors of the three sides are treated as
+    independent. The error of the shape has a term of second order, since the shape is largest,
+    and stationary, where the sides are equal.
     """
     area, slopes = area_and_slopes(a, b, c)
     shape = 16.0 * area**3 / (a * b * c) ** 2
@@ -322,7 +322,7 @@ def similar_triangles(
 ) -> list[Rows]:
     """Return the triangles of stars, as rows of the product, that each observed one is similar to.
 
-    Sides, shape (T, 3), are those with the focal length that was given, radians.
+    ``sides``, shape (T, 3), are in radians, with the focal length that was given.
     """
     known, (shortest, longest), found = database.cached(shapes), observation.focal_range, []
     for a, b, c in sides.tolist():
@@ -332,7 +332,7 @@ def similar_triangles(
         smallest = (area - area_error) / longest**2
         largest = (area + area_error) / shortest**2
         near = first + np.flatnonzero((part >= smallest) & (part <= largest))
-        # The order in which both are by length fits best; what fails so, fails in every order.
+        # Sides in order of length fit best; triangles that fail so fail in every other order.
         apart = known.sides_rad[:, near]
         close = are_similar(sorted((a, b, c)), apart, ANY_ORDER * tolerance_rad, observation)
         found.append(known.rows[near[close]])
@@ -345,9 +345,9 @@ def are_similar(
     tolerance_rad: float,
     observation: Observation,
 ) -> Mask:
-    """Return which sides of stars are those of observed triangles at some allowed scale.
+    """Return which sides of stars equal the sides of observed triangles at some allowed scale.
 
-    Three arrays each, of any shape, or observed numbers; the scale is that of least squares.
+    Three arrays each, of any shape, or observed numbers; the scale is the least-squares scale.
     """
     (a, b, c), (u, v, w) = sides, apart
     scale = (a * u + b * v + c * w) / (u * u + v * v + w * w)

@@ -1,4 +1,4 @@
-"""Votes for how a frame is turned about a centroid, for frames that triangles do not solve.
+"""Votes for the turn of a frame about a centroid, for frames that triangles do not solve.
 
 If centroids are far from their places, an observed triangle is like thousands of triangles of
 stars. If most centroids are false, hardly any triangle has three stars. Votes still work then. One
@@ -27,13 +27,13 @@ from starcat.matcher.settings import LOOKUP, TriangleOrder
 from starcat.matcher.star_cells import cells_for, rows_between
 
 MAX_REFERENCES = 12
-"""Centroids that can_vote as the reference, in the order of the observation."""
+"""Number of centroids that are tried as the reference, in the order of the observation."""
 
 MAX_VOTERS = 32
-"""Centroids around a reference, the nearest ones."""
+"""Number of centroids around a reference, the nearest ones."""
 
 MAX_KEPT = 6
-"""Stars of one reference that are proposed."""
+"""Number of stars of one reference that are proposed."""
 
 TURN = 256
 """Units of position angles in a turn."""
@@ -45,25 +45,25 @@ PER_BIN = TURN // BINS
 """Units of position angles in a bin."""
 
 MIN_VOTES = 3
-"""Votes of a star that is proposed."""
+"""Smallest number of votes of a star that is proposed."""
 
 MIN_EXPECTED = 0.3
-"""Votes that two bins have by chance at least."""
+"""Smallest number of votes by chance that is assumed for two bins."""
 
 APART = 65535.0
 """Units of the largest separation of neighbours."""
 
 PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
-"""Units of a magnitude, the magnitude of the first one, and the unit of an unknown magnitude."""
+"""Units per magnitude, the magnitude of unit 0, and the unit of an unknown magnitude."""
 
 MAX_NEIGHBOURS = 16_000_000
-"""NeighbourTable of all stars together, up to which there are votes."""
+"""Largest number of neighbours of all stars together with which there are votes."""
 
 STARS_OF_LOOKUP = 100
-"""Stars whose votes take the time of looking one pattern up."""
+"""Number of stars whose votes take the time of looking one pattern up."""
 
 AT_ONCE = 512
-"""Stars whose neighbours are looked for together."""
+"""Number of stars whose neighbours are searched together."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class NeighbourTable:
     """The stars around every star of a database, in small units."""
 
     radius_rad: float
-    # The neighbours of star s are those from offsets[s] to offsets[s + 1]; shape (N + 1,).
+    # The neighbours of star s are at offsets[s] to offsets[s + 1]; shape (N + 1,).
     offsets: NDArray[np.int64]
     star: NDArray[np.int32]  # row of the database; shape (M,)
     apart: NDArray[np.uint16]  # separation, the radius over `APART`; shape (M,)
     turn: NDArray[np.uint8]  # position angle, a turn over 256; shape (M,)
-    magnitude: NDArray[np.uint8]  # in units from `BRIGHTEST` on; `UNKNOWN` where it is not known
+    magnitude: NDArray[np.uint8]  # in units from `BRIGHTEST` on; `UNKNOWN` if not known
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ VOTING = ("triangle", "pyramid")
 
 
 def can_vote(observation: Observation, database: Database) -> bool:
-    """Return whether votes may be counted: with the default search, where the scale is known."""
+    """Return whether votes can be counted: with the default search, if the scale is known."""
     settings = observation.settings
     is_own = settings.method in VOTING and settings.selection == TriangleOrder()
     return is_own and not observation.fov_error and has_few_neighbours(database)
@@ -256,7 +256,7 @@ def position_angle(centre: Directions, other: Directions) -> Array:
     x, y, z = centre.T
     none = np.zeros(len(centre))
     polar = z * z > 0.5
-    # The cross products of two axes with the centre; the second one where it is near the first.
+    # The cross product of an axis with the centre; a second axis if the centre is near the first.
     east = np.where(polar, [z, none, -x], [-y, x, none]).T
     east /= np.linalg.norm(east, axis=1)[:, None]
     north = np.cross(centre, east)

@@ -1,4 +1,4 @@
-"""Stars that fields of the tiling have too many of, and which stars stay where a spec thins."""
+"""Surplus stars of crowded fields of the tiling, and which stars stay if a spec thins."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ KEYS = Thinning
 
 
 def check(selection: Any) -> None:
-    """Check that a spec which says how to thin also says to how many stars."""
+    """Check that a spec with a ``thinning`` also sets the number of stars that stay."""
     if selection.thinning != "brightest" and (
         selection.max_stars is None is selection.max_stars_per_field
     ):
         raise ValueError(
-            f"thinning is {selection.thinning}, but nothing says how many stars stay; give "
+            f"thinning is {selection.thinning}, but no key sets how many stars stay; give "
             "max_stars or max_stars_per_field"
         )
 

@@ -78,7 +78,7 @@ TABLE, KEYS = "observed", Observed
 
 
 def reject(context: Context, keys: Observed) -> list[Rejection] | None:
-    """Reject the stars that the spec says to distrust."""
+    """Reject the stars that the spec lists as distrusted."""
     if not keys.reject:
         return None
     wanted = np.array(keys.reject, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Stars with a companion that the sensor cannot tell apart, by separation and magnitude."""
+"""Stars with a companion that the sensor cannot resolve, by separation and magnitude."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def reject(context: Context, keys: Doubles) -> list[Rejection]:
 
 
 def has_companion(stars: pa.Table, selection: Any) -> Mask:
-    """Return which stars have a companion that the sensor cannot tell apart.
+    """Return which stars have a companion that the sensor cannot resolve.
 
     It lies within ``min_separation_deg`` and is not fainter by more than ``max_delta_mag``.
     """
@@ -126,8 +126,8 @@ def has_companion(stars: pa.Table, selection: Any) -> Mask:
 def merge_doubles(stars: pa.Table, selection: Any) -> tuple[pa.Table, Mask]:
     """Merge groups of close stars into one star each, at their photocentre.
 
-    The rows stay; the brightest of each group, a chain of pairs as `has_companion` finds them,
-    has the combined magnitude and direction. The mask tells which stars are absorbed by it.
+    A group is a chain of pairs as `has_companion` finds them. The rows stay; the brightest star of
+    each group gets the combined magnitude and direction. The mask marks the stars that it absorbs.
     """
     pairs, mag = _companion_pairs(stars, selection)
     if selection.doubles.max_delta_mag is not None:
@@ -163,13 +163,13 @@ def _companion_pairs(stars: pa.Table, selection: Any) -> tuple[Rows, Array]:
 
 
 def _check_pairs(stars: int, separation_deg: float) -> None:
-    """Check that stars are not so many, or so far apart, that nearly all of them are doubles."""
+    """Check that the separation is not so large, for these stars, that most become doubles."""
     pairs = 0.25 * stars**2 * (1.0 - np.cos(np.radians(separation_deg)))
     if pairs > MAX_PAIRS:
         raise BuildError(
             f"selection.doubles.min_separation_deg = {separation_deg:g} makes about {pairs:,.0f} "
-            f"doubles of {stars:,} stars, at most {MAX_PAIRS:,} are looked at; give the few "
-            "pixels that the camera cannot tell apart, or a brighter faint_limit_mag"
+            f"doubles of {stars:,} stars, the limit is {MAX_PAIRS:,}; give the few "
+            "pixels that the camera cannot resolve, or a brighter faint_limit_mag"
         )
 
 

@@ -46,7 +46,7 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
 
 
 def _is_joined(stars: pa.Table, doubles: Doubles) -> Mask:
-    """Return which stars a joined source says to be close doubles."""
+    """Return which stars a joined source lists as close doubles."""
     found = np.zeros(len(stars), dtype=bool)
     for source in doubles.join:
         named = pc.match_substring(stars["double_flag"], f"{source}:")

@@ -1,7 +1,7 @@
 """Stars whose centroid other stars in its window move, or add light to.
 
-Every star that may become a guide star is judged by all stars of the table with a magnitude,
-however faint, as `starcat.products.blends` says a centroid sees them.
+Every star that can become a guide star is judged by all stars of the table with a magnitude, even
+very faint ones, by their effect on its centroid (`starcat.products.blends`).
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ FORM = {
 }
 
 FAINTER_MAG = 2.0
-"""Stars up to so much beyond the faint limit may be one guide star together."""
+"""Stars up to this much beyond the faint limit can form one guide star together."""
 
-_SAME_SPOT = 0.5  # of a spot's width: nothing tells apart centroids that are as close
+_SAME_SPOT = 0.5  # in widths of a spot: centroids that are as close cannot be distinguished
 
 DEFAULT_OFFSET_PX = 0.1
-"""Largest shift of a centroid where a spec states none: a fifth of the self-test's noise."""
+"""Largest shift of a centroid if a spec states none: a fifth of the self-test's noise."""
 
 
 class NeighbourRule(Section):
@@ -138,7 +138,7 @@ class NeighbourRule(Section):
         fields = type(self).model_fields.items()
         if not self.is_on and any(getattr(self, name) != key.default for name, key in fields):
             raise ValueError(
-                "psf_sigma_px is missing: without the width of a spot there are no blends; state "
+                "psf_sigma_px is missing: blends cannot be computed without it; state "
                 "it, such as psf_sigma_px = 1.0, or leave the section out"
             )
         if (self.centroid == "box") != (self.box_px is not None):
@@ -176,7 +176,7 @@ TABLE, KEYS = "neighbours", NeighbourRule
 
 @dataclass(frozen=True)
 class NeighbourTally:
-    """What [selection.neighbours] decided otherwise than the separation rule of the same spec."""
+    """Differences between [selection.neighbours] and the separation rule of the same spec."""
 
     regained: int  # stars that it keeps, and the separation rule would leave out
     lost: int  # the other way round
@@ -184,13 +184,13 @@ class NeighbourTally:
 
 
 def check(selection: Any) -> None:
-    """Check that only one rule says what becomes of close stars."""
+    """Check that only one rule handles close stars."""
     doubles = selection.doubles
     if selection.neighbours.is_on and doubles.action == "merge":
         raise ValueError(
-            'doubles.action = "merge" and [selection.neighbours] both say what becomes of '
-            'close stars; leave it out, and set neighbours.action = "merge" to merge them as '
-            "the sensor does"
+            'doubles.action = "merge" and [selection.neighbours] both handle close stars; '
+            'leave out the first, and set neighbours.action = "merge" to merge them as the '
+            "sensor does"
         )
     if selection.neighbours.is_on and doubles.companion_limit_mag is not None:
         raise ValueError(
@@ -212,7 +212,7 @@ def combine(context: Context, keys: NeighbourRule) -> None:
 
 
 def reject(context: Context, keys: NeighbourRule) -> list[Rejection]:
-    """Reject stars that neighbours spoil beyond the limits, but for those that were merged."""
+    """Reject stars that neighbours disturb beyond the limits, except merged stars."""
     if not keys.is_on:
         return []
     stars = context.stars
@@ -240,7 +240,7 @@ def _tally(context: Context, kept: Mask) -> NeighbourTally:
 @dataclass(frozen=True)
 class _Sky:
     directions: Directions
-    mag: Array  # NaN where it is not known
+    mag: Array  # NaN if not known
     number: NDArray[np.int64]
     widths: Widths  # radians
 
@@ -252,7 +252,7 @@ class SeenStars:
     sky: _Sky
     rows: Rows  # the stars, shape (N,)
     pairs: tuple[Rows, Rows]  # places in ``rows``, and the rows of the neighbours of these stars
-    blends: Blends  # of the N stars; offsets east and north, radians
+    blends: Blends  # blends of the N stars; offsets east and north, radians
 
     @property
     def moved_arcsec(self) -> Array:
@@ -268,7 +268,7 @@ class SeenStars:
 def seen_by_sensor(
     stars: pa.Table, rows: Rows, rule: NeighbourRule, pixel_arcsec: float
 ) -> SeenStars:
-    """Return what neighbours do to stars of a table, which has x, y, z, mag and star_id."""
+    """Return the effect of neighbours on stars of a table, which has x, y, z, mag and star_id."""
     widths = widths_px(rule.psf_sigma_px or 0.0, rule.window_px, rule.box_px)
     mag, number = floats_of(stars, "mag"), stars["star_id"].to_numpy()
     sky = _Sky(directions_of(stars), mag, number, widths.times(pixel_arcsec * ARCSEC))
@@ -353,9 +353,9 @@ def _moved(directions: Directions, offset: Array) -> Directions:
 def _spots(
     sky: _Sky, rows: Rows, pairs: tuple[Rows, Rows], seen: Blends, may_merge: Mask
 ) -> tuple[Rows, Mask]:
-    """Return the rows of stars that become the star of their spot, and who is absorbed by them.
+    """Return the rows of stars that represent their spot, and a mask of the stars they absorb.
 
-    A spot is of the stars whose centroids are at one place, and has the name of the brightest.
+    A spot holds the stars whose centroids are at the same place; the brightest represents it.
     """
     place, other = pairs
     faint = np.setdiff1d(other[may_merge[rows][place]], rows)

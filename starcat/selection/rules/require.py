@@ -89,7 +89,7 @@ def reject(context: Context, keys: Requirements) -> list[Rejection] | None:
 
 
 def _is_met(stars: pa.Table, wanted: Requirement) -> Mask:
-    """Return which stars meet a condition; those with an unknown value in it do not."""
+    """Return which stars meet a condition; stars with an unknown value in it do not."""
     key, count = f"selection.require.{wanted.name}", len(stars)
     names, _ = columns_in(wanted.expression, stars.column_names, key, _TABLE)
     missing = [name for name in names if count and stars[name].null_count == count]
