@@ -171,7 +171,7 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
             task.cancel()
         return took
 
-    pool._limits = type(pool._limits)(time_s=8.0, memory_gb=0.5, disk_gb=0.1)
+    pool._limits = type(pool._limits)(time_s=100.0, memory_gb=0.5, disk_gb=0.1)
     assert len(asyncio.run(go())) == 12
 
 
