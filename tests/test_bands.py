@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from starcat.artifact.verify import check_artifact
 from starcat.bands.catalogs import BANDS_AND_COLOURS, best_relation
 from starcat.bands.exposure import PHOTONS_S_MM2, Exposure, photons_s_mm2
-from starcat.bands.measured import error_factors
+from starcat.bands.measured import colour_share, error_factors
 from starcat.bands.relation import Prediction, combined, predict_by_type, relation
 from starcat.bands.response import (
     checked_response,
@@ -386,6 +386,13 @@ def doubt_of(**columns: Any) -> np.ndarray:
         for more in ({}, columns)
     )  # fmt: skip
     return np.sqrt(np.maximum(doubtful**2 - plain**2, 0.0))
+
+
+def test_companions_of_red_stars_count_less():
+    share = colour_share(np.array([0.9, 1.2, 1.7, 3.0, np.nan]))
+    assert share[0] == share[4] == 1.0
+    assert (share[1:4] < 0.6).all()
+    assert (share > 0.2).all()
 
 
 def test_companions_make_magnitudes_less_certain():

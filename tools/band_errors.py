@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from starcat.bands import measured
-from starcat.bands.measured import companion_light
+from starcat.bands.measured import companion_error, companion_light
 from starcat.bands.photometry import band_error, variability_error
 from starcat.bands.relation import relation
 from starcat.bands.response import shipped
@@ -67,6 +67,8 @@ OUTLIER = 8.0
 """Single stars that are off by this many errors are left out of the fit; the table counts them."""
 
 SEPARATIONS_ARCSEC = (0.0, 0.15, 0.5, 1000.0)
+RED_MAG = (1.0, 1.5, 6.0)
+"""Limits of BP-RP between which stars are red, and most of them giants."""
 
 RELATIONS_HEADER = """\
 # Measured errors of relations over the errors computed from the library of spectra, by colour: a
@@ -79,7 +81,8 @@ STARS_HEADER = """\
 # from Gaia's G and BP-RP, for every second flagged star of Hipparcos. companion_share: the share of
 # the light of a companion of known magnitude difference, by separation. The others are standard
 # deviations in mag: companion of unknown difference, in a list of doubles without a flag, and
-# variable of unknown amplitude. Made by tools/band_errors.py.
+# variable of unknown amplitude. colour_share: a factor of those of companions, by colour BP-RP.
+# Made by tools/band_errors.py.
 """
 
 
@@ -275,6 +278,29 @@ def star_rows(catalogs: Path) -> Iterator[str]:
         yield f"{state},,,{rows.sum()},{solved(residual[rows], known[rows], one[rows]):.3f}"
 
 
+def colour_rows(catalogs: Path) -> Iterator[str]:
+    """Give the rows of star_errors.csv by colour, from Hp and VT, with the other rows in use."""
+    stars = sample(catalogs)
+    companions = companion_error(
+        stars.gaia["is_flagged_double"].to_numpy(),
+        stars.gaia["double_flag"].is_valid().to_numpy(),
+        floats_of(stars.gaia, "companion_separation_arcsec"),
+        floats_of(stars.gaia, "companion_delta_mag"),
+    )
+    used = (companions > 0.0) & ~stars.gaia["is_flagged_variable"].to_numpy() & stars.fitted()
+    _, residual, error, colour = (
+        np.concatenate(one)
+        for one in zip(*((used, *case.judged(catalogs)[1:]) for case in CASES[:2]), strict=True)
+    )
+    used, companions = np.tile(used, 2), np.tile(companions, 2)
+    used &= np.isfinite(residual) & (np.abs(residual) < OUTLIER * error)
+    fixed = np.sqrt(np.maximum(error**2 - companions**2, 0.0))
+    for low, high in pairwise(RED_MAG):
+        rows = used & (colour >= low) & (colour < high)
+        share = solved(residual[rows], fixed[rows], companions[rows])
+        yield f"colour_share,{low:g},{high:g},{rows.sum()},{share:.2f}"
+
+
 RELATIONS_COLUMNS = "base,colour,target,low_mag,stars,factor"
 STARS_COLUMNS = "state,low_arcsec,high_arcsec,stars,value"
 
@@ -286,6 +312,10 @@ def tables(catalogs: Path) -> dict[str, str]:
     bins = measured.bands_in_bins([row.split(",") for row in relations])
     with mock.patch.object(measured, "relation_errors", return_value=bins):
         stars = list(star_rows(catalogs))
+        states = measured.states_of([row.split(",") for row in stars])
+        states[measured.COLOUR_SHARE] = np.empty((0, 3))
+        with mock.patch.object(measured, "star_errors", return_value=states):
+            stars += colour_rows(catalogs)
     header = RELATIONS_HEADER.format(stars=f"{sample(catalogs).is_single.sum():,}")
     return {
         "relation_errors.csv": header + "\n".join([RELATIONS_COLUMNS, *relations]) + "\n",

@@ -25,6 +25,7 @@ NOISE_MAG = 0.05
 this for 1 of 1,000 stars of the class C in H52 of Hipparcos."""
 
 COMPANION_SHARE, COMPANION, LISTED, VARIABLE = "companion_share", "companion", "listed", "variable"
+COLOUR_SHARE = "colour_share"
 """States of a star in ``star_errors.csv``."""
 
 
@@ -93,19 +94,37 @@ def _in_bins(bins: Array, colour_mag: Array) -> Array:
 
 @cache
 def star_errors() -> dict[str, Array]:
-    """Return rows of low and high separation and value, shape (K, 3), by the state of a star."""
-    _, rows = data_table("star_errors.csv")
-    states = dict.fromkeys(row[0] for row in rows)
-    return {
-        state: np.array(
-            [
-                [float(r[1] or 0.0), float(r[2] or np.inf), float(r[4])]
-                for r in rows
-                if r[0] == state
-            ]
-        )
-        for state in states
-    }
+    """Return the table of flagged stars that ships with starcat."""
+    return states_of(data_table("star_errors.csv")[1])
+
+
+def states_of(rows: list[list[str]]) -> dict[str, Array]:
+    """Return lower limit, upper limit and value of the rows of each state, shape (K, 3)."""
+    found: dict[str, list[list[float]]] = {}
+    for state, low, high, _, value in rows:
+        found.setdefault(state, []).append([float(low or 0.0), float(high or np.inf), float(value)])
+    return {state: np.array(limits) for state, limits in found.items()}
+
+
+def colour_share(bp_rp_mag: Array) -> Array:
+    """Return the share of the errors of flagged stars that stars of a colour BP-RP show.
+
+    Most red stars are giants. A companion adds little to the light of a giant.
+
+    Parameters
+    ----------
+    bp_rp_mag : ndarray of float64, shape (N,)
+        Colours; NaN if unknown.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        Factor of the errors that companions and variability add; 1 without a measured share.
+    """
+    found = np.ones(len(bp_rp_mag))
+    for low_mag, high_mag, share in star_errors()[COLOUR_SHARE]:
+        found[(bp_rp_mag >= low_mag) & (bp_rp_mag < high_mag)] = share
+    return found
 
 
 def companion_light(delta_mag: Array) -> Array:

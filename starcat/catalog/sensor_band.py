@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.bands.catalogs import colour_of, relations_of
-from starcat.bands.measured import companion_error, variation_error
+from starcat.bands.measured import colour_share, companion_error, variation_error
 from starcat.bands.photometry import band_error
 from starcat.bands.relation import Prediction, Relation, combined, predict_by_type
 from starcat.bands.response import Response, shipped_names
@@ -106,6 +106,9 @@ def _doubt(stars: pa.Table) -> Array:
         floats_of(stars, "companion_separation_arcsec"),
         floats_of(stars, "companion_delta_mag"),
     )
+    colours = _colours(stars)
+    if "BP-RP" in colours:
+        companions *= colour_share(colours["BP-RP"])
     return np.hypot(companions, variation_error(is_variable, floats_of(stars, "amplitude_mag")))
 
 
