@@ -161,7 +161,7 @@ TOLD: dict[str, tuple[list[Fault], str]] = {
     ),
     "another address": (
         [Fault("GET /tap/async/[0-9a-f]+ ", swap=(b'href="http', b'href="file'), times=99)],
-        "the result is said to be at 'file",
+        "the address of the result is 'file",
     ),
     "a failed job": (
         [Fault("GET /tap/async/[0-9a-f]+ ", swap=(b"COMPLETED", b"ABORTED"), times=99)],

@@ -157,7 +157,7 @@ EDITS_OF_MAP = (
     ('name = "mine"\n', "", "mine.toml: name: missing; every map needs it"),
     ('"mine"', '"sao"', "name: sao is a source of starcat; choose another name"),
     ("epoch =", "epoc =", "mine.toml: epoc: unknown key; did you mean 'epoch'?"),
-    ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is no date; write it like 2016-01-01"),
+    ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is not a date; write it like 2016-01-01"),
     ("epoch", 'frame = "B1950"\nepoch', "frame: found 'B1950'; expected 'ICRS', 'FK5', 'FK4'"),
     (
         "epoch",
