@@ -75,7 +75,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
         assert min(hard, bare_hard) >= 0.97
     else:
         assert made.rates[0].share_of_identifiable >= 0.85
-        assert any("the embedded sky has no fainter ones" in text for text in advice(starter))
+        assert any("the embedded sky has no fainter stars" in text for text in advice(starter))
         # What is missed has few stars, and not a hole of the tiling or of the triangles.
         assert np.median(made.rates[0].missed) < 6
     assert not any("holes" in text for text in made.warnings)

@@ -253,7 +253,7 @@ def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_
     with pytest.raises(ChecksumMismatch, match=r"has changed.*remove that to read it"):
         rebuild(made, {"sao": [input_path(address)]})
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "another"))
-    with pytest.raises(ChecksumMismatch, match="has changed: what was read of it has sha256"):
+    with pytest.raises(ChecksumMismatch, match="has changed: the part that was read has sha256"):
         rebuild(made, {"sao": [input_path(address)]})
 
 

@@ -62,7 +62,7 @@ def inspect(
 @app.command("coverage")
 def coverage_command(
     artifact: Annotated[Path, database()],
-    output: Annotated[Path | None, to_folder("Folder for CSV, JSON, PNG and SVG.")] = None,
+    output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
     replace: Replace = False,
     json: Json = False,
 ) -> None:
@@ -146,7 +146,7 @@ def rebuild_command(
     artifact: Annotated[Path, database()],
     inputs: Input = None,
     output: Annotated[
-        Path | None, to_folder("Folder for the new database; default: it is not kept.")
+        Path | None, to_folder("Where the new database goes; default: it is not kept.")
     ] = None,
     json: Json = False,
 ) -> None:

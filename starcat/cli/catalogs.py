@@ -68,7 +68,7 @@ Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted 
 
 @app.command("ingest")
 def ingest_command(
-    output: Annotated[Path, to_either("Parquet file to write, or the folder for hats.")],
+    output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
     source: Annotated[
         str | None, typer.Argument(help="A star catalog, such as sao; default: from --source.")
     ] = None,
@@ -168,7 +168,7 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
 def crossmatch_command(
     a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet).")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The same, with the counterparts.")],
-    output: Annotated[Path, to_file("File for the counterparts; its suffix selects the format.")],
+    output: Annotated[Path, to_file("Where the counterparts go; the suffix selects the format.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,

@@ -43,7 +43,7 @@ FormatName = Annotated[
 OutputPath = Annotated[
     Path | None,
     to_either(
-        "The result: with a suffix the file of one product, else the folder of all, "
+        "Where the result goes: with a suffix the file of one product, else the folder of all, "
         "default: export; for onboard and c the file, default: <name>-<version>.img or .c; for "
         "other solvers the folder, default: <name>-<version>-<format>."
     ),

@@ -28,7 +28,7 @@ def fetch(
     ],
     output: Annotated[
         Path | None,
-        to_folder("Folder for the files; default: the download cache. TAP has no default."),
+        to_folder("Where the files go; default: the download cache. TAP has no default."),
     ] = None,
     part: Annotated[
         list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")

@@ -33,7 +33,7 @@ def learn_command(
     ],
     output: Annotated[
         Path | None,
-        to_file("File for the section of a spec, or with --patch for the patch's spec (TOML)."),
+        to_file("Where the section of a spec goes, or with --patch the patch's spec (TOML)."),
     ] = None,
     patch: Annotated[
         Path | None,

@@ -86,7 +86,7 @@ def methods(json: opt.Json = False) -> None:
 @app.command("simulate")
 def simulate_command(
     artifact: Folder,
-    output: Annotated[Path, to_file("File for the frame: CSV, FITS, PNG, TIFF, JPEG.")],
+    output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
     noise_mag: Annotated[float, typer.Option(min=0, max=10, help="Noise of a magnitude.")] = 0.2,
@@ -261,7 +261,7 @@ def calibrate_command(
     files: Annotated[
         list[str], typer.Argument(metavar="FRAMES...", help="Frames, as for 'starcat identify'.")
     ],
-    output: Annotated[Path, to_file("File for the camera (TOML).")],
+    output: Annotated[Path, to_file("Where the camera (TOML) goes.")],
     camera: Annotated[
         Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
     ] = None,

@@ -31,7 +31,9 @@ Values = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
 ]
-OutputFile = Annotated[Path | None, to_file("File for the answer; its suffix selects the format.")]
+OutputFile = Annotated[
+    Path | None, to_file("Where the answer goes; the suffix selects the format.")
+]
 FormatName = Annotated[
     str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
 ]
