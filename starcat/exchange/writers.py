@@ -64,7 +64,7 @@ def write_batches(
                 with partial.open("wb") as stream:
                     stream.writelines(_TEXTS[file_format](watched.reader))
     except OutputError:
-        if watched.failure:  # DuckDB's errors look like file errors, but not writing failed
+        if watched.failure:  # reading failed: DuckDB's errors look like errors of writing
             raise watched.failure from None
         raise
     return watched.rows
