@@ -222,8 +222,8 @@ def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
         found = json.loads(fetcher.came[named[-1]])
         until = f" on {str(found['signed']['expires'])[:10]}"
     return ProductError(
-        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: newer ones are "
-        f"hidden from you, or were never made; {_NOT_USED}. The publisher can run "
+        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: newer "
+        f"ones are hidden from you, or were never made; {_NOT_USED}. The publisher can run "
         f"'starcat keys {'roles' if role == 'root' else 'renew'} REGISTRY --sign KEY'"
     )
 
