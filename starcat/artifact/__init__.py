@@ -1,4 +1,4 @@
-"""Artifacts: products become a directory with a manifest; reading, verifying, comparing it."""
+"""Artifacts: write products into a folder with a manifest; read, verify and compare databases."""
 
 from starcat.rooms import lazy_names
 
