@@ -1,4 +1,4 @@
-"""Artifacts: write products into a folder with a manifest; read, verify and compare databases."""
+"""Artifacts: write products into a folder with a manifest, and read, verify and compare it."""
 
 from starcat.rooms import lazy_names
 

@@ -1,9 +1,9 @@
 """Convert values to text, and tables to CSV, TSV and JSON, batch by batch.
 
 CSV: null is an empty cell, an empty text is ``""`` (with a single column both are ``""``). NaN and
-infinity are ``nan`` and ``inf``; lists and records are JSON in the cell. JSON: an array with one
-object per line; it has neither NaN nor infinity, so both are null. Integers have all their digits
-in both formats.
+infinity are ``nan`` and ``inf``; lists and records are JSON in the cell. A JSON file is an array
+with one object per line. It has neither NaN nor infinity, so both are null. Integers have all
+their digits in both formats.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Publish a database into a registry on disk.
 
-The order of the steps makes it safe. First the content is written, each blob under its digest;
-then the release, a file that never changes; and last the index, made from all releases. If the
+The order of the steps makes it safe. First the content is written, each blob under its digest,
+then the release, a file that never changes, and last the index, made from all releases. If the
 process is killed in between, it leaves content that nothing refers to, and the next run continues.
 If a release is missing in the index, the next publisher adds it.
 """

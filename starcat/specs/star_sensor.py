@@ -34,7 +34,7 @@ LEFT_OUT = ("zero_point_e_s", "limit_mag")
 
 
 def _key(default: Any, description: str, example: Any = None) -> Any:
-    """Return a key: its default (an ellipsis: required), meaning with unit, and an example."""
+    """Return a key with its default (an ellipsis if required), meaning, unit, and example."""
     return Field(default, description=description, examples=None if example is None else [example])
 
 

@@ -1,4 +1,4 @@
-"""Dask clusters: a local one on this machine, or an existing one; and tasks that run on them."""
+"""Dask clusters (a local one on this machine, or an existing one), and tasks that run on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs: files with the stars of one input, sorted by pixel; a partition reads its share of them.
+"""Runs: files with the stars of one input, sorted by pixel. A partition reads its share of them.
 
 Splitting an archive writes runs; finishing a partition reads from every run the batches of its
 pixels. A run has one Arrow batch for each coarse pixel. A second file has the numbers of its stars

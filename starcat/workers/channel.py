@@ -34,7 +34,7 @@ class Channel:
         return from_json(self._exactly(size))
 
     def send(self, kind: str, content: Any, *, more: bool = False) -> None:
-        """Send a reply: plain values or raw bytes; with ``more`` it may be sent with the next one.
+        """Send a reply (plain values or raw bytes); with ``more`` it may wait for the next one.
 
         OSError if the parent process is gone.
         """

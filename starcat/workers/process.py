@@ -87,7 +87,7 @@ class WorkerProcess:
         return self._process.poll() is None
 
     def wait(self, wait_s: float | None = None) -> int | None:
-        """Wait for its end; return the exit code (negative: signal), or None after ``wait_s``."""
+        """Wait for its end; return the exit code (negative for a signal), or None if too late."""
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(wait_s)
         return None
