@@ -339,7 +339,7 @@ ATTACKS: dict[str, Attack] = {
     "a huge snapshot": (on_file(huge, SNAPSHOT), "longer than"),
     "huge targets": (on_file(huge, TARGETS), "longer than"),
     "a huge root": (on_file(huge, ROOT2), "longer than"),
-    "a root of nonsense": (on_file(text("{}"), ROOT2), "2.root.json is no metadata"),
+    "a root of nonsense": (on_file(text("{}"), ROOT2), "2.root.json is not metadata"),
     "a link for the timestamp": (on_file(link, TIMESTAMP), "a symbolic link; expected a file"),
     "a pipe for the timestamp": (on_file(fifo, TIMESTAMP), "not a file"),
     # Older and mixed states.
@@ -365,7 +365,7 @@ ATTACKS: dict[str, Attack] = {
     "targets by one and another": (other_releases("anna", "mallory"), "signed by 1 of the 2"),
     "targets by who may only renew": (other_releases("anna", "clock"), "signed by 1 of the 2"),
     "one signature for two": (one_key_twice, "4.targets.json is signed by 1 of the 2"),
-    "one signature twice": (same_key_id_twice, "4.targets.json is no metadata"),
+    "one signature twice": (same_key_id_twice, "4.targets.json is not metadata"),
     "a root by another": (new_root("mallory"), "2.root.json is signed by 0 of the 2"),
     "a root by one of two": (new_root("chief"), "2.root.json is signed by 1 of the 2"),
     "a root by one and another": (

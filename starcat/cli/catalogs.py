@@ -381,7 +381,7 @@ def print_problems(problems: Sequence[str]) -> None:
 
 
 def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows read, kept, and rejected by reason; the first is the sum of the others."""
+    """Return table rows: records read, kept, and rejected by reason; they add up."""
     from starcat.selection.ruleset import ALL_REASONS
 
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]

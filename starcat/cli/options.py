@@ -102,7 +102,7 @@ Time = Annotated[
 ]
 Velocity = Annotated[
     str | None,
-    typer.Option(metavar="VX,VY,VZ", help="Velocity from the Earth, km/s, GCRS; with --time."),
+    typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
 ]
 Orbit = Annotated[
     str | None,
@@ -141,7 +141,7 @@ Threshold = Annotated[
 ]
 MostSpots = Annotated[int, typer.Option(min=4, help="Use this many of the brightest spots.")]
 Plane = Annotated[
-    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: all combined.")
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours combined.")
 ]
 Mosaic = Annotated[
     bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
