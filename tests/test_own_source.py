@@ -177,7 +177,7 @@ EDITS_OF_MAP = (
         '"pmra", unit = "mas per yr"',
         "'mas per yr' is no unit of astropy",
     ),
-    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be converted"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be"),
     ('{ value = "pmra", unit = "mas/yr" }', '"pmra"', "neither t.csv nor the map states a unit"),
     ('"ra"', '"RAJ2000"', "columns.ra: 'RAJ2000' is no column of t.csv; it has id, ra, dec"),
     ('"v"', '"(SELECT max(v) FROM t)"', "subquery is not allowed in one"),
