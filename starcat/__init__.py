@@ -5,7 +5,7 @@
 <BuildSpec gaia-12deg-1.0.0: gaia to 6 mag, 1024 x 1024 px, 12 x 12 deg>
 
 The public names are listed in ``__all__``. Each is imported when it is first used, so that
-``import starcat`` takes no time, and a program that only matches needs numpy and h5py alone. The
+``import starcat`` is fast, and a program that only matches needs numpy and h5py alone. The
 packages that define them are described in ``docs/house.md`` and may change.
 """
 

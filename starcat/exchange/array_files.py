@@ -61,7 +61,7 @@ class NumpyColumn:
     # Null is NaN, 0, False or an empty text.
     values: NDArray[Any]
     is_null: Mask
-    # Shape (N + 1,): begin and end of the list of each row; None if rows are not lists.
+    # Shape (N + 1,): start and end of the list of each row; None if rows are not lists.
     offsets: NDArray[np.int64] | None
     facts: dict[str, str]  # unit, description and ucd, if the column has them
 

@@ -105,7 +105,7 @@ class Cells:
 
     values: pa.Array  # numbers, truth values or texts: one per row, or all items of the lists
     is_null: Mask | None  # None if every row has a value
-    # Shape (N + 1,): begin and end of the list of each row; None if rows are not lists.
+    # Shape (N + 1,): start and end of the list of each row; None if rows are not lists.
     offsets: NDArray[np.int64] | None
 
 

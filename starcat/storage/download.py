@@ -444,7 +444,7 @@ def fetch_range(
 
 
 def _range_of(response: requests.Response) -> tuple[RemoteVersion, int, int]:
-    """Return the version of a partial answer, and its begin and end."""
+    """Return the version of a partial answer, and its start and end."""
     if response.status_code == 416:
         raise Refused("the file is shorter than it was, or the server has no ranges")
     if response.status_code == 200:

@@ -177,7 +177,7 @@ class Run:
     stars: Path  # Arrow file
     places: Path  # file with `PLACES`, sorted by bucket
     pixels: Pixels  # shape (B,): the coarse pixel of each batch
-    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): begin of each bucket in ``places``
+    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): start of each bucket in ``places``
 
 
 Share = tuple[Path, list[int]]
@@ -329,7 +329,7 @@ class RunIndex:
     pixels: Pixels  # shape (B,): coarse pixel of each batch, ascending
     runs: NDArray[np.int64]  # shape (B,): the run of each batch
     batches: NDArray[np.int64]  # shape (B,): its number in the run
-    # shape (R, BUCKETS + 1): begin of each bucket of numbers in the places of each run
+    # shape (R, BUCKETS + 1): start of each bucket of numbers in the places of each run
     buckets: NDArray[np.int64]
 
     def shares(self, pixel: Pixel) -> list[Share]:
